@@ -243,7 +243,7 @@ def test_a_long_record_that_is_oversampled_is_averaged_and_stays_whole() -> None
     (small,), said = averaged([record])
     assert small.n < MOST
     assert small.duration == pytest.approx(record.duration, rel=1e-2)
-    assert "averaged in blocks" in said[0]
+    assert "averaged in blocks" in said[0].sentence
 
 
 @slow

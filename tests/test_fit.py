@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import Fit, fit, objective
+from psa_casadi.identification.fitting.fit import Fit, Objective, fit
 from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.refitting import same_place
@@ -240,10 +240,10 @@ def test_a_loop_that_has_left_the_record_far_behind_has_diverged(
     model = model_with()
     experiments = [whole(record_of(model, 1))]
     found = fitted(model, experiments)
-    weights = np.full(experiments[0].record.n, SIGMA)
-    evaluate = objective(model, experiments, found.unknowns, weights, found.way)
-    far = np.full(len(weights), ranges * experiments[0].record.range_m)
-    slopes = np.full((len(weights), found.unknowns.size), slope)
+    evaluate = Objective(model, experiments, found.unknowns, [SIGMA], found.way)
+    samples = experiments[0].record.n
+    far = np.full(samples, ranges * experiments[0].record.range_m)
+    slopes = np.full((samples, found.unknowns.size), slope)
     monkeypatch.setattr(
         "psa_casadi.identification.fitting.fit.predict",
         lambda *_, **__: [Prediction(far, slopes, "exact")],

@@ -18,7 +18,7 @@ from psa_casadi.components.flexure import FLEXURE
 from psa_casadi.diagnosis.columns import decision_sentence
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import fit, objective
+from psa_casadi.identification.fitting.fit import Objective, fit
 from psa_casadi.identification.fitting.further import COLUMNS, scaled
 from psa_casadi.identification.prepare import columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
@@ -27,6 +27,7 @@ from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
 from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.shown import sentences
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import Way
 from tests.plants import further_columns as plants
@@ -103,7 +104,7 @@ def test_the_derivatives_of_further_columns_are_those_of_their_residuals() -> No
     experiments = with_levels([whole(r)], found.fitted)
     some = fit(found.model, experiments, ["k_L", "A", "R_s"], sigma=[1e-8], evaluations=1)
     way = Way(1e-9, 1e-9)
-    evaluate = objective(found.model, experiments, some.unknowns, np.full(300, 1e-8), way)
+    evaluate = Objective(found.model, experiments, some.unknowns, [1e-8], way)
     theta, rows = some.theta, slice(300, 900)
     at = evaluate(theta)
     assert at is not None
@@ -132,11 +133,11 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
         columns_of(compose([FLEXURE]), [r])
     found = columns_of(starting_model([r]), [r])
     assert found.fitted == ("monitor_voltage",)
-    assert found.left_out == ("strain is left out: it never changes.",)
+    assert sentences(found.left_out) == ("strain is left out: it never changes.",)
     assert "monitor_voltage" in found.model.output_names
     turned = replace(r, current=-np.gradient(time), monitor_voltage=None, strain=None)
     (said,) = columns_of(starting_model([turned]), [turned]).left_out
-    assert "does not follow the voltage as a capacitance's does" in said
+    assert "does not follow the voltage as a capacitance's does" in said.sentence
     with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
         replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
 
@@ -165,7 +166,7 @@ def test_a_turned_sign_is_told() -> None:
         found = columns_of(starting_model([record]), [record])
         experiments = with_levels([whole(record)], found.fitted)
         (further,) = fit(found.model, experiments, [], sigma=[1e-8], evaluations=1).further
-        assert ("its sign is probably turned" in further.sentence) is told
+        assert ("its sign is probably turned" in sentences(further.notes)[-1]) is told
 
 
 @pytest.mark.parametrize(
@@ -205,7 +206,7 @@ def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> Non
     model, (beside,) = scaled(some.model, some.further)
     assert model.values == pytest.approx(some.model.values)  # the scale is in the model already
     assert beside.factors == pytest.approx([1.0])
-    assert "displacement_2: fitted beside the displacement" in further.sentence
+    assert "displacement_2: fitted beside the displacement" in further.notes[0].sentence
 
 
 @slow

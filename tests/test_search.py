@@ -15,6 +15,7 @@ from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.refitting import exchanges
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
+from psa_casadi.shown import sentences
 from tests.benchmarks.coverage import one_run
 from tests.benchmarks.records import clean_loops, with_noise
 from tests.tiers import slow
@@ -113,7 +114,7 @@ def test_what_loops_leave_open_is_told_in_words(found: Identification) -> None:
 
 
 def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    objective, count = fitting.objective, [0]
+    objective, count = fitting.Objective, [0]
 
     def interrupted(*arguments):  # type: ignore[no-untyped-def]
         evaluate = objective(*arguments)
@@ -126,7 +127,7 @@ def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch)
 
         return wrapped
 
-    monkeypatch.setattr(fitting, "objective", interrupted)
+    monkeypatch.setattr(fitting, "Objective", interrupted)
     begin = time.perf_counter()
     found = identify(loops()[:1])
     assert count[0] == 8  # nothing was evaluated after the interrupt
@@ -158,10 +159,10 @@ def test_oversampled_records_are_averaged_and_say_so() -> None:
     t: FloatArray = 2.5e-6 * np.arange(400_000.0)
     v: FloatArray = 50.0 * (1.0 - np.cos(2 * np.pi * t))
     y: FloatArray = 1e-7 * v + 1e-9 * np.random.default_rng(1).standard_normal(t.size)
-    shorter, sentences = prepared(Record(name="fast", time=t, voltage=v, displacement=y))
+    shorter, notes = prepared(Record(name="fast", time=t, voltage=v, displacement=y))
     factor = t.size // shorter.n
     assert factor >= 8
-    assert f"averaged in blocks of {factor}" in sentences[-1]
+    assert f"averaged in blocks of {factor}" in sentences(notes)[-1]
     assert float(np.std(np.asarray(shorter.displacement) - 1e-7 * shorter.voltage)) == (
         pytest.approx(1e-9 / np.sqrt(factor), rel=0.1)
     )

@@ -43,6 +43,7 @@ from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, in_one_order
+from psa_casadi.shown import sentences
 from psa_casadi.simulation.ahead import compiled_ahead
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
@@ -101,7 +102,7 @@ def diagnose(
             (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
             start, scale_given = chosen_start(clean, model, stiffness)
             (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
-            said += [*means, *means_too, *long, *long_too]
+            said += [*sentences((*means, *means_too)), *long, *long_too]
             experiments = divided(clean, judged)
             columns = columns_of(start, [e.record for e in experiments])
             experiments = with_levels(experiments, columns.fitted)
@@ -112,7 +113,7 @@ def diagnose(
             start = start.without(c.name for c in searched if c.gain is not None)
             there = {c.name for c in start.components}
             table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-            said += [*columns.left_out, *preferred]
+            said += [*sentences(columns.left_out), *preferred]
         so_far: list[Fit] = []
         task = Task(
             experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden
@@ -204,7 +205,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
-    turned = [f.turned for f in steps[0].fit.further if f.turned]
+    turned = sentences([note for f in steps[0].fit.further for note in f.turned])
     notes = (*seen.notes, *between, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
     return replace(found, notes=(*found.notes, *notes))
 

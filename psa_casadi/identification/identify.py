@@ -51,10 +51,7 @@ _MISSED = 1.5
 #: Rounds of fitting with every record's own residual as its noise level.
 _LEVEL_ROUNDS = 2
 
-FORCE_NOTE = (
-    "Force scale assumed: voltage and displacement determine the displacement only. Forces, masses"
-    " and stiffnesses are right in proportion, not in size; give a stiffness to fix them."
-)
+FORCE_NOTE = Note("force_assumed")
 INTERRUPTED = Note("interrupted")
 
 
@@ -138,7 +135,7 @@ def identify(
     fitted, long = excerpts(every)
     known = {r.sha256: r for r in parts}
     said = [*cut, *(s for _, own in ready for s in own), *long]
-    refuse_few(given_records, fitted, said)
+    refuse_few(given_records, fitted, sentences(said))
     start, given = chosen_start(every, model, stiffness)
     columns = columns_of(start, fitted)
     forms = forms_of(columns.model, hysteresis)
@@ -198,7 +195,7 @@ def identify(
             *said,
             *((preferred,) if preferred else ()),
             *columns.left_out,
-            *(f.sentence for f in best.further),
+            *(" ".join(sentences(f.notes)) for f in best.further),
         ),
         combinations=open_ones,
         advice=advised or (),
@@ -229,7 +226,7 @@ def with_provenance(
         interrupted=interrupted,
         notes=(
             *((INTERRUPTED.sentence,) if interrupted else ()),
-            *(() if stiffness_given else (FORCE_NOTE,)),
+            *(() if stiffness_given else (FORCE_NOTE.sentence,)),
             *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
@@ -243,7 +240,7 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
         package_version=__version__,
         free=best.unknowns.names,
         force_scale="given" if stiffness_given else "assumed",
-        notes=(INTERRUPTED.sentence, *(() if stiffness_given else (FORCE_NOTE,))),
+        notes=(INTERRUPTED.sentence, *(() if stiffness_given else (FORCE_NOTE.sentence,))),
         interrupted=True,
     )
     return replace(best.model, provenance=provenance, evidence=None)

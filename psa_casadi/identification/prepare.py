@@ -18,6 +18,7 @@ from psa_casadi.records.quality.fast_noise import fast_noise
 from psa_casadi.records.quality.suspects import cleaned, masked, suspects
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level
+from psa_casadi.shown import Note
 
 
 def as_read(record: Record) -> Record:
@@ -25,8 +26,8 @@ def as_read(record: Record) -> Record:
     return on_one_clock(cleaned(record))[0]
 
 
-def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
-    """Return the record to fit, and sentences on what was done to it.
+def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
+    """Return the record to fit, and what was done to it.
 
     Outliers, drop-outs and a stuck sensor are masked; where the sampling is so fast that block
     averages lose nothing, they take the samples' place.
@@ -38,8 +39,8 @@ def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
     return shorter, (*said, *averages)
 
 
-def averaged(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
-    """Return records with block averages where these lose nothing, and sentences that tell it.
+def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
+    """Return records with block averages where these lose nothing, and notes that tell it.
 
     As they are where all of their samples can be fitted.
     """
@@ -49,8 +50,8 @@ def averaged(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     return [r for r, _ in ready], [s for _, said in ready for s in said]
 
 
-def _averaged(record: Record) -> tuple[Record, tuple[str, ...]]:
-    """Return a record of block averages, where they lose nothing, and a sentence that tells it."""
+def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
+    """Return a record of block averages, where they lose nothing, and a note that tells it."""
     y = measured(record)
     noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([record])
     if noise <= 0 or slope == 0:
@@ -58,10 +59,7 @@ def _averaged(record: Record) -> tuple[Record, tuple[str, ...]]:
     shorter, factor = decimated(record, noise, slope)
     if factor == 1:
         return record, ()
-    return shorter, (
-        f"{record.name}: {record.n} samples are averaged in blocks of {factor}, which loses"
-        " nothing of voltage or displacement beyond a tenth of the noise.",
-    )
+    return shorter, (Note("averaged", (record.name, record.n, factor)),)
 
 
 #: Noise level of a column before a fit has told it, over the standard deviation of the column.
@@ -74,7 +72,7 @@ class Columns:
 
     model: Model
     fitted: tuple[str, ...]
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[Note, ...] = ()
 
 
 def columns_of(model: Model, records: Sequence[Record]) -> Columns:
@@ -97,7 +95,7 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
                 f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
             )
         elif why := _says_nothing(column, given):
-            said.append(f"{column} is left out: {why}.")
+            said.append(Note(why, (column,)))
         else:
             model = wider
             fitted.append(column)
@@ -133,12 +131,7 @@ def _with_sensor(model: Model, column: str) -> Model:
 
 
 def _says_nothing(column: str, records: Sequence[Record]) -> str:
-    """Return why a column is no use, "" where it is."""
+    """Return why a column is no use, as the code of a note, "" where it is."""
     if all(float(np.ptp(getattr(r, column))) == 0.0 for r in records):
-        return "it never changes"
-    if column == "current" and capacitance_of(records) is None:
-        return (
-            "it does not follow the voltage as a capacitance's does (another sign or unit, a"
-            " limited current, uneven time steps)"
-        )
-    return ""
+        return "still_column"
+    return "stray_current" if column == "current" and capacitance_of(records) is None else ""

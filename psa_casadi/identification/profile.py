@@ -7,7 +7,7 @@ import numpy as np
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.determinacy import covariance_of, weighted_rows
-from psa_casadi.identification.fitting.fit import Fit, objective
+from psa_casadi.identification.fitting.fit import Fit, Objective
 from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
@@ -55,10 +55,7 @@ class HeldFits:
         self.k = self.unknowns.names.index(name)
         self.log = fit.model.parameter(name).log
         self.estimate = fit.model.values[name]
-        weights = np.concatenate(
-            [np.full(int(e.used.sum()), s) for e, s in zip(experiments, fit.sigma, strict=True)]
-        )
-        self._evaluate = objective(fit.model, experiments, self.unknowns, weights, fit.way)
+        self._evaluate = Objective(fit.model, experiments, self.unknowns, fit.sigma, fit.way)
         self._tolerance = float(np.clip(_CLOSE * limit / fit.cost, 1e-9, 1e-5))
         self._fitted = fit.theta
         edges = (float(edge[self.k]) for edge in (self.unknowns.low, self.unknowns.high))

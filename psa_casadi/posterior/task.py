@@ -8,11 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.identification.fitting.fit import FIT_RTOL, Effort, accurate_minimum, objective
+from psa_casadi.identification.fitting.fit import (
+    Objective,
+    accurate_minimum,
+    unknowns_around,
+    weights_of,
+)
 from psa_casadi.identification.fitting.further import further_of
-from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Evaluate, Minimum
-from psa_casadi.identification.fitting.prediction import measured, motions_of
-from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
+from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum
+from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.search import free_parameters
@@ -22,6 +26,7 @@ from psa_casadi.records.quality.gaps import without_gaps
 from psa_casadi.records.quality.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level, whole
+from psa_casadi.shown import Note
 from psa_casadi.simulation.ways import Way
 from psa_casadi.units import FloatArray
 
@@ -160,7 +165,7 @@ class Task:
     inflation: tuple[float, ...]
     way: Way
     converged: bool
-    sentences: tuple[str, ...]
+    sentences: tuple[Note | str, ...]
 
 
 def task_of(
@@ -188,7 +193,11 @@ def task_of(
     centre = columns.model.with_values(_centres(columns.model, fitted, names, prior or {}))
     values = {n: columns.model.values[n] for n in names}
     sigma = noise_levels(experiments)
-    unknowns = _unknowns(centre, experiments, names, sigma, widths or {})
+    unknowns = unknowns_around(centre, names, experiments, sigma, placed=centre)
+    for name, width in (widths or {}).items():
+        if not width > 0.0:
+            raise InputError(f"The prior of '{name}' has the width {width:g}; give one above 0.")
+        unknowns.prior[names.index(name)] = width
     theta = np.zeros(unknowns.size)
     theta[: len(names)] = unknowns.coordinates(values)
     for r in range(unknowns.records):
@@ -237,26 +246,6 @@ def _centres(
     return {**centre, **given}
 
 
-def _unknowns(
-    centre: Model,
-    experiments: Sequence[Experiment],
-    names: Sequence[str],
-    sigma: Sequence[float],
-    widths: Mapping[str, float],
-) -> Unknowns:
-    """Return the coordinates around the priors' centre, with the widths that were given."""
-    motions = [motions_of(centre, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
-    first = [float(e.record.voltage[0]) for e in experiments]
-    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
-    found = unknowns_of(centre, names, motions, first, 30.0 * max(scale, 1e-12))
-    prior = found.prior.copy()
-    for name, width in widths.items():
-        if not width > 0.0:
-            raise InputError(f"The prior of '{name}' has the width {width:g}; give one above 0.")
-        prior[names.index(name)] = width
-    return replace(found, prior=prior)
-
-
 def _fitted(
     model: Model,
     experiments: Sequence[Experiment],
@@ -265,16 +254,13 @@ def _fitted(
     sigma: Sequence[float],
 ) -> tuple[Minimum, Way, list[float], tuple[Experiment, ...]]:
     """Return the fit, and the levels that its residuals suggest: of records and of columns."""
-    counts = [int(e.used.sum()) for e in experiments]
-    weights = np.repeat(np.array(sigma), counts)
-    linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
-    effort = Effort(_TOLERANCE, _EVALUATIONS, np.inf, linear, FIRST_RADIUS)
     found, way, _ = accurate_minimum(
-        model, experiments, unknowns, weights, theta, sigma, FIT_RTOL, effort
+        model, experiments, unknowns, theta, sigma, tolerance=_TOLERANCE, evaluations=_EVALUATIONS
     )
     if found.interrupted:
         raise KeyboardInterrupt
-    own = np.split(found.residual[: len(weights)] * weights, np.cumsum(counts)[:-1])
+    weights, ends = weights_of(experiments, sigma), np.cumsum([e.used.sum() for e in experiments])
+    own = np.split(found.residual[: len(weights)] * weights, ends[:-1])
     rms = [max(float(np.sqrt(np.mean(r**2))), 1e-15) for r in own]
     beside = further_of(model, experiments, unknowns, found.theta, way=way)
     levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in beside)
@@ -288,10 +274,10 @@ def _task(
     found: Minimum,
     way: Way,
     sigma: Sequence[float],
-    sentences: tuple[str, ...],
+    sentences: tuple[Note | str, ...],
 ) -> Task:
     counts = [int(e.used.sum()) for e in experiments]
-    evaluate = objective(model, experiments, unknowns, np.repeat(np.array(sigma), counts), way)
+    evaluate = Objective(model, experiments, unknowns, sigma, way)
     low, high = unknowns.bounds()
     again = evaluate(found.theta)
     if again is None:

@@ -23,7 +23,6 @@ from psa_casadi.identification.fitting.further import Further, further_of, scale
 from psa_casadi.identification.fitting.levenberg_marquardt import (
     FIRST_RADIUS,
     LEAST_RADIUS,
-    Evaluate,
     Minimum,
     minimise,
 )
@@ -44,6 +43,8 @@ from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.ways import Way
 from psa_casadi.units import FloatArray
 
+#: Relative tolerance of a step in fits.
+FIT_RTOL = 1e-6
 #: First voltages that differ by less than this share of the records' range are the same.
 _SAME = 0.01
 #: Coordinates of a start are of order 1: smaller than this none is known.
@@ -100,15 +101,13 @@ def _told(
     ]
     found = {
         first + place: [
-            float(theta[_place(unknowns, j, name)]) for j in alike if name in unknowns.started[j]
+            float(theta[unknowns.first(j) + unknowns.started[j].index(name)])
+            for j in alike
+            if name in unknowns.started[j]
         ]
         for place, name in enumerate(unknowns.started[k])
     }
     return {c: values for c, values in found.items() if values}
-
-
-def _place(unknowns: Unknowns, record: int, name: str) -> int:
-    return unknowns.first(record) + unknowns.started[record].index(name)
 
 
 def _sought(
@@ -140,20 +139,11 @@ def _sought(
         missed = (run.output[known] + unknowns.offset(there, k) - y) / level
         return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
 
-    return _minimum(evaluate, len(columns))
-
-
-def _minimum(evaluate: Evaluate, size: int) -> FloatArray:
-    """Return where the search ends; the last coordinate is the offset, exactly linear."""
-    free = np.full(size, np.inf)
-    found = minimise(
-        evaluate,
-        np.zeros(size),
-        (-free, free),
-        tolerance=_TOLERANCE,
-        evaluations=_EVALUATIONS,
-        linear=(size - 1,),
-    )
+    free = np.full(len(columns), np.inf)
+    found = minimise(  # the last coordinate is the offset, exactly linear
+        evaluate, np.zeros(len(columns)), (-free, free), tolerance=_TOLERANCE,
+        evaluations=_EVALUATIONS, linear=(len(columns) - 1,),
+    )  # fmt: skip
     if found is None:
         raise PsaError("A held-out record cannot be simulated from where the others begin.")
     return found.theta
@@ -168,47 +158,46 @@ _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
 _DIVERGED = 1e6
 
 
-@dataclass(frozen=True)
-class Effort:
-    """How far a minimum is sought: see `minimise`."""
-
-    tolerance: float
-    evaluations: int
-    goal: float
-    linear: tuple[int, ...]
-    radius: float
-    patient: bool = False
-
-
 def accurate_minimum(
     model: Model,
     experiments: Sequence[Experiment],
     unknowns: Unknowns,
-    weights: FloatArray,
     theta: FloatArray,
     sigma: Sequence[float],
-    rtol: float,
-    effort: Effort,
+    *,
+    tolerance: float,
+    evaluations: int,
+    rtol: float = FIT_RTOL,
+    goal: float = np.inf,
+    radius: float = FIRST_RADIUS,
+    patient: bool = False,
 ) -> tuple[Minimum, Way, list[Simulated]]:
-    """Return the minimum, found by a simulation that is accurate there, and how that was done."""
-    allowed = [_allowed(e, s) for e, s in zip(experiments, sigma, strict=True)]
-    goal = min(effort.goal, _missing_all(experiments, sigma))
+    """Return the minimum, found by a simulation that is accurate there, and how that was done.
+
+    See `minimise` for how far it is sought.
+    """
+    pairs = [(measured(e.record)[e.used], s) for e, s in zip(experiments, sigma, strict=True)]
+    allowed = [
+        max(_OF_NOISE * s, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0) for y, s in pairs
+    ]
+    if not any(e.further for e in experiments):  # a loop that diverges misses more than all
+        goal = min(goal, sum(y.size * float(np.ptp(y) / s) ** 2 for y, s in pairs if y.size))
     ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
     ways.append(Way(rtol, 0.1 * rtol, stepped=True))
     spent, before = 0, None
     for way in ways:
-        evaluate = objective(model, experiments, unknowns, weights, way)
+        evaluate = Objective(model, experiments, unknowns, sigma, way)
         try:
             found = minimise(
                 evaluate,
                 theta,
                 unknowns.bounds(),
-                tolerance=effort.tolerance,
-                evaluations=max(effort.evaluations - spent, 2),
+                tolerance=tolerance,
+                evaluations=max(evaluations - spent, 2),
                 goal=goal,
-                linear=effort.linear,
-                patient=effort.patient,
-                radius=effort.radius if before is None else max(before[0].radius, LEAST_RADIUS),
+                linear=unknowns.offsets,
+                patient=patient,
+                radius=radius if before is None else max(before[0].radius, LEAST_RADIUS),
             )
         except KeyboardInterrupt:
             if before is None:  # nothing was evaluated yet
@@ -235,52 +224,26 @@ def accurate_minimum(
     return replace(minimum, evaluations=spent), way, told
 
 
-def _missing_all(experiments: Sequence[Experiment], sigma: Sequence[float]) -> float:
-    """Return the cost of missing every sample by the whole range: a loop that diverges misses more.
+class Objective:
+    """The weighted residuals (predicted - measured, then priors) with their Jacobian, at a theta.
 
-    Infinite where a further column counts as well.
+    Those of the displacement, then those of the further columns. None where the model diverges. It
+    can be pickled with the posterior that it is part of.
     """
-    if any(e.further for e in experiments):
-        return np.inf
-    parts = [(measured(e.record)[e.used], s) for e, s in zip(experiments, sigma, strict=True)]
-    return sum(y.size * float(np.ptp(y) / s) ** 2 for y, s in parts if y.size)
-
-
-def _allowed(experiment: Experiment, sigma: float) -> float:
-    """Return the rms error [m] that a record's simulation may have."""
-    y = measured(experiment.record)[experiment.used]
-    return max(_OF_NOISE * sigma, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0)
-
-
-def objective(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    weights: FloatArray,
-    way: Way,
-) -> Evaluate:
-    """Return the weighted residuals (predicted - measured, then priors) with their Jacobian.
-
-    Those of the displacement, then those of the further columns. None where the model diverges.
-    """
-    return _Objective(model, tuple(experiments), unknowns, weights, way)
-
-
-class _Objective:
-    """What `objective` returns; it can be pickled with the posterior that it is part of."""
 
     def __init__(
-        self, model: Model, experiments: tuple[Experiment, ...], unknowns: Unknowns,
-        weights: FloatArray, way: Way,
+        self, model: Model, experiments: Sequence[Experiment], unknowns: Unknowns,
+        sigma: Sequence[float], way: Way,
     ) -> None:  # fmt: skip
-        self._of, self._way = (model, experiments, unknowns), way
+        self._of, self._way = (model, tuple(experiments), unknowns), way
         self._target = np.concatenate([measured(e.record)[e.used] for e in experiments])
-        span = float(np.ptp(self._target))
+        weights, span = weights_of(experiments, sigma), float(np.ptp(self._target))
         self._reach = float(np.max(span / weights)) if span > 0.0 else np.inf
         self._used = [e.used[: e.stop] for e in experiments]
         self._prior, self._share = 1.0 / unknowns.prior, 1.0 / weights
 
     def __call__(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return residuals (m,) and Jacobian (m, size)."""
         try:
             parts = predict(*self._of, theta, way=self._way)
             beside = further_of(*self._of, theta, way=self._way)
@@ -306,10 +269,13 @@ class _Objective:
         return (residual, jacobian) if finite and near else None
 
 
+def weights_of(experiments: Sequence[Experiment], sigma: Sequence[float]) -> FloatArray:
+    """Return the level [m] that weights each used sample (n,)."""
+    return np.repeat(np.asarray(sigma, dtype=np.float64), [int(e.used.sum()) for e in experiments])
+
+
 #: Correlation of neighbouring residuals that counts at most: a hundred samples are then one.
 _MOST_ALIKE = 0.98
-#: Relative tolerance of a step in fits.
-FIT_RTOL = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -452,21 +418,14 @@ def fit(
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
-    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
     placed = model.with_values(start or {})
-    motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
-    first = [float(e.record.voltage[0]) for e in experiments]
-    unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
-    unknowns = unknowns.without([k for k, e in enumerate(experiments) if not e.used.any()])
+    unknowns = unknowns_around(model, free, experiments, sigma, placed=placed)
     theta = _starting_point(model, experiments, unknowns, start or {}, start_states)
-    weights = np.concatenate(
-        [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
-    )
-    linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
-    effort = Effort(tolerance, evaluations, goal, linear, radius, patient)
     minimum, way, told = accurate_minimum(
-        model, experiments, unknowns, weights, theta, sigma, rtol, effort
-    )
+        model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
+        rtol=rtol, goal=goal, radius=radius, patient=patient,
+    )  # fmt: skip
+    weights = weights_of(experiments, sigma)
     further = further_of(model, experiments, unknowns, minimum.theta, way=way)
     found, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
@@ -485,6 +444,18 @@ def fit(
         radius=minimum.radius,
         further=further,
     )
+
+
+def unknowns_around(
+    model: Model, free: Sequence[str], experiments: Sequence[Experiment], sigma: Sequence[float],
+    *, placed: Model,
+) -> Unknowns:  # fmt: skip
+    """Return the coordinates of a fit around a model's values, `placed` where it begins."""
+    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
+    motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
+    first = [float(e.record.voltage[0]) for e in experiments]
+    unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
+    return unknowns.without([k for k, e in enumerate(experiments) if not e.used.any()])
 
 
 def _starting_point(

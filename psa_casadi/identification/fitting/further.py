@@ -16,6 +16,7 @@ from psa_casadi.identification.fitting.prediction import trace_record, traced_by
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
+from psa_casadi.shown import Note
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.ways import Way
 from psa_casadi.units import FloatArray
@@ -80,21 +81,18 @@ class Further:
         return COLUMNS[self.column].straight * self.spread
 
     @property
-    def sentence(self) -> str:
-        """What is left of the column, and what is odd about it, in words."""
+    def notes(self) -> tuple[Note, ...]:
+        """What is left of the column, and what is odd about it."""
         unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
         named = "" if unit == "1" else f" {unit}"
-        return (
-            f"{self.column}: fitted beside the displacement; {self.rms:.3g}{named} rms of it are"
-            f" missed, {share:.2g} % of its own rms.{' ' + self.turned if self.turned else ''}"
-        )
+        return (Note("column", (self.column, self.rms, named, share)), *self.turned)
 
     @property
-    def turned(self) -> str:
-        """Say so where a column falls while what it shows rises, else ""."""
+    def turned(self) -> tuple[Note, ...]:
+        """Say so where a column falls while what it shows rises."""
         if COLUMNS[self.column].scale is not None or self.factors[0] >= 0.0:
-            return ""
-        return f"{self.column} falls where the model's rises: its sign is probably turned."
+            return ()
+        return (Note("turned_column", (self.column,)),)
 
     @property
     def rms(self) -> float:

@@ -75,6 +75,11 @@ class Unknowns:
         """Number of coordinates."""
         return self.first(self.records)
 
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """Indices of the records' offsets, in which a prediction is exactly linear."""
+        return tuple(self.first(r + 1) - 1 for r in range(self.records))
+
     def values(self, theta: FloatArray) -> dict[str, float]:
         """Return the parameter values at theta, clipped to their bounds against rounding."""
         free = theta[: len(self.names)]

@@ -4,7 +4,7 @@ Quasi-static, in displacement units: x = k u + h,
 h' = A u' - beta |u'| |h|^(n-1) h - gamma u' |h|^n + delta u sgn(u').
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -15,6 +15,7 @@ import scipy
 
 from psa_casadi.identification.paper.linear import Loop
 from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.shown import Note
 from psa_casadi.units import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -44,7 +45,7 @@ class Rates:
     x_rate: FloatArray
     inner: BoolArray
     branches: tuple[slice, ...]
-    sentences: tuple[str, ...]
+    notes: tuple[Note, ...]
 
     def sign(self, branch: slice) -> float:
         """Return 1 on a branch on which the voltage rises, else -1."""
@@ -60,19 +61,30 @@ def rates_of(loop: Loop, k: float) -> Rates:
     pass through the same filter, so that what it bends it bends alike.
     """
     window, excess = window_of(loop)
-    u, u_rate = (_filter(loop.voltage, window, d, loop.sample_time) for d in (0, 1))
-    x, x_rate = (_filter(loop.displacement, window, d, loop.sample_time) for d in (0, 1))
-    inner, branches = _branches(loop.turns, len(u), window // 2 + 1)
-    sentences = []
-    if excess > _TOO_MUCH:
-        sentences.append(
-            f"The noise of loop '{loop.name}' does not allow a good velocity: over the longest"
-            f" window it is {100.0 * _QUIET * excess:.1f} % of the mean speed. A, delta, n, beta"
-            " and gamma rest on it; give slower or less noisy loops."
+    u, u_rate, x, x_rate = (
+        np.asarray(
+            scipy.signal.savgol_filter(
+                values, window, _ORDER, deriv=derivative, delta=loop.sample_time
+            ),
+            dtype=np.float64,
         )
-    return Rates(
-        loop.name, k, u, u_rate, x - k * u, x_rate, inner, tuple(branches), tuple(sentences)
+        for values in (loop.voltage, loop.displacement)
+        for derivative in (0, 1)
     )
+    margin = window // 2 + 1
+    branches = tuple(
+        slice(first + margin, last - margin + 1)
+        for first, last in pairwise([0, *loop.turns.tolist(), len(u) - 1])
+        if last - first > 2 * margin + 2
+    )
+    inner = np.zeros(len(u), dtype=np.bool_)
+    for branch in branches:
+        inner[branch] = True
+    notes = (Note("rough_velocity", (loop.name, 100.0 * _QUIET * excess)),)
+    return Rates(
+        loop.name, k, u, u_rate, x - k * u, x_rate, inner, branches,
+        notes if excess > _TOO_MUCH else (),
+    )  # fmt: skip
 
 
 def window_of(loop: Loop) -> tuple[int, float]:
@@ -83,35 +95,11 @@ def window_of(loop: Loop) -> tuple[int, float]:
     noise = high_frequency_noise(loop.displacement)
     window = _SHORTEST
     while True:
-        excess = noise * _gain(window, loop.sample_time) / allowed
+        weights = scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=loop.sample_time)
+        excess = noise * float(np.linalg.norm(weights)) / allowed
         if excess <= 1.0 or window >= longest:
             return window, excess
         window = min(longest, max(window + 2, int(1.2 * window) // 2 * 2 + 1))
-
-
-def _gain(window: int, sample_time: float) -> float:
-    weights = scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=sample_time)
-    return float(np.linalg.norm(weights))
-
-
-def _filter(values: FloatArray, window: int, derivative: int, sample_time: float) -> FloatArray:
-    smooth: FloatArray = scipy.signal.savgol_filter(
-        values, window, _ORDER, deriv=derivative, delta=sample_time
-    ).astype(np.float64)
-    return smooth
-
-
-def _branches(
-    turns: Sequence[int] | npt.NDArray[np.int64], n: int, margin: int
-) -> tuple[BoolArray, list[slice]]:
-    inner = np.zeros(n, dtype=bool)
-    edges = [0, *(int(j) for j in turns), n - 1]
-    branches = []
-    for first, last in pairwise(edges):
-        if last - first > 2 * margin + 2:
-            branches.append(slice(first + margin, last - margin + 1))
-            inner[branches[-1]] = True
-    return inner, branches
 
 
 #: Samples count in (31), (34) where h and |u'| exceed this share of their largest values.
@@ -143,7 +131,7 @@ class HysteresisPart:
     A: float | None = None
     delta: float | None = None
     bends: Bends | None = None
-    sentences: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 class Crossing(NamedTuple):
@@ -171,46 +159,41 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
     logarithm of (beta - gamma) h^n is taken, which says the same, and a sentence tells it.
     """
     rates = [rates_of(loop, k) for loop in loops]
-    sentences = [s for r in rates for s in r.sentences]
+    notes = [note for r in rates for note in r.notes]
     pairs = [pair for r in rates for pair in crossing_pairs(r)]
     if not pairs:
-        return HysteresisPart(sentences=(*sentences, _no_crossing(rates)))
+        return HysteresisPart(notes=(*notes, _no_crossing(rates)))
     each = np.array([slope_and_asymmetry(up, down, k) for up, down in pairs])
     A, delta = (float(v) for v in each.mean(axis=0))
-    sentences += _doubts_about_k(rates, each[:, 0])
+    notes += _doubts_about_k(rates, each[:, 0])
     rising, falling = (_logarithms(rates, A, delta, sign) for sign in (1.0, -1.0))
-    sentences += _lost(rising, "rising", "beta + gamma") + _lost(falling, "falling", "gamma - beta")
+    notes += _lost(rising, "rising", "beta + gamma") + _lost(falling, "falling", "gamma - beta")
     if rising is None or falling is None:
-        return HysteresisPart(A=A, delta=delta, sentences=tuple(sentences))
+        return HysteresisPart(A=A, delta=delta, notes=tuple(notes))
     n = rising.n
     total, difference = (
         line.sign * float(np.exp(line.mean_log - n * line.mean_log_h)) for line in (rising, falling)
     )
     if falling.sign < 0.0:
-        sentences.append(_LAGGING)
+        notes.append(Note("lagging_loop"))
     bends = Bends(n, 0.5 * (total - difference), 0.5 * (total + difference))
-    return HysteresisPart(A, delta, bends, tuple(sentences))
+    return HysteresisPart(A, delta, bends, tuple(notes))
 
 
-def crossing_pairs(r: Rates) -> Iterator[tuple[Crossing, Crossing]]:
-    """Yield a crossing of x = k u on a rising branch with that of the next falling branch.
+def crossing_pairs(r: Rates) -> list[tuple[Crossing, Crossing]]:
+    """Return each crossing of x = k u on a rising branch with that of the next falling branch.
 
     Where no rising branch with a crossing is followed by such a falling one, a falling branch is
     paired with the next rising one.
     """
     branches = [(r.sign(b), _crossing(r, b)) for b in r.branches]
     pairs = [
-        (first[1], then[1])
+        (first[0], first[1], then[1])
         for first, then in pairwise(branches)
-        if first[0] > 0.0 > then[0] and first[1] is not None and then[1] is not None
+        if first[0] * then[0] < 0.0 and first[1] is not None and then[1] is not None
     ]
-    if not pairs:
-        pairs = [
-            (then[1], first[1])
-            for first, then in pairwise(branches)
-            if then[0] > 0.0 > first[0] and first[1] is not None and then[1] is not None
-        ]
-    yield from pairs
+    up_first = [(first, then) for sign, first, then in pairs if sign > 0.0]
+    return up_first or [(then, first) for _, first, then in pairs]
 
 
 def slope_and_asymmetry(up: Crossing, down: Crossing, k: float) -> tuple[float, float]:
@@ -271,68 +254,34 @@ def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> 
     return _Line(common, slope, float(np.mean(logs)), float(np.mean(log_h[good])), lost)
 
 
-def _lost(line: _Line | None, branch: str, what: str) -> list[str]:
-    """Say where (31) or (34) had no samples, or logarithms of numbers of the wrong sign."""
+def _lost(line: _Line | None, branch: str, what: str) -> list[Note]:
+    """Note where (31) or (34) had no samples, or logarithms of numbers of the wrong sign."""
     if line is None:
-        return [
-            f"No samples with h = x - k u above zero are left on the {branch} branches, so {what}"
-            " has no equation, and the model has no loop (f_H = 0). Likely cause: k is wrong or the"
-            " loops did not begin at rest at 0 V; give loops that do."
-        ]
-    found = []
-    if branch == "rising" and line.sign < 0.0:
-        found.append(
-            "The logarithms of (31) are of negative numbers on the rising branches, so beta + gamma"
-            " > 0 does not hold; the logarithms of the opposite numbers are taken."
-        )
+        return [Note("no_samples", (branch, what))]
+    notes = [Note("negative_rising")] if branch == "rising" and line.sign < 0.0 else []
     if line.lost > _FEW:
-        found.append(
-            f"{100.0 * line.lost:.0f} % of the logarithms on the {branch} branches ({what}) are of"
-            " numbers of the wrong sign and were left out, which biases the rest. Likely cause:"
-            " noise, or a k that is wrong; give slower loops or another step."
-        )
-    return found
+        notes.append(Note("wrong_sign", (100.0 * line.lost, branch, what)))
+    return notes
 
 
-def _no_crossing(rates: Sequence[Rates]) -> str:
+def _no_crossing(rates: Sequence[Rates]) -> Note:
     missing = [
         name
         for name, sign in (("rising", 1.0), ("falling", -1.0))
         if not any(_crossing(r, b) for r in rates for b in r.branches if r.sign(b) == sign)
     ]
-    where = f"the {' and the '.join(missing)} branches" if missing else "two branches in succession"
-    return (
-        f"x = k u is not met on {where} of the loops, so A and delta cannot be read at zero"
-        " crossings, and n, beta and gamma rest on them: the model has no loop (f_H = 0). Likely"
-        " cause: k contains a part of the hysteresis (it is the secant of the step), or the loops"
-        " did not begin at rest at 0 V; give two periods or more from rest."
-    )
+    return Note("no_crossing", (missing,))
 
 
-def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[str]:
-    """Say that k is doubtful where A scatters, or where the loop closes on the line x = k u."""
-    found = []
+def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[Note]:
+    """Note that k is doubtful where A scatters, or where the loop closes on the line x = k u."""
+    notes = []
     scatter = float(np.std(slopes) / max(abs(float(np.mean(slopes))), 1e-300))
     if scatter > _SCATTER:
-        found.append(
-            f"A scatters by {100.0 * scatter:.0f} % between the loops' periods, which it should"
-            " not: the loops are not those of eq. (8) with this k."
-        )
+        notes.append(Note("scatter", (100.0 * scatter,)))
     widest = max(rates, key=lambda r: float(np.ptp(r.u)))
     top = int(np.argmax(np.abs(widest.u)))
     share = abs(float(widest.h[top])) / float(np.max(np.abs(widest.h)))
     if share < _CLOSED:
-        found.append(
-            f"At its tip the loop '{widest.name}' meets the line x = k u (h there is"
-            f" {100.0 * share:.0f} % of its largest value): k, read from a step, holds what the"
-            " hysteresis adds at that voltage, and the paper takes it for the linear part alone."
-            " k, A, delta and all that rest on them are off."
-        )
-    return found
-
-
-_LAGGING = (
-    "The logarithm of (34) is of negative numbers: gamma > beta does not hold, as it cannot for a"
-    " loop that lags. The logarithm of (beta - gamma) h^n was taken instead, which is the same"
-    " equation."
-)
+        notes.append(Note("secant", (widest.name, 100.0 * share)))
+    return notes

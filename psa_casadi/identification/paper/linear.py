@@ -11,6 +11,7 @@ import scipy
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.quality.noise import high_frequency_noise
 from psa_casadi.records.record import Record
+from psa_casadi.shown import Note
 from psa_casadi.units import FloatArray
 
 #: How far the voltage may stray from its two levels, and how long the rise may take of the hold.
@@ -158,17 +159,20 @@ _OVERSHOOT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class LinearPart:
-    """Coefficients of eq. (15) [s to s^5, then s] and what is doubtful about them, in sentences."""
+    """Coefficients of eq. (15) [s to s^5, then s] and what is doubtful about them."""
 
     coefficients: Mapping[str, float]
-    sentences: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 def linear_part(step: Step) -> LinearPart:
     """Return a_1..a_5, b_1 by the iterated integrals of one step response, and their doubts."""
     found = moment_coefficients(step.time, step.g)
-    sentences = [*_dependence(step, found), *_signs(found)]
-    return LinearPart(dict(zip(COEFFICIENTS, found.tolist(), strict=True)), tuple(sentences))
+    notes = _dependence(step, found)
+    wrong = [name for name, value in zip(COEFFICIENTS, found, strict=True) if not value > 0.0]
+    if wrong:
+        notes.append(Note("signs", (wrong,)))
+    return LinearPart(dict(zip(COEFFICIENTS, found.tolist(), strict=True)), tuple(notes))
 
 
 def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
@@ -213,38 +217,20 @@ def coefficients_of_limits(limits: FloatArray) -> FloatArray:
     return found
 
 
-def coefficients_of_values(values: Mapping[str, float]) -> FloatArray:
-    """Return a_1..a_5, b_1, shape (6,), of the physical parameters of the cascade, eqs. (13), (15).
-
-    The denominator is (tau s + 1) (m_B/k_B s^2 + c_B/k_B s + 1) (m_P/k_P s^2 + c_P/k_P s + 1).
-    """
-    product = np.array([values["tau"], 1.0])
-    for part in "BP":
-        m, c, k = (values[f"{q}_{part}"] for q in "mck")
-        product = np.polymul(product, [m / k, c / k, 1.0])
-    zero = (values["c_B"] + values["c_P"]) / (values["k_B"] + values["k_P"])
-    return np.append(product[-2::-1], zero)
-
-
-def _dependence(step: Step, found: FloatArray) -> list[str]:
-    """Say whether the coefficients depend on the end of the window, and why that may be."""
+def _dependence(step: Step, found: FloatArray) -> list[Note]:
+    """Return a note where the coefficients depend on the end of the window, and why that may be."""
     kept = step.time <= (1.0 - _CUT) * step.time[-1]
     other = moment_coefficients(step.time[kept], step.g[kept])
     change = np.abs(other - found) / np.maximum(np.abs(found), 1e-300)
     worst = int(np.argmax(change))
     if change[worst] <= _STEADY:
         return []
-    reasons = _reasons(step) or ["the window is too short for the higher integrals"]
-    return [
-        f"The linear part is not to be trusted: without the last tenth of step '{step.name}',"
-        f" {COEFFICIENTS[worst]} changes by {_share(change[worst])}, though it should not"
-        f" depend on where the window ends. Likely cause: {'; '.join(reasons)}. Use"
-        " --method prediction-error for these records."
-    ]
+    reasons = _reasons(step) or [("short", 0.0)]
+    return [Note("window", (step.name, COEFFICIENTS[worst], change[worst], reasons))]
 
 
-def _reasons(step: Step) -> list[str]:
-    """Return what keeps the iterated integrals of a step from converging, as parts of a sentence.
+def _reasons(step: Step) -> list[tuple[str, float]]:
+    """Return what keeps the iterated integrals of a step from converging, and of what size it is.
 
     Truncation: the means of the last two twentieths differ. Noise: the high-frequency noise of the
     last quarter. Ringing: the response passes its steady state by more than 1 %.
@@ -256,34 +242,12 @@ def _reasons(step: Step) -> list[str]:
     overshoot = float(np.max(g)) - 1.0
     reasons = []
     if drift > max(4.0 * noise / np.sqrt(last), 1e-12):
-        reasons.append(
-            f"the window truncates the response, which still moves by {drift:.1g} of the step at"
-            " its end"
-        )
+        reasons.append(("truncated", drift))
     if noise > 1e-9:
-        reasons.append(f"white noise of {noise:.1g} of the step, which six integrations amplify")
+        reasons.append(("noise", noise))
     if overshoot > max(_OVERSHOOT, 6.0 * noise):
-        reasons.append(
-            f"the response rings (it overshoots by {100.0 * overshoot:.0f} %), and integrals of a"
-            " ringing response converge only long after the ringing has ended"
-        )
+        reasons.append(("ringing", 100.0 * overshoot))
     return reasons
-
-
-def _signs(found: FloatArray) -> list[str]:
-    """Say which coefficients are not larger than zero, as eq. (15) demands."""
-    wrong = [name for name, value in zip(COEFFICIENTS, found, strict=True) if not value > 0.0]
-    if not wrong:
-        return []
-    verb = "is" if len(wrong) == 1 else "are"
-    return [
-        f"{', '.join(wrong)} {verb} not larger than zero, which the paper's eq. (15) demands: the"
-        " moments did not find a stack's transfer function. A longer, quieter step may help."
-    ]
-
-
-def _share(change: float) -> str:
-    return f"a factor of {change:.2g}" if change > 10.0 else f"{100.0 * change:.0f} %"
 
 
 #: A root counts as real where its imaginary part is below this share of its size.
@@ -305,8 +269,8 @@ class Factors:
 
 def mechanics_of(
     coefficients: Mapping[str, float], k_P: float, k_B: float
-) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return tau, m_P, c_P, m_B, c_B (SI), and sentences; tau alone where no stack has the roots.
+) -> tuple[dict[str, float], tuple[Note, ...]]:
+    """Return tau, m_P, c_P, m_B, c_B (SI), and notes; tau alone where no stack has the roots.
 
     a_5 s^5 + ... + a_1 s + 1 = (tau s + 1) (m_P/k_P s^2 + c_P/k_P s + 1) (m_B/k_B s^2 + ...).
     A real root gives tau, the other four make two pairs. Where several readings exist (the
@@ -316,13 +280,11 @@ def mechanics_of(
     """
     denominator = [coefficients[name] for name in reversed(COEFFICIENTS[:5])]
     if not np.all(np.isfinite(denominator)) or denominator[0] == 0.0:
-        return _delay_alone(coefficients), (_NOT_A_STACK.format("a_5 is zero or not finite"),)
+        return _delay_alone(coefficients), (Note("no_a_5"),)
     roots = np.roots([*denominator, 1.0]).astype(np.complex128)
     if np.any(roots.real >= 0.0):
         count = int(np.sum(roots.real >= 0.0))
-        return _delay_alone(coefficients), (
-            _NOT_A_STACK.format(f"{count} of its 5 poles do not decay"),
-        )
+        return _delay_alone(coefficients), (Note("growing_poles", (count,)),)
     b_1 = coefficients["b_1"]
 
     def distance(f: Factors) -> tuple[float, float]:
@@ -339,11 +301,7 @@ def mechanics_of(
     }
     if distance(best)[0] <= _ZERO_AGREES:
         return values, ()
-    return values, (
-        f"b_1 = {b_1:.3g} s, but the poles allow {_zero(best, k_P, k_B):.3g} s at the nearest with"
-        f" the assumed k_P/k_B = {k_P / k_B:.3g}: b_1 or this ratio is wrong, and the first"
-        " microseconds of a step will be off.",
-    )
+    return values, (Note("other_zero", (b_1, _zero(best, k_P, k_B), k_P / k_B)),)
 
 
 def readings(roots: npt.NDArray[np.complex128]) -> Iterator[Factors]:
@@ -377,9 +335,3 @@ def _delay_alone(coefficients: Mapping[str, float]) -> dict[str, float]:
 
 def _zero(f: Factors, k_P: float, k_B: float) -> float:
     return (f.c_B * k_B + f.c_P * k_P) / (k_B + k_P)
-
-
-_NOT_A_STACK = (
-    "The denominator of eq. (15) is no stack's: {}. tau = a_1 - b_1 alone is taken, masses and"
-    " dampings keep ordinary values; use --method prediction-error, or a longer, quieter step."
-)

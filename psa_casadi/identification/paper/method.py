@@ -30,81 +30,32 @@ from psa_casadi.identification.start.ordinary import ordinary_values, starting_m
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
+from psa_casadi.shown import Note, sentences
 
 #: The paper's loops are slower than this [Hz], and their lag should stay below this angle [rad].
 _SLOW, _QUASI_STATIC = 1.0, 0.01
 
 
-def missing(step: Step | None, loops: Sequence[Loop]) -> list[str]:
-    """Say what the records lack."""
-    sentences = []
-    if step is None:
-        rest = (
-            " k is taken from the slope of the largest loop near its tip, which is not the paper's."
-            if loops
-            else ""
-        )
-        sentences.append(
-            "No record is a step (a jump of the voltage that is then held), so the linear part"
-            " cannot be found by this method: the lag, masses and dampings keep ordinary values."
-            f"{rest} Give the response to a step as a record."
-        )
+def conditions(step: Step | None, loops: Sequence[Loop], linear: LinearPart | None) -> list[Note]:
+    """Note what the records lack: a step, a loop, loops that are slow, from 0 V, without gaps."""
+    notes = [Note("no_step", (bool(loops),))] if step is None else []
+    notes += [] if loops else [Note("no_loop")]
+    notes += linear.notes if linear else ()
     if not loops:
-        sentences.append(
-            "No record is a loop (a voltage that goes up and down at even intervals), so A, delta,"
-            " n, beta and gamma cannot be found by this method: the model has no loop (f_H = 0)."
-            " Give two periods of a slow sine or triangle from rest at 0 V."
-        )
-    return sentences
-
-
-def loop_conditions(loops: Sequence[Loop], linear: LinearPart | None) -> list[str]:
-    """Say where the loops are too fast, do not begin at 0 V, or have gaps."""
-    if not loops:
-        return []
-    sentences, frequency = [], loops[0].frequency
+        return notes
+    frequency = loops[0].frequency
     if frequency > 1.001 * _SLOW:
-        sentences.append(
-            f"The slowest loops have {frequency:.3g} Hz; the paper asks for less than 1 Hz, so that"
-            " mechanics and lag do not widen the loop. Give slower loops."
-        )
+        notes.append(Note("fast_loops", (frequency,)))
     if linear is not None:
         delay = linear.coefficients["a_1"] - linear.coefficients["b_1"]
         angle = 2.0 * np.pi * frequency * delay
         if angle > _QUASI_STATIC:
-            sentences.append(
-                f"The step lags by {1e3 * delay:.3g} ms, {angle:.2g} rad of"
-                f" the loops at {frequency:.3g} Hz, which the method counts as hysteresis: A,"
-                " delta, n, beta and gamma are off. Give slower loops."
-            )
-    away = [
-        loop.name for loop in loops if abs(loop.first_volts) > 0.02 * float(np.ptp(loop.voltage))
-    ]
-    if away:
-        sentences.append(
-            f"{_names(away)} do not begin at 0 V, though the method needs h = 0 at the start; their"
-            " first sample is taken for rest. Give loops from rest at 0 V."
-        )
+            notes.append(Note("lagging_step", (1e3 * delay, angle, frequency)))
+    away = [o.name for o in loops if abs(o.first_volts) > 0.02 * float(np.ptp(o.voltage))]
     gaps = [f"{loop.name} ({loop.missing})" for loop in loops if loop.missing]
-    if gaps:
-        sentences.append(
-            f"Missing samples were bridged by straight lines in {_names(gaps)}; derivatives there"
-            " are not measured."
-        )
-    return sentences
-
-
-def _names(names: Sequence[str]) -> str:
-    return ", ".join(f"'{n}'" for n in names)
-
-
-@dataclass(frozen=True, eq=False)
-class Translated:
-    """The model, the names of its parameters that were found, and what could not be taken over."""
-
-    model: Model
-    found: tuple[str, ...]
-    sentences: tuple[str, ...]
+    notes += [Note("not_from_rest", (away,))] if away else []
+    notes += [Note("bridged", (gaps,))] if gaps else []
+    return notes
 
 
 def in_forces(
@@ -112,36 +63,28 @@ def in_forces(
     k: float | None,
     coefficients: Mapping[str, float] | None,
     bend: HysteresisPart,
-) -> Translated:
+) -> tuple[Model, tuple[str, ...], list[Note]]:
     """Return `start` with everything that was found, k_P and k_B being those of `start`.
 
+    Beside it the names of the parameters that were found, and what could not be taken over.
     k_L = k/C with C = 1/k_P + 1/k_B [m/N]; lag, masses and dampings are factors of the denominator.
     Without a loop f_H is 0; without factors the parts are damped critically, c >= 2 sqrt(k m),
     since nothing is known to ring. A value out of its bounds is refused, n is clipped.
     """
-    compliance = static_compliance(start.values)
-    usual = _still(start)
-    motion: dict[str, float] = {}
-    sentences: tuple[str, ...] = ()
-    if coefficients is not None:
-        motion, sentences = mechanics_of(coefficients, start.values["k_P"], start.values["k_B"])
-    wanted = {**motion, **_loop(bend, compliance, start.values["h_ref"])}
+    p = start.values
+    compliance = static_compliance(p)
+    critical = {f"c_{q}": 2.0 * float(np.sqrt(p[f"k_{q}"] * p[f"m_{q}"])) for q in "PB"}
+    still = dict.fromkeys(("A", "beta", "gamma", "delta"), 0.0)
+    usual = start.with_values({**still, **{c: max(v, p[c]) for c, v in critical.items()}})
+    motion, notes = (
+        ({}, ()) if coefficients is None else mechanics_of(coefficients, p["k_P"], p["k_B"])
+    )
+    wanted = {**motion, **_loop(bend, compliance, p["h_ref"])}
     if k is not None:
         wanted["k_L"] = k / compliance
     kept, refused = _inside(usual, wanted)
-    return Translated(
-        model=usual.with_values(kept),
-        found=tuple(name for name in start.parameter_names if name in kept),
-        sentences=(*sentences, *refused),
-    )
-
-
-def _still(start: Model) -> Model:
-    """Return the model without a loop and with both parts damped critically at least."""
-    p = start.values
-    critical = {f"c_{q}": 2.0 * float(np.sqrt(p[f"k_{q}"] * p[f"m_{q}"])) for q in "PB"}
-    loop = dict.fromkeys(("A", "beta", "gamma", "delta"), 0.0)
-    return start.with_values({**loop, **{c: max(v, p[c]) for c, v in critical.items()}})
+    found = tuple(name for name in start.parameter_names if name in kept)
+    return usual.with_values(kept), found, [*notes, *refused]
 
 
 def _loop(bend: HysteresisPart, compliance: float, h_ref: float) -> dict[str, float]:
@@ -163,8 +106,8 @@ def _loop(bend: HysteresisPart, compliance: float, h_ref: float) -> dict[str, fl
     }
 
 
-def _inside(model: Model, wanted: Mapping[str, float]) -> tuple[dict[str, float], list[str]]:
-    """Return the values that the parameters' bounds allow, and a sentence for each other one."""
+def _inside(model: Model, wanted: Mapping[str, float]) -> tuple[dict[str, float], list[Note]]:
+    """Return the values that the parameters' bounds allow, and a note for each other one."""
     kept, refused = {}, []
     for name, value in wanted.items():
         p = model.parameter(name)
@@ -174,10 +117,7 @@ def _inside(model: Model, wanted: Mapping[str, float]) -> tuple[dict[str, float]
             kept[name] = float(np.clip(value, low, high))
         if not within:
             instead = kept.get(name, model.values[name])
-            refused.append(
-                f"{name} = {value:.3g} {p.unit} is outside of its range, {low:g} to {high:g};"
-                f" {instead:.3g} stands in the model, and the rest does not belong to it."
-            )
+            refused.append(Note("out_of_range", (name, value, p.unit, low, high, instead)))
     return kept, refused
 
 
@@ -192,7 +132,7 @@ class PaperIdentification:
     `coefficients` are a_1 [s] to a_5 [s^5] and b_1 [s] of eq. (15). `k` [m/V], `A` [m/V], `delta`
     [m/(V.s)] and `bends` (n, beta, gamma) are in displacement units, eqs. (25), (26). `model` has
     them in forces; without a loop its f_H is 0, and what else was not found has ordinary values.
-    `found` names the parameters that the method set; `sentences` say what failed or is doubtful.
+    `found` names the parameters that the method set; `notes` tell what failed or is doubtful.
     """
 
     coefficients: Mapping[str, float] | None
@@ -202,7 +142,12 @@ class PaperIdentification:
     bends: Bends | None
     model: Model
     found: tuple[str, ...]
-    sentences: tuple[str, ...]
+    notes: tuple[Note, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What failed or is doubtful, in words."""
+        return sentences(self.notes)
 
 
 def paper_method(
@@ -219,15 +164,8 @@ def paper_method(
     slowest = [loop for loop in loops if loop.frequency < 1.05 * loops[0].frequency]
     k = step.k if step is not None else _slope_at_tip(slowest)
     bend = hysteresis_part(slowest, k) if slowest and k is not None else HysteresisPart()
-    translated = in_forces(
+    model, found, notes = in_forces(
         starting_model(records, stiffness), k, linear.coefficients if linear else None, bend
-    )
-    sentences = (
-        *missing(step, slowest),
-        *(linear.sentences if linear else ()),
-        *loop_conditions(slowest, linear),
-        *bend.sentences,
-        *translated.sentences,
     )
     return PaperIdentification(
         coefficients=linear.coefficients if linear else None,
@@ -235,9 +173,9 @@ def paper_method(
         A=bend.A,
         delta=bend.delta,
         bends=bend.bends,
-        model=translated.model,
-        found=translated.found,
-        sentences=sentences,
+        model=model,
+        found=found,
+        notes=(*conditions(step, slowest, linear), *bend.notes, *notes),
     )
 
 
@@ -255,8 +193,7 @@ def identify_by_paper(
     progress("moments and zero crossings")
     paper = paper_method(records, stiffness=stiffness)
     experiments = tuple(whole(r) for r in records)
-    sigma, sentences = noise_levels(experiments), paper.sentences
-    found = paper.found
+    sigma, doubts, found = noise_levels(experiments), paper.notes, paper.found
     progress("the model on all records")
     try:
         best = fit(paper.model, experiments, [], sigma=sigma)
@@ -265,17 +202,17 @@ def identify_by_paper(
     except PsaError:
         usual = paper.model.with_values(ordinary_values(paper.model, records))
         best = fit(usual, experiments, [], sigma=sigma)
-        sentences, found = (*sentences, _RUNS_AWAY), ()
+        doubts, found = (*doubts, Note("runs_away")), ()
     nothing = determinacy(best, experiments)
     model = with_provenance(best.model, nothing, records, stiffness is not None)
-    notes = (*model.provenance.notes, _note(found))
+    notes = (*model.provenance.notes, Note("paper", (found,)).sentence)
     provenance = replace(model.provenance, notes=notes)
     return Identification(
         model=replace(model, provenance=provenance),
         fit=best,
         determinacy=nothing,
         experiments=experiments,
-        doubts=sentences,
+        doubts=doubts,
         read_off=found,
     )
 
@@ -295,18 +232,3 @@ def _slope_at_tip(loops: Sequence[Loop]) -> float | None:
     if part.sum() < 3:
         return None
     return float(np.polyfit(u[part], x[part], 1)[0])
-
-
-def _note(found: Sequence[str]) -> str:
-    named = ", ".join(found) or "nothing"
-    return (
-        "Identified by the paper's method (Yang and Zhu 2015, section 3), which gives no intervals."
-        f" It found {named}; all other parameters have ordinary values."
-    )
-
-
-_RUNS_AWAY = (
-    "The model with these values cannot be simulated on the records (with A, beta and gamma like"
-    " these the hysteresis grows without bound, or masses and dampings are out of proportion), so"
-    " its loop, lags and masses were set back to ordinary values; use --method prediction-error."
-)

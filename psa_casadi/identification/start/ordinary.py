@@ -32,6 +32,7 @@ from psa_casadi.identification.start.doubts import (
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.records.quality.filtering import filtered
 from psa_casadi.records.record import Record
+from psa_casadi.shown import Note, sentences
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval
 
@@ -99,13 +100,10 @@ class Capacitance:
 
     def sentence(self, value: float) -> str:
         """What the current says, in words; `value` [F] is that of the model."""
-        low, high = 1e6 * self.interval.low, 1e6 * self.interval.high
-        kept = "" if self.is_that_of(value) else f" The model keeps the {1e6 * value:.4g} uF given."
-        return (
-            f"The measured {self.source} tells C_p = {1e6 * self.value:.4g} uF ({low:.4g} to"
-            f" {high:.4g}; times the amplifier's gain, if the voltage is its input): it explains"
-            f" {100 * self.explained:.1f} % of it.{kept}"
-        )
+        ends = (1e6 * self.interval.low, 1e6 * self.interval.high)
+        of = (self.source, 1e6 * self.value, *ends, 100 * self.explained)
+        kept = () if self.is_that_of(value) else (Note("capacitance_kept", (1e6 * value,)),)
+        return " ".join(sentences((Note("capacitance", of), *kept)))
 
 
 def capacitance_of(records: Sequence[Record]) -> Capacitance | None:

@@ -27,6 +27,7 @@ import numpy.typing as npt
 from psa_casadi.identification.start.linear_response import orthonormal, plays
 from psa_casadi.records.quality.filtering import filtered
 from psa_casadi.records.record import Record
+from psa_casadi.shown import Note
 from psa_casadi.units import FloatArray
 
 #: Beats that a record may hold; phases that are tried, and how much finer than 1/T the rates.
@@ -208,14 +209,14 @@ class TwoClocks:
 
     def sentence(self, record: Record) -> str:
         """Say what was found in the record."""
+        return f"{self._note(record).sentence}."
+
+    def _note(self, record: Record) -> Note:
         scale, unit = (1e9, "nm") if record.displacement_unit == "m" else (1.0, "counts")
         off = scale * float(np.sqrt(np.nanmean(self.moved**2)))
-        return (
-            f"{record.name}: voltage and displacement were sampled by two clocks: the delay between"
-            f" them {'falls' if self.falling else 'grows'} evenly by {1e3 * self.height:.3g} ms and"
-            f" jumps back every {self.period:.3g} s, which moves the readings by {off:.2g} {unit}"
-            " rms."
-        )
+        way = "falls" if self.falling else "grows"
+        of = (record.name, way, 1e3 * self.height, self.period, off, unit)
+        return Note("two_clocks", of)
 
 
 def on_one_clock(record: Record) -> tuple[Record, tuple[str, ...]]:
@@ -226,8 +227,8 @@ def on_one_clock(record: Record) -> tuple[Record, tuple[str, ...]]:
     found = two_clocks(record)
     if found is None:
         return record, ()
-    said = f"{found.sentence(record)[:-1]}; that was undone. Better read both from one device."
-    return replace(found.undone(record), source=record.source, sha256=record.sha256), (said,)
+    undone = replace(found.undone(record), source=record.source, sha256=record.sha256)
+    return undone, (f"{found.sentence(record)[:-1]}{Note('clocks_undone').sentence}",)
 
 
 def two_clocks(record: Record) -> TwoClocks | None:

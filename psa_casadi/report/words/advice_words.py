@@ -22,6 +22,37 @@ def _quoted(names: Sequence[str]) -> str:
     return ", ".join(f"'{n}'" for n in names)
 
 
+def _change(share: float) -> str:
+    return f"a factor of {share:.2g}" if share > 10.0 else f"{100.0 * share:.0f} %"
+
+
+def _reasons(reasons: Sequence[tuple[str, float]]) -> str:
+    """Return what keeps iterated integrals from converging, of what size each."""
+    words = {
+        "truncated": "the window truncates the response, which still moves by {:.1g} of the step"
+        " at its end",
+        "noise": "white noise of {:.1g} of the step, which six integrations amplify",
+        "ringing": "the response rings (it overshoots by {:.0f} %), and integrals of a ringing"
+        " response converge only long after the ringing has ended",
+        "short": "the window is too short for the higher integrals",
+    }
+    return "; ".join(words[code].format(size) for code, size in reasons)
+
+
+def _branches(missing: Sequence[str]) -> str:
+    if missing:
+        return f"the {' and the '.join(missing)} branches"
+    return "two branches in succession"
+
+
+_TIP_FOR_STEP = (
+    " k is taken from the slope of the largest loop near its tip, which is not the paper's."
+)
+_NO_STACK = "The denominator of eq. (15) is no stack's: "
+_DELAY_ALONE = (
+    ". tau = a_1 - b_1 alone is taken, masses and dampings keep ordinary values; use --method"
+    " prediction-error, or a longer, quieter step."
+)
 #: Sentences by the codes of notes; their figures are put in where the braces stand.
 _NOTES: Mapping[str, str | Callable[..., str]] = {
     "interrupted": "The search was interrupted; this is the best fit so far, and its values are not"
@@ -40,6 +71,96 @@ _NOTES: Mapping[str, str | Callable[..., str]] = {
     "missed": "Record '{}' is missed by {:.2g} times its noise: the model lacks something there;"
     " `psa diagnose` looks for the cause.",
     "form": "hysteresis: {}, which leaves {:.3g} nm rms; {} would leave {:.3g} nm.",
+    "force_assumed": "Force scale assumed: voltage and displacement determine the displacement"
+    " only. Forces, masses and stiffnesses are right in proportion, not in size; give a stiffness"
+    " to fix them.",
+    "averaged": "{}: {} samples are averaged in blocks of {}, which loses nothing of voltage or"
+    " displacement beyond a tenth of the noise.",
+    "still_column": "{} is left out: it never changes.",
+    "stray_current": "{} is left out: it does not follow the voltage as a capacitance's does"
+    " (another sign or unit, a limited current, uneven time steps).",
+    "column": "{0}: fitted beside the displacement; {1:.3g}{2} rms of it are missed, {3:.2g} % of"
+    " its own rms.",
+    "turned_column": "{} falls where the model's rises: its sign is probably turned.",
+    "capacitance": "The measured {} tells C_p = {:.4g} uF ({:.4g} to {:.4g}; times the amplifier's"
+    " gain, if the voltage is its input): it explains {:.1f} % of it.",
+    "capacitance_kept": "The model keeps the {:.4g} uF given.",
+    "two_clocks": "{}: voltage and displacement were sampled by two clocks: the delay between them"
+    " {} evenly by {:.3g} ms and jumps back every {:.3g} s, which moves the readings by {:.2g} {}"
+    " rms",
+    "clocks_undone": "; that was undone. Better read both from one device.",
+    "paper": lambda names: (
+        "Identified by the paper's method (Yang and Zhu 2015, section 3), which gives no"
+        f" intervals. It found {', '.join(names) or 'nothing'}; all other parameters have ordinary"
+        " values."
+    ),
+    "no_step": lambda loops: (
+        "No record is a step (a jump of the voltage that is then held), so the linear part cannot"
+        " be found by this method: the lag, masses and dampings keep ordinary values."
+        f"{_TIP_FOR_STEP if loops else ''} Give the response to a step as a record."
+    ),
+    "no_loop": "No record is a loop (a voltage that goes up and down at even intervals), so A,"
+    " delta, n, beta and gamma cannot be found by this method: the model has no loop (f_H = 0)."
+    " Give two periods of a slow sine or triangle from rest at 0 V.",
+    "fast_loops": "The slowest loops have {:.3g} Hz; the paper asks for less than 1 Hz, so that"
+    " mechanics and lag do not widen the loop. Give slower loops.",
+    "lagging_step": "The step lags by {:.3g} ms, {:.2g} rad of the loops at {:.3g} Hz, which the"
+    " method counts as hysteresis: A, delta, n, beta and gamma are off. Give slower loops.",
+    "not_from_rest": lambda names: (
+        f"{_quoted(names)} do not begin at 0 V, though the method needs h = 0 at the start; their"
+        " first sample is taken for rest. Give loops from rest at 0 V."
+    ),
+    "bridged": lambda names: (
+        f"Missing samples were bridged by straight lines in {_quoted(names)}; derivatives there are"
+        " not measured."
+    ),
+    "out_of_range": "{} = {:.3g} {} is outside of its range, {:g} to {:g}; {:.3g} stands in the"
+    " model, and the rest does not belong to it.",
+    "runs_away": "The model with these values cannot be simulated on the records (with A, beta and"
+    " gamma like these the hysteresis grows without bound, or masses and dampings are out of"
+    " proportion), so its loop, lags and masses were set back to ordinary values; use --method"
+    " prediction-error.",
+    "window": lambda name, coefficient, change, reasons: (
+        f"The linear part is not to be trusted: without the last tenth of step '{name}',"
+        f" {coefficient} changes by {_change(change)}, though it should not depend on where the"
+        f" window ends. Likely cause: {_reasons(reasons)}. Use --method prediction-error for these"
+        " records."
+    ),
+    "signs": lambda names: (
+        f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not larger than zero, which the"
+        " paper's eq. (15) demands: the moments did not find a stack's transfer function. A longer,"
+        " quieter step may help."
+    ),
+    "no_a_5": f"{_NO_STACK}a_5 is zero or not finite{_DELAY_ALONE}",
+    "growing_poles": f"{_NO_STACK}{{}} of its 5 poles do not decay{_DELAY_ALONE}",
+    "other_zero": "b_1 = {:.3g} s, but the poles allow {:.3g} s at the nearest with the assumed"
+    " k_P/k_B = {:.3g}: b_1 or this ratio is wrong, and the first microseconds of a step will be"
+    " off.",
+    "rough_velocity": "The noise of loop '{}' does not allow a good velocity: over the longest"
+    " window it is {:.1f} % of the mean speed. A, delta, n, beta and gamma rest on it; give slower"
+    " or less noisy loops.",
+    "no_samples": "No samples with h = x - k u above zero are left on the {} branches, so {} has no"
+    " equation, and the model has no loop (f_H = 0). Likely cause: k is wrong or the loops did not"
+    " begin at rest at 0 V; give loops that do.",
+    "negative_rising": "The logarithms of (31) are of negative numbers on the rising branches, so"
+    " beta + gamma > 0 does not hold; the logarithms of the opposite numbers are taken.",
+    "wrong_sign": "{:.0f} % of the logarithms on the {} branches ({}) are of numbers of the wrong"
+    " sign and were left out, which biases the rest. Likely cause: noise, or a k that is wrong;"
+    " give slower loops or another step.",
+    "no_crossing": lambda branches: (
+        f"x = k u is not met on {_branches(branches)} of the loops, so A and delta cannot be read"
+        " at zero crossings, and n, beta and gamma rest on them: the model has no loop (f_H = 0)."
+        " Likely cause: k contains a part of the hysteresis (it is the secant of the step), or the"
+        " loops did not begin at rest at 0 V; give two periods or more from rest."
+    ),
+    "scatter": "A scatters by {:.0f} % between the loops' periods, which it should not: the loops"
+    " are not those of eq. (8) with this k.",
+    "secant": "At its tip the loop '{}' meets the line x = k u (h there is {:.0f} % of its largest"
+    " value): k, read from a step, holds what the hysteresis adds at that voltage, and the paper"
+    " takes it for the linear part alone. k, A, delta and all that rest on them are off.",
+    "lagging_loop": "The logarithm of (34) is of negative numbers: gamma > beta does not hold, as"
+    " it cannot for a loop that lags. The logarithm of (beta - gamma) h^n was taken instead, which"
+    " is the same equation.",
     "diverged": "{} of {} transitions diverged: a part of the posterior may be missing. Draw more"
     " with another seed, or hold what is open (--free).",
     "chains_disagree": lambda names, limit: (
