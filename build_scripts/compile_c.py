@@ -22,9 +22,8 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
-from psa_casadi.export.fmu.sources import STRICT
-from psa_casadi.export.fmu.texts import write_sources
-from psa_casadi.export.web.module import WEB_FLAGS, module_texts
+from psa_casadi.export.fmu.sources import STRICT, write_sources
+from psa_casadi.export.web import WEB_FLAGS, module_texts
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.codegen import generate_c
 from psa_casadi.simulation.exact.generate import generate

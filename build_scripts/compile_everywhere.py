@@ -14,7 +14,7 @@ from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import MachineError
 from psa_casadi.export.fmu.platforms import PLATFORMS, Platform, compile_library
-from psa_casadi.export.fmu.texts import exported_texts
+from psa_casadi.export.fmu.sources import exported_texts
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 

@@ -8,10 +8,10 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.remedy.size import example
-from psa_casadi.diagnosis.residual.signature import signature
+from psa_casadi.diagnosis.remedy import example
+from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.modal_series import FEWEST, MODAL_SERIES
+from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES
 from psa_casadi.report.page.playground_page import playground
 from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size

@@ -9,9 +9,9 @@ from psa_casadi.components import COMPONENTS
 from psa_casadi.design.mechanism.mechanism import port_model
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model, Structure
+from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.variables import Input, Output

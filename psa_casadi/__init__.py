@@ -25,7 +25,7 @@ from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
     from psa_casadi import datasets, design, online, system
-    from psa_casadi.any_model.entry import diagnose, identify
+    from psa_casadi.any_model.diagnose import diagnose, identify
     from psa_casadi.any_model.identify import OdeIdentification
     from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.component import Component, Equations, Symbols
@@ -50,14 +50,13 @@ if TYPE_CHECKING:
     from psa_casadi.identification.identify import Identification
     from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
-    from psa_casadi.model.from_casadi.ode_model import ode_model
     from psa_casadi.model.model_file import load_model, save_model
+    from psa_casadi.model.nanopositioner import controller_for, margins_of, nanopositioner
+    from psa_casadi.model.ode_model import ode_model
     from psa_casadi.model.own_effects import own_effects
     from psa_casadi.model.parts import PARTS, compensator_for, part_model
     from psa_casadi.model.stacks import STACKS, stack_model
-    from psa_casadi.model.system.nanopositioner import nanopositioner
-    from psa_casadi.model.system.system import System, connect
-    from psa_casadi.model.system.tuning import controller_for, margins_of
+    from psa_casadi.model.system import System, connect
     from psa_casadi.online import (
         AdaptiveFeedForward,
         FeedForward,
@@ -128,12 +127,12 @@ _HOMES = {
         "port_model",
     ),
     "psa_casadi.online": (
-        "FeedForward",
         "HysteresisObserver",
+        "FeedForward",
         "stack_values",
         "part_for",
-        "AdaptiveFeedForward",
         "OnlineIdentification",
+        "AdaptiveFeedForward",
         "identifier_for",
     ),
     "psa_casadi.model.parts": (
@@ -141,16 +140,12 @@ _HOMES = {
         "part_model",
         "compensator_for",
     ),
-    "psa_casadi.model.system.tuning": (
-        "controller_for",
-        "margins_of",
-    ),
-    "psa_casadi.model.system.system": (
+    "psa_casadi.model.system": (
         "System",
         "connect",
     ),
-    "psa_casadi.model.system.nanopositioner": ("nanopositioner",),
-    "psa_casadi.model.from_casadi.ode_model": ("ode_model",),
+    "psa_casadi.model.nanopositioner": ("controller_for", "margins_of", "nanopositioner"),
+    "psa_casadi.model.ode_model": ("ode_model",),
     "psa_casadi.export.importer.fmu_model": ("fmu_model",),
     "psa_casadi.variables": (
         "Input",
@@ -175,7 +170,7 @@ _HOMES = {
         "simulate",
         "simulate_record",
     ),
-    "psa_casadi.any_model.entry": ("identify", "diagnose"),
+    "psa_casadi.any_model.diagnose": ("identify", "diagnose"),
     "psa_casadi.any_model.identify": ("OdeIdentification",),
     "psa_casadi.any_model.result": ("OdeDiagnosis",),
     "psa_casadi.identification.identify": ("Identification",),

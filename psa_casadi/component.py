@@ -22,7 +22,7 @@ Expression = Any
 _TABLES = (
     ("psa_casadi.components", "COMPONENTS"),
     ("psa_casadi.effects", "EFFECTS"),
-    ("psa_casadi.effects.modal_series", "MODAL_SERIES"),
+    ("psa_casadi.effects.mechanics", "MODAL_SERIES"),
     ("psa_casadi.effects.patches", "PATCHES"),
 )
 

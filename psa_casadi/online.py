@@ -9,18 +9,17 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.components import COMPONENTS
-from psa_casadi.components.hysteresis_step import COUNT, TRACKED, constants, estimates
-from psa_casadi.components.online_identification import ONLINE_IDENTIFICATION
-from psa_casadi.components.online_recursion import variances
-from psa_casadi.components.sampled_feed_forward import (
+from psa_casadi.components.online_identification import (
     ADAPTIVE_FEED_FORWARD,
     FEED_FORWARD,
     HYSTERESIS_OBSERVER,
+    ONLINE_IDENTIFICATION,
 )
+from psa_casadi.components.online_recursion import COUNT, TRACKED, constants, estimates, variances
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import PARTS, compensator_for, part_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
 
 __all__ = [
     "AdaptiveFeedForward",

@@ -5,8 +5,7 @@ name of what makes it.
 """
 
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
@@ -25,19 +24,6 @@ class Worded:
     def sentence(self) -> str:
         """The result in words."""
         return str(import_module(_WORDS).sentence_of(self))
-
-
-@dataclass(frozen=True)
-class Note(Worded):
-    """What is to be said of a result: a code, and of what: names and figures."""
-
-    code: str
-    of: tuple[Any, ...] = ()
-
-
-def sentences(notes: "Iterable[Note | str]") -> tuple[str, ...]:
-    """Return notes in words."""
-    return tuple(n if isinstance(n, str) else n.sentence for n in notes)
 
 
 class Celled:

@@ -2,11 +2,10 @@
 
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.design.mechanism.mechanism import mechanism_model, port_model
-from psa_casadi.model.from_casadi.ode_model import ode_model
+from psa_casadi.model.nanopositioner import controller_for, margins_of, nanopositioner
+from psa_casadi.model.ode_model import ode_model
 from psa_casadi.model.parts import PARTS, compensator_for, part_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
-from psa_casadi.model.system.system import System, connect
-from psa_casadi.model.system.tuning import controller_for, margins_of
+from psa_casadi.model.system import System, connect
 from psa_casadi.variables import Input, Output, Parameter, Publication, State
 
 __all__ = [

@@ -305,3 +305,19 @@ def _spell(unit: Unit) -> str:
 
 def _describe(unit: Unit) -> str:
     return unit.quantity or f"dimension {_spell(unit)}"
+
+
+def rate_unit(unit: str) -> str:
+    """Return the unit of a quantity's time derivative: m/s for m, m/s2 for m/s, N/(V.s) for N/V."""
+    above, _, below = unit.partition("/")
+    if not below:
+        return f"{above}/s"
+    factors = below.strip("()").split(".")
+    for i, factor in enumerate(factors):
+        match = re.fullmatch(r"s(\d*)", factor)
+        if match:
+            factors[i] = f"s{int(match[1] or 1) + 1}"
+            break
+    else:
+        factors.append("s")
+    return f"{above}/{factors[0]}" if len(factors) == 1 else f"{above}/({'.'.join(factors)})"

@@ -18,7 +18,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 import pytest
 
 from build_scripts.measured_data import measured_data_directory, must_be_present
-from tests.check_here import started_here
+from tests.check_here import rows_here
 
 #: Groups of tests that share something long, the longest first.
 LONG_GROUPS = ("platforms", "identification", "demo", "search", "verification", "browser")
@@ -62,7 +62,7 @@ def _place(names: Sequence[str], name: str) -> int:
 @pytest.fixture
 def code_runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """`check_fmu` runs the code of FMUs, which must do no harm, in this process."""
-    monkeypatch.setattr("psa_casadi.export.check.check.started", started_here)
+    monkeypatch.setattr("psa_casadi.export.check.check.rows_apart", rows_here)
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import fmpy
 
+from psa_casadi.export.check.binaries import FUNCTIONS
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
 
@@ -74,12 +75,6 @@ static int instance;
 API void *fmi2Instantiate(void) { at("make"); return &instance; }
 API void *fmi3InstantiateCoSimulation(void) { at("make"); return &instance; }
 API void *fmi3InstantiateModelExchange(void) { return &instance; }
-#define BOTH(name) API int fmi2##name(void) { return 0; } API int fmi3##name(void) { return 0; }
-BOTH(FreeInstance) BOTH(EnterInitializationMode) BOTH(ExitInitializationMode) BOTH(Terminate)
-BOTH(Reset)
-API int fmi2SetupExperiment(void) { return 0; }
-API int fmi2SetReal(void) { return 0; }
-API int fmi3SetFloat64(void) { return 0; }
 API int fmi2GetReal(void *c, const unsigned *v, size_t n, double *x)
 { (void)c; (void)v; while (n) x[--n] = 0.0; return 0; }
 API int fmi3GetFloat64(void *c, const unsigned *v, size_t n, double *x, size_t m)
@@ -104,11 +99,19 @@ _DESCRIPTIONS = {
 }
 
 
+#: The functions that do nothing.
+_STUBS = "".join(
+    f"API int {name}(void) {{ return 0; }}\n"
+    for name in sorted(FUNCTIONS[2] | FUNCTIONS[3])
+    if f"{name}(" not in _SOURCE
+)
+
+
 @cache
 def library() -> bytes:
     """Return the library, compiled once for both versions of FMI, and never loaded here."""
     with temporary_folder() as work:
-        (work / "hostile.c").write_text(_SOURCE, encoding="utf-8")
+        (work / "hostile.c").write_text(_SOURCE + _STUBS, encoding="utf-8")
         flags = ("-fPIC", "-fvisibility=hidden", "-shared", "hostile.c", "-o", "hostile.lib")
         run_compiler([*compiler_command(), *OPTIMISE, *flags], work)
         return (work / "hostile.lib").read_bytes()

@@ -3,7 +3,7 @@
 import io
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -45,21 +45,48 @@ def tdms(channels: Mapping[str, ArrayLike], properties: Mapping[str, Any]) -> by
     return stream.getvalue()
 
 
+def mat(arrays: Mapping[str, Any], version: Literal["4", "5"] = "5", **options: Any) -> bytes:
+    """Return a MATLAB file of version 4 or 5, without the date."""
+    from scipy.io import savemat  # noqa: PLC0415 - slow to import
+
+    stream: Any = io.BytesIO()
+    savemat(stream, arrays, format=version, **options)
+    data: bytes = stream.getvalue()
+    return data if version == "4" else b"MATLAB 5.0 MAT-file".ljust(116) + data[116:]
+
+
+def parquet(columns: Mapping[str, Any], **options: Any) -> bytes:
+    """Return a Parquet file of columns by their names."""
+    import pyarrow  # noqa: PLC0415 - slow to import
+    from pyarrow import parquet  # noqa: PLC0415
+
+    sink = io.BytesIO()
+    parquet.write_table(pyarrow.table(dict(columns)), sink, **options)
+    return sink.getvalue()
+
+
 def hdf5(
     content: Mapping[str, ArrayLike],
     units: Mapping[str, str],
     attributes: Mapping[str, Any] | None = None,
+    *,
+    userblock_size: int = 0,
     **options: Any,
 ) -> bytes:
-    """Return an HDF5 file of datasets by their places, with `units` and the file's attributes."""
+    """Return an HDF5 file of datasets by their places, with `units` and the file's attributes.
+
+    With a `userblock_size` [bytes] it begins as a MATLAB file of version 7.3 does.
+    """
     stream = io.BytesIO()
-    with h5py.File(stream, "w") as file:
+    with h5py.File(stream, "w", userblock_size=userblock_size) as file:
         for name, values in content.items():
             file.create_dataset(name, data=np.asarray(values), **options)
             if name in units:
                 file[name].attrs["units"] = units[name]
         file.attrs.update(attributes or {})
-    return stream.getvalue()
+    data = stream.getvalue()
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    return head + data[len(head) :] if userblock_size else data
 
 
 def named(t: ArrayLike, u: ArrayLike, x: ArrayLike) -> NDArray[np.generic]:

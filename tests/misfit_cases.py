@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.noise.floor import noise_floor
-from psa_casadi.diagnosis.residual.misfit import Misfit, misfit
+from psa_casadi.diagnosis.misfit import Misfit, misfit
+from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.records import Record, excitation
 
 FloatArray = NDArray[np.float64]

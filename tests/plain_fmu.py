@@ -12,6 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import fmpy
+from fmpy.fmi2 import FMU2Model
 
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 
@@ -165,8 +166,12 @@ def pendulum(*, indicators: int = 0, once: str = "false") -> Path:
 def _binary() -> Path:
     folder = Path(_FOLDER.name)
     (folder / "pendulum.c").write_text(_CODE, encoding="utf-8")
+    # further ones of the standard, which importers look up
+    names = [n for n in dir(FMU2Model) if n[:4] == "fmi2" and f" {n}(" not in _CODE]
+    refused = "".join(f"int {name}(void) {{ return 3; }}\n" for name in names)
+    (folder / "refused.c").write_text(refused, encoding="utf-8")
     library = folder / f"pendulum{fmpy.sharedLibraryExtension}"
     headers = files("fmpy") / "c-code"
-    command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{headers}", "pendulum.c"]
-    run_compiler([*command, "-lm", "-o", str(library)], folder)
+    command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{headers}"]
+    run_compiler([*command, "pendulum.c", "refused.c", "-lm", "-o", str(library)], folder)
     return library

@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.held_out.errors import Errors, Gain
-from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor
-from psa_casadi.diagnosis.remedy.size import Size
-from psa_casadi.diagnosis.residual.misfit import Misfit, misfit
+from psa_casadi.diagnosis.held_out import Errors, Gain
+from psa_casadi.diagnosis.misfit import Misfit, misfit
+from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import (
     BlindSpot,
     Candidate,
@@ -139,8 +139,8 @@ def diagnosis(
             BlindSpot("current_limit", 1e300, "1/A", "The current stays small."),
         ),
         remaining=Remaining(verdict in ("adequate", "cause_named"), 0.4, "Nothing is left."),
-        next_experiment=NextExperiment(None, (), "Hold the voltage for a minute."),
-        notes=("Forces are assumed.",),
+        next_experiment=NextExperiment(None, (), ("Hold the voltage for a minute.",)),
+        remarks=("Forces are assumed.",),
         experiments=tuple(p[0] for p in parts),
         base_fit=_fit(compose(BASE), len(names)),
         extended_fit=_fit(model, len(names)),

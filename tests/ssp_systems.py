@@ -5,8 +5,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from psa_casadi.export.ssp.archive import export_ssp
-from psa_casadi.model.system.nanopositioner import nanopositioner
-from psa_casadi.model.system.system import System
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.system import System
 from tests.fmu_models import model_named
 from tests.test_fmu_system import STACK
 

@@ -9,8 +9,8 @@ from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.components import BASE
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.screening.evidence import levelled
-from psa_casadi.diagnosis.search.contenders import one_of_each
+from psa_casadi.diagnosis.screening import levelled
+from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError

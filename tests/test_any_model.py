@@ -16,11 +16,11 @@ import psa_casadi as psa
 from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import block_in_tests
 from psa_casadi.any_model.effects.attached import extended
-from psa_casadi.any_model.effects.table import effects_of
+from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.any_model.predict import Sizes, sizes_of
 from psa_casadi.any_model.runs import runs_of
-from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.from_casadi.ports import ports_of, with_ports
+from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.own_words import own_verdict_sentence
 from tests import own_plants as plants
@@ -140,8 +140,8 @@ def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
         d,
         runs=(replace(run, signals=replace(run.signals, name=_HOSTILE)),),
         causes=(replace(cause, description=_HOSTILE),),
-        missed=replace(d.missed, where=_HOSTILE),
-        notes=(_HOSTILE,),
+        missed=replace(d.missed, seen=_HOSTILE),
+        remarks=(_HOSTILE,),
     )
     hostile.report(path)
     text = path.read_text("utf-8")

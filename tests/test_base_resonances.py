@@ -8,12 +8,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.base_fit.ringing import ringing
-from psa_casadi.diagnosis.base_fit.variants import from_band, from_resonances, instead_of
+from psa_casadi.diagnosis.base_fit import from_band, from_resonances, instead_of, ringing
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
-from psa_casadi.diagnosis.search.view import examine
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, examine, hypothesis
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.base_fit.between_samples import smooth_between
+from psa_casadi.diagnosis.base_fit import smooth_between
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.stacks import stack_model
@@ -46,7 +46,8 @@ def test_a_smooth_voltage_is_seen_and_straight_lines_get_the_mean_of_its_curve()
     seen = smooth_between(found, experiments)
     assert seen is not None
     (moved,), note = seen
-    assert "smooth curve" in note
+    assert note.code == "smooth_voltage"
+    assert note.values["share"] == pytest.approx(1.0, abs=0.25)
     voltage, before = moved.record.voltage, experiments[0].record.voltage
     # a sine of angular frequency w needs amplitudes larger by 1 + (w h)^2/12
     last = slice(COUNT - 60, COUNT)

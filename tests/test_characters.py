@@ -18,15 +18,14 @@ from psa_casadi.components import BASE
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.parameter_sets import parameter_set
 from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.fmu.model_description import model_description
-from psa_casadi.export.fmu.model_description3 import model_description3
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.export.ssp.archive import export_ssp
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
 from psa_casadi.records import read_record
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.words.tables import Table
@@ -38,7 +37,7 @@ CARRIED = "\t\n\r <&>\"' ]]> \x7f\x85 µ \ud7ff\ue000\ufffd \U0001f600"
 
 WRITERS: dict[str, Callable[[Model], str]] = {
     "FMI 2": lambda m: model_description(m, "stack", "{0}", ["a.c"]),
-    "FMI 3": lambda m: model_description3(m, "stack", "{0}", ["a.c"]),
+    "FMI 3": lambda m: model_description(m, "stack", "{0}", ["a.c"], 3),
     "page": documentation,
     "parameters": parameter_set,
     "Modelica": modelica_text,

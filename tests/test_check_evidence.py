@@ -11,9 +11,9 @@ import psa_casadi as psa
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
-from psa_casadi.export.check.playback import played_again
+from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.check.rows import CheckRow
-from psa_casadi.export.fmu import evidence_files as files
+from psa_casadi.export.fmu import evidence
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.identification.determinacy import determinacy
@@ -36,7 +36,7 @@ def carried(path: Path) -> Model:
 def play(path: Path, *records: Record) -> list[CheckRow]:
     with Fmu(path) as fmu:
         again = repeated(fmu, carried(path), records)
-        return [*again.rows, *(played_again(fmu, p) for p in again.playbacks)]
+        return [r if isinstance(r, CheckRow) else played_again(fmu, r) for r in again]
 
 
 @pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
@@ -66,15 +66,17 @@ def test_a_record_that_was_averaged_is_averaged_again() -> None:
     with Archive(evident_fmu()) as archive:
         again = repeated(archive, model, [record])
         gone = repeated(archive, model, [record.slice(0, 7000)])
-    (playback,) = again.playbacks
+    (playback,) = (run for run in again if isinstance(run, Playback))
     assert len(playback.times) == shorter.n
     x0 = np.array([playback.start[n] for n in model.state_names])
     inputs = np.column_stack([playback.inputs.values[:, 0], np.zeros(shorter.n)])
     y = psa.run(model, playback.times, inputs, x0, rtol=1e-9).y
     error = playback.expected - y[:, model.output_names.index("displacement")]
     assert np.sqrt(np.mean(error**2)) == pytest.approx(playback.stated, rel=1e-4)
-    assert not gone.rows[-1].passed
-    assert f"{shorter.n} are stated" in gone.rows[-1].remark
+    refused = gone[-1]
+    assert isinstance(refused, CheckRow)
+    assert not refused.passed
+    assert f"{shorter.n} are stated" in refused.remark
 
 
 def test_another_record_is_not_one_of_those() -> None:
@@ -105,11 +107,14 @@ def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
         values[column] = repr(1.01 * float(values[column]))
         return "\n".join([*lines[:100], ",".join(values), *lines[101:], ""]).encode()
 
-    changes = {files.OUTPUTS: moved, files.PAGE: lambda c: c.replace(b"held-out", b"hold-out")}
+    changes = {
+        evidence.OUTPUTS: moved,
+        evidence.PAGE: lambda c: c.replace(b"held-out", b"hold-out"),
+    }
     path = rewritten(evident_fmu(), tmp_path / "m.fmu", changes)
     with Archive(path) as archive:
         assert list(wrong_evidence(archive, carried(path))) == [
-            f"{files.PAGE} is not what the model says"
+            f"{evidence.PAGE} is not what the model says"
         ]
     with Archive(evident_fmu()) as archive:
         assert list(wrong_evidence(archive, carried(path))) == []
@@ -125,9 +130,10 @@ def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
     assert model.evidence is not None
     told = replace(model.evidence, outside=(drift.name,))
     with Archive(evident_fmu()) as archive:
-        again = repeated(archive, replace(model.plant(), evidence=told), [noisy_record()])
-    assert again.rows[-1].passed
-    assert "not compared: the FMU leaves out offset_drift" in again.rows[-1].remark
+        row = repeated(archive, replace(model.plant(), evidence=told), [noisy_record()])[-1]
+    assert isinstance(row, CheckRow)
+    assert row.passed
+    assert "not compared: the FMU leaves out offset_drift" in row.remark
 
 
 @pytest.mark.slow

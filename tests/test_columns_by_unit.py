@@ -12,8 +12,13 @@ from scipy.io import savemat
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record
-from psa_casadi.records.read.column_map import parse_columns
-from psa_casadi.records.read.names import columns_known, stated_unit, understood, units_row
+from psa_casadi.records.read.columns import (
+    columns_known,
+    parse_columns,
+    stated_unit,
+    understood,
+    units_row,
+)
 
 N = 20
 T = np.arange(N) * 1e-3

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psa_casadi.export.fmu.communication_step import SHARE, STEPS_PER_PERIOD, held_step
-from psa_casadi.export.fmu.reference_results import reference_inputs
+from psa_casadi.export.fmu.reference_run import SHARE, STEPS_PER_PERIOD, held_step, reference_inputs
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.simulation.stepper import run

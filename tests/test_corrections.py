@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.budget import budget
-from psa_casadi.diagnosis.corrections.correct import Correction, corrections
-from psa_casadi.diagnosis.corrections.export import with_patch
-from psa_casadi.diagnosis.corrections.patch import patch_of
-from psa_casadi.diagnosis.held_out.errors import held_out_rms
+from psa_casadi.diagnosis.colour import Colour
+from psa_casadi.diagnosis.corrections import Correction, corrections
+from psa_casadi.diagnosis.held_out import budget, held_out_rms
 from psa_casadi.diagnosis.judgement import Weighed
-from psa_casadi.diagnosis.noise.colour import Colour
+from psa_casadi.diagnosis.patch import patch_of, with_patch
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose

@@ -1,10 +1,7 @@
 """Files of records that are damaged, huge or lead elsewhere: a sound record or a sentence."""
 
 import io
-import json
 import os
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,28 +12,16 @@ import numpy as np
 import pyarrow
 import pytest
 from pyarrow import parquet
-from scipy.io import savemat
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import apart, file_bytes
-from psa_casadi.records.read.binary import READERS
-from tests.fuzz.laboratory import sound_files
+from psa_casadi.records.read.formats import READERS
 from tests.laboratory_bytes import hdf5, npy, npz, tdms, xlsx
-from tests.mutations import changed, sentences
-from tests.tiers import slow_but
+from tests.mutations import sentences
 
 T = np.arange(24) / 8.0
 NAMES = ("time [s]", "voltage [V]", "displacement [um]")
-
-#: Reads the files that it is given one after the other, and says of each how it ended.
-READS = """
-import json, sys
-from psa_casadi.records.read import apart
-for path in sys.argv[1:]:
-    told = apart.answered({"path": path, "request": {"columns": {}}, "out": "."})
-    print(json.dumps([path, told.get("refused") or told.get("problems")]), flush=True)
-"""
 
 
 def refusal(path: Path, content: bytes) -> str:
@@ -47,77 +32,12 @@ def refusal(path: Path, content: bytes) -> str:
     return str(caught.value)
 
 
-def matlab(version: str) -> bytes:
-    stream: Any = io.BytesIO()
-    flat = {"time_s": T, "voltage_V": T, "displacement_um": T}
-    if version == "4":
-        savemat(stream, flat, format="4")
-    else:
-        savemat(stream, {"log": flat, "note": "rig 3"}, format="5", do_compression=True)
-    content: bytes = stream.getvalue()
-    return content
-
-
 def columns(path: Path, **form: Any) -> bytes:
     """Return a Parquet file with the columns of a record and others."""
     values = {name: (k + 1.0) * T for k, name in enumerate(NAMES)}
     others = {"note": ["ok"] * T.size, "list": [[1.0, 2.0]] * T.size}
     parquet.write_table(pyarrow.table({**values, **others}), path, **form)
     return path.read_bytes()
-
-
-def sound(suffix: str, folder: Path) -> list[bytes]:
-    if suffix == ".mat":
-        return [matlab("5"), matlab("4")]
-    if suffix == ".parquet":
-        packed = {"compression": "zstd", "data_page_version": "2.0", "row_group_size": 10}
-        plain = columns(folder / "a.parquet", compression="none", use_dictionary=False)
-        return [plain, columns(folder / "a.parquet", **packed)]
-    return list(sound_files()[suffix])
-
-
-@pytest.mark.parametrize(
-    "suffix",
-    slow_but([".h5", ".mat"], [".h5", ".mat", ".parquet", ".xlsx", ".tdms", ".npz", ".npy"]),
-)
-def test_wrong_bytes_are_refused_or_read(suffix: str, tmp_path: Path) -> None:
-    paths = []
-    for k, content in enumerate(sound(suffix, tmp_path)):
-        for n, wrong in enumerate(changed(content, 60, seed=5)):
-            paths.append(tmp_path / f"{k}_{n}{suffix}")
-            paths[-1].write_bytes(wrong)
-    refused, read, crashed, left = 0, 0, 0, [str(p) for p in paths]
-    while left:
-        done = subprocess.run(
-            [sys.executable, "-c", READS, *left], capture_output=True, text=True, cwd=tmp_path,
-            check=False,
-        )  # fmt: skip
-        for line in done.stdout.splitlines():
-            path, problems = json.loads(line)
-            assert path == left.pop(0)
-            assert all(p.startswith((path, "... and")) for p in problems)
-            refused += bool(problems)
-            read += not problems
-        assert "Traceback" not in done.stderr
-        crashed += bool(left)
-        left = left[1:] if left else []
-    assert refused + read + crashed == len(paths)
-    assert refused > 5
-    assert read > 2
-
-
-@pytest.mark.parametrize("suffix", [".lvm", ".dat"])
-def test_wrong_bytes_of_text_are_refused_or_read(suffix: str, tmp_path: Path) -> None:
-    path, refused, read = tmp_path / f"r{suffix}", 0, 0
-    for content in sound_files()[suffix]:
-        for wrong in changed(content, 60, seed=5):
-            path.write_bytes(wrong)
-            said = sentences(lambda: read_record(path))
-            assert all(str(path) in p or p.startswith("... and") for p in said)
-            refused += bool(said)
-            read += not said
-    assert refused > 5
-    assert read > 2
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a script stands in for the interpreter")

@@ -17,11 +17,10 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification import prepare
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.prepare import averaged
-from psa_casadi.records import Record, hold, read_record, sine, steps, time_grid, triangle
-from psa_casadi.records import excerpts as long_records
+from psa_casadi.records import Record, hold, read_record, sine, split, steps, time_grid, triangle
 from psa_casadi.records.decimate import decimated
-from psa_casadi.records.excerpts import LEAST, MOST, PARTS, excerpts
-from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.noise import fast_noise
+from psa_casadi.records.split import LEAST, MOST, PARTS, excerpts
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
 from tests.tiers import slow
@@ -243,7 +242,7 @@ def test_a_long_record_that_is_oversampled_is_averaged_and_stays_whole() -> None
     (small,), said = averaged([record])
     assert small.n < MOST
     assert small.duration == pytest.approx(record.duration, rel=1e-2)
-    assert "averaged in blocks" in said[0].sentence
+    assert "averaged in blocks" in str(said[0])
 
 
 @slow
@@ -261,8 +260,8 @@ def test_parts_give_the_answer_of_the_whole_record(
     y += 5e-4 * np.ptp(y) * rng.standard_normal(n)
     record = Record(name="night", time=t, voltage=v, displacement=y)
     whole = command([record])
-    monkeypatch.setattr(long_records, "MOST", 6_000)
-    monkeypatch.setattr(long_records, "LEAST", 0)
+    monkeypatch.setattr(split, "MOST", 6_000)
+    monkeypatch.setattr(split, "LEAST", 0)
     monkeypatch.setattr(prepare, "MOST", 6_000)
     parts = command([record])
     said = parts.sentences if command is identify else parts.notes

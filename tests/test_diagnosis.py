@@ -8,9 +8,8 @@ import pytest
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.held_out.errors import gain_of, lost_elsewhere
-from psa_casadi.diagnosis.noise.colour import colour_of
-from psa_casadi.diagnosis.noise.residual_tests import omnibus
+from psa_casadi.diagnosis.colour import colour_of, omnibus
+from psa_casadi.diagnosis.held_out import gain_of, lost_elsewhere
 from psa_casadi.records.drive import among_harmonics, drive_frequency, mains_line
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment

@@ -21,8 +21,8 @@ from psa_casadi.identification.start.doubts import (
     refuse_wrapped,
 )
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.records.quality.suspects import suspects
 from psa_casadi.records.record import Record
+from psa_casadi.records.suspects import suspects
 from psa_casadi.units import FloatArray
 from tests.plants.base import simulate_base
 from tests.plants.excitation import loops

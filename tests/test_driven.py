@@ -9,9 +9,8 @@ import pytest
 from scipy.signal import lfilter
 
 from psa_casadi.cli.diagnosis_files import write_patch
-from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.driven import filtered
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.diagnose import diagnose, filtered
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import load_model

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from psa_casadi.component import Component, Symbols
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.ageing import AGEING
-from psa_casadi.effects.sizes import static_stiffness, stroke
+from psa_casadi.effects.strain import AGEING
 from psa_casadi.model.compose import compose
-from psa_casadi.scales import stiffness_scale, stroke_scale
+from psa_casadi.scales import static_stiffness, stiffness_scale, stroke, stroke_scale
 from psa_casadi.simulation.codegen import functions_of
 from psa_casadi.simulation.simulate import simulate
 from tests.effect_runs import (

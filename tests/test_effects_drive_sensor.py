@@ -9,15 +9,9 @@ from numpy.typing import NDArray
 
 from psa_casadi.component import Component
 from psa_casadi.components import SIMPLIFIED
-from psa_casadi.effects.charge_leakage import CHARGE_LEAKAGE
-from psa_casadi.effects.drive_lag import DRIVE_LAG
-from psa_casadi.effects.mains_hum import MAINS_HUM
-from psa_casadi.effects.sensor_jump import SENSOR_JUMP
-from psa_casadi.effects.sensor_lag import SENSOR_LAG
-from psa_casadi.effects.sensor_nonlinearity import SENSOR_NONLINEARITY
-from psa_casadi.effects.sensor_ripple import SENSOR_RIPPLE
-from psa_casadi.effects.temperature import TEMPERATURE
-from psa_casadi.effects.voltage_saturation import VOLTAGE_SATURATION
+from psa_casadi.effects.drive import CHARGE_LEAKAGE, DRIVE_LAG, VOLTAGE_SATURATION
+from psa_casadi.effects.environment import MAINS_HUM, TEMPERATURE
+from psa_casadi.effects.sensor import SENSOR_JUMP, SENSOR_LAG, SENSOR_NONLINEARITY, SENSOR_RIPPLE
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.scales import stroke_scale

@@ -6,15 +6,14 @@ from numpy.typing import NDArray
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.effects.ageing import AGEING
-from psa_casadi.effects.backlash import BACKLASH
-from psa_casadi.effects.field_dependent_gain import FIELD_DEPENDENT_GAIN
-from psa_casadi.effects.hysteresis_memory import HYSTERESIS_MEMORY
-from psa_casadi.effects.load_stiffness import LOAD_STIFFNESS
-from psa_casadi.effects.preload_loss import PRELOAD_LOSS
-from psa_casadi.effects.rate_dependent_hysteresis import RATE_DEPENDENT_HYSTERESIS
-from psa_casadi.effects.saturation_of_strain import SATURATION_OF_STRAIN
-from psa_casadi.effects.self_heating import SELF_HEATING
+from psa_casadi.effects.hysteresis import HYSTERESIS_MEMORY, RATE_DEPENDENT_HYSTERESIS
+from psa_casadi.effects.mechanics import BACKLASH, LOAD_STIFFNESS, PRELOAD_LOSS
+from psa_casadi.effects.strain import (
+    AGEING,
+    FIELD_DEPENDENT_GAIN,
+    SATURATION_OF_STRAIN,
+    SELF_HEATING,
+)
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.scales import stiffness_scale, stroke_scale
 from psa_casadi.simulation.simulate import simulate

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from psa_casadi.records.quality.filtering import convolved, filtered, peaks, without_line
+from psa_casadi.records.noise import convolved, filtered, peaks, without_line
 
 RANDOM = np.random.default_rng(7)
 

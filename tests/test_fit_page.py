@@ -13,8 +13,14 @@ from psa_casadi.report.page.fit_page import fit_page, write_fit_report
 from psa_casadi.report.page.record_part import MOST_RECORDS, points_each
 from psa_casadi.report.plots.residual_plots import time_plot
 from psa_casadi.report.plots.theme import DARK
-from psa_casadi.report.words.fit_words import determined_sentence, error_bar_note, pairs_sentence
-from psa_casadi.report.words.grades import Grade, grades, strong_pairs
+from psa_casadi.report.words.fit_words import (
+    Grade,
+    determined_sentence,
+    error_bar_note,
+    grades,
+    pairs_sentence,
+    strong_pairs,
+)
 from psa_casadi.report.words.series import compact, extremes, kept, series_of_fit
 from psa_casadi.report.words.tables import parameter_table
 from tests.html_page import Page, figures, numbers

@@ -14,8 +14,8 @@ from psa_casadi.cli.inputs import step_seconds
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
+from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
-from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.probe import VOLTAGES, Probe, played_inputs
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS

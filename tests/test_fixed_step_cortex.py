@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
+from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.probe import Probe, played_inputs
 from psa_casadi.simulation.compiler import run_compiler, zig_command
 from tests.c_host.build import FloatArray, tool

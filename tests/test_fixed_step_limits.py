@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.export.fixed_step.planning import GOOD, FixedStep, fixed_step
+from psa_casadi.export.fixed_step.export import GOOD, FixedStep, fixed_step
 from psa_casadi.export.fixed_step.probe import Probe, played_inputs
-from psa_casadi.export.fmu.fixed import FIXED_ENTRY
-from psa_casadi.export.importer.calls import CO_SIMULATION
-from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.fmu.sources import FIXED_ENTRY
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.stepper import run

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.examples.linearisation_trial import DriftingStack
+from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
-from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.probe import Probe
 from psa_casadi.model.compose import Model
 from psa_casadi.model.parts import PARTS, part_model

@@ -14,7 +14,7 @@ from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
-from psa_casadi.export.fmu.model_description3 import model_description3
+from psa_casadi.export.fmu.description import model_description
 from psa_casadi.model.stacks import STACKS
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but
@@ -43,7 +43,7 @@ def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
     "breakage", slow_but(["order"], ["unit", "dependencies", "start", "order"])
 )
 def test_the_validation_finds_faults(breakage: str, tmp_path: Path) -> None:
-    text = model_description3(model_named("flexure"), "m", "{t}", ())
+    text = model_description(model_named("flexure"), "m", "{t}", fmi=3)
     broken = {
         "unit": text.replace('<Unit name="kg">', '<Unit name="kilo">'),
         "dependencies": text.replace('dependencies="2"', 'dependencies="2 3"', 1),

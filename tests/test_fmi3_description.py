@@ -11,9 +11,7 @@ import pytest
 
 from psa_casadi.component import Component, Equations
 from psa_casadi.export.common.variable_table import OPTIONS, variable_table
-from psa_casadi.export.fmu.dependencies import dependencies
-from psa_casadi.export.fmu.model_description import model_description
-from psa_casadi.export.fmu.model_description3 import model_description3
+from psa_casadi.export.fmu.description import dependencies, model_description
 from psa_casadi.model.compose import Model, Structure, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.variables import Input, Output, Parameter, State
@@ -24,7 +22,7 @@ NAMES = (*STACKS, "every_effect", "single_mass", "flexure")
 
 @cache
 def xml_of(name: str) -> ET.Element:
-    return ET.fromstring(model_description3(model_named(name), "m", "{t}", ()))
+    return ET.fromstring(model_description(model_named(name), "m", "{t}", fmi=3))
 
 
 @pytest.mark.parametrize("name", NAMES)

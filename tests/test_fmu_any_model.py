@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from psa_casadi.any_model.effects.attached import extended
-from psa_casadi.any_model.effects.table import effects_of
-from psa_casadi.any_model.sizes import Sizes
+from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.any_model.predict import Sizes
 from psa_casadi.component import Component, Equations
 from psa_casadi.export.check.check import as_exported, check_fmu
-from psa_casadi.export.check.origin import wrong_dependencies, wrong_start_values
+from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.from_casadi.ode_model import ode_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.ode_model import ode_model
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Parameter, State
 from tests.modelica_runs import simulated

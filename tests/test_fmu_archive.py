@@ -14,15 +14,16 @@ from psa_casadi.component import Component, Equations
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.export.common.variable_table import rate_unit, variable_table
+from psa_casadi.export.common.markup import time_scale
+from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu
-from psa_casadi.export.fmu.model_description import model_description, time_scale
+from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
-from psa_casadi.export.fmu.sources import STRICT
-from psa_casadi.export.fmu.texts import write_sources
+from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import loads
 from psa_casadi.simulation.compiler import run_compiler
+from psa_casadi.units import rate_unit
 from psa_casadi.variables import Output
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but

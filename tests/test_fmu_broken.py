@@ -12,21 +12,20 @@ import pytest
 from fmpy.validation import _validate_variable_names
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.check import agreement, check, description
+from psa_casadi.export.check import agreement, binaries, check, description
 from psa_casadi.export.check.agreement import expected_outputs
+from psa_casadi.export.check.binaries import FUNCTIONS, read_binary
 from psa_casadi.export.check.check import CheckReport, check_fmu
-from psa_casadi.export.check.description import (
-    misplaced_binaries,
-    new_libraries,
-    oldest_systems,
-)
+from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu, write_archive
 from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library, host_platform
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
+from psa_casadi.report.words.text import check_sentence
 from psa_casadi.units import FloatArray
 from tests.broken_descriptions import DESCRIPTIONS, STACK
+from tests.c_host.build import binary
 from tests.fmu_models import entries, exported, model_named, rewritten
 from tests.tiers import slow, slow_but
 
@@ -158,12 +157,6 @@ CORE = {
         "if (found.checksum != expected.checksum && size == 0)",
         {"snapshots"},
     ),
-    "every call allowed": (
-        "instance.c",
-        "if (ALLOWED[call] & instance->state.phase) return 1;",
-        "if (call != PSA_CALL_COUNT || ALLOWED[call]) return 1;",
-        {"illegal calls"},
-    ),
     "a step beside the communication point": (
         "instance.c",
         "{size + (point - now), point + size};",
@@ -180,7 +173,7 @@ TOGETHER = (
     ("input held where a rate is given", "parameters without effect during a run",
      "indicators that stand still"),
     ("wrong directional derivative", "a start without the rise", "no line of the input",
-     "checksum not looked at", "every call allowed", "a step beside the communication point"),
+     "checksum not looked at", "a step beside the communication point"),
 )  # fmt: skip
 
 
@@ -214,11 +207,10 @@ FACE = {
             "    return psa_fmi3_status(r);",
         ),
     ),
-    "fmi3_interfaces.c": (
-        ("*terminate = fmi3False;", "*terminate = fmi3True;"),
-        ("*earlyReturn = early != 0;", "*earlyReturn = fmi3False;"),
-    ),
+    "fmi3_interfaces.c": (("*terminate = fmi3False;", "*terminate = fmi3True;"),),
     "values.c": (("state->facing[i] = -state->facing[i];", "instance->fresh = 0;"),),
+}
+MISSING = {
     "fmi3_clocks.c": (
         (
             "fmi3Status fmi3ActivateModelPartition(",
@@ -233,45 +225,62 @@ FACE = {
 @harmless
 def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
     found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, FACE)))
-    assert {
-        "adjoint derivatives", "event mode", "life cycle", "intermediate update",
-        "functions present", "no other symbols", "illegal calls", "event indicators",
-    } == set(found), found  # fmt: skip
+    assert {"adjoint derivatives", "life cycle", "event indicators"} == set(found), found
+    assert "stays negative after an event" in found["event indicators"]
+
+
+@slow
+@harmless
+def test_a_function_under_another_name(tmp_path: Path) -> None:
+    found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, MISSING)))
+    assert {"functions present", "no other symbols", "binary loads"} == set(found), found
     assert "fmi3ActivateModelPartition is missing" in found["functions present"]
     assert "fmi3ActivateModelPartitions is exported" in found["no other symbols"]
-    assert "does not return early" in found["intermediate update"]
-    assert "stays negative after an event" in found["event indicators"]
+    assert "fmi3ActivateModelPartition" in found["binary loads"]
 
 
 @slow
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_binaries_that_cannot_be_used(fmi: int, tmp_path: Path) -> None:
-    """Missing, cut off, of something else, or of a new library: found, and nothing is loaded."""
+    """Missing, cut off, or of something else: found, whatever loading them does."""
     name, content = _binary(fmi), entries(STACK, fmi)[_binary(fmi)]
     left = {n: c for n, c in entries(STACK, fmi).items() if n != name}
-    cut, other = content[: len(content) // 2], b"no library at all"
-    for wrong, said in ((None, "no binary for this machine"), (cut, "cut off"), (other, "known")):
+    for wrong in (None, content[: len(content) // 2], b"no library at all"):
         path = tmp_path / "b.fmu"
         write_archive(path, left if wrong is None else {**left, name: wrong})
         report = check_fmu(path)
         assert not report.compared
-        assert said in _failures(report)["binary loads"]
+        assert "binary loads" in _failures(report)
         assert {row.name for row in report.rows if row.passed} >= {"units defined", ALWAYS}
+
+
+@slow
+@pytest.mark.xdist_group("platforms")
+@pytest.mark.parametrize("name", PLATFORMS)
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_binaries_of_all_platforms_are_inspected(name: str, fmi: int) -> None:
+    found = read_binary(binary(fmi, PLATFORMS[name]))
+    assert (found.platform, found.exports) == (name, FUNCTIONS[fmi])
+    assert any(n.startswith("GLIBC_2.") for n in found.needs) == name.endswith("linux")
+
+
+def test_without_lief_the_binaries_are_not_inspected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(binaries, "has_lief", lambda: False)
+    with pytest.raises(InputError, match="run `pip install lief`"):
+        check_fmu(exported(STACK, 2), portable=True)
+    monkeypatch.setattr(check, "rows_apart", lambda *_: [])
+    report = check_fmu(exported(STACK, 2))
+    assert report.left_out == OF_BINARIES
+    said = check_sentence(report)
+    assert "Left out, as lief is not installed (`pip install lief`): functions present" in said
 
 
 @slow
 @harmless
 @pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
-@pytest.mark.parametrize("fmi", VERSIONS)
-def test_names_in_the_binary(fmi: int, tmp_path: Path) -> None:
-    """A function under another name, and a need of a newer libc, seen without a compiler."""
-    path, name = tmp_path / "b.fmu", _binary(fmi)
-    change = _edit(f"fmi{fmi}DoStep\0", f"fmi{fmi}DoStop\0")
-    found = _failures(check_fmu(rewritten(exported(STACK, fmi), path, {name: change})))
-    assert f"fmi{fmi}DoStep is missing" in found["functions present"]
-    assert f"fmi{fmi}DoStop is exported" in found["no other symbols"]
-    change = _edit("GLIBC_2.2.5\0", "GLIBC_2.99\0\0")
-    found = _failures(check_fmu(rewritten(exported(STACK, fmi), path, {name: change})))
+def test_a_need_of_a_newer_library(tmp_path: Path) -> None:
+    change = {_binary(2): _edit("GLIBC_2.2.5\0", "GLIBC_2.99\0\0")}
+    found = _failures(check_fmu(rewritten(exported(STACK, 2), tmp_path / "b.fmu", change)))
     assert "needs GLIBC_2.99" in found["GNU libc"]
 
 
@@ -288,15 +297,14 @@ def test_the_oldest_system_that_a_binary_loads_on(
             ("2.36", True, "with GNU libc 2.17 "),
         ):  # fmt: skip
             monkeypatch.setattr(platform, "libc_ver", lambda v=libc: ("glibc", v))
-            said = "; ".join(new_libraries(newer, portable=portable))
-            assert problem in said if problem else said == ""
-        assert oldest_systems(newer).endswith("loads on GNU libc 2.29 and later")
-    monkeypatch.setattr(platform, "libc_ver", lambda: ("glibc", "2.36"))
-    other = "riscv64-linux" if host_platform().name != "riscv64-linux" else "x86_64-linux"
-    monkeypatch.setattr(description, "host_platform", lambda: PLATFORMS[other])
-    with Archive(path) as foreign:
-        (said,) = new_libraries(foreign)
-    assert "needs GLIBC_2.29, which systems with GNU libc 2.17 lack" in said
+            row = binaries.libc_row(newer, portable=portable)
+            assert row.passed == (problem is None)
+            assert (problem or "loads on GNU libc 2.29 and later") in row.remark
+        monkeypatch.setattr(platform, "libc_ver", lambda: ("glibc", "2.36"))
+        other = "riscv64-linux" if host_platform().name != "riscv64-linux" else "x86_64-linux"
+        monkeypatch.setattr(binaries, "host_platform", lambda: PLATFORMS[other])
+        foreign = binaries.libc_row(newer)
+    assert "needs GLIBC_2.29, which systems with GNU libc 2.17 lack" in foreign.remark
 
 
 @slow
@@ -319,10 +327,10 @@ def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) ->
     path, found = tmp_path / "b.fmu", entries(STACK, fmi)
     write_archive(path, {**found, "binaries/riscv64-linux/psa.so": found[_binary(fmi)]})
     with Archive(path) as moved:
-        (said,) = misplaced_binaries(moved)
+        (said,) = binaries.misplaced_binaries(moved)
     assert said.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
     with Archive(exported(STACK, fmi)) as whole:
-        assert not list(misplaced_binaries(whole))
+        assert not list(binaries.misplaced_binaries(whole))
 
 
 @slow
@@ -412,8 +420,8 @@ def test_the_time_of_a_check_is_that_of_all_its_parts(monkeypatch: pytest.Monkey
         time.sleep(0.2)
         return ()
 
-    monkeypatch.setitem(check._DESCRIBED, "functions present", slowly)
-    monkeypatch.setitem(check._DESCRIBED, "no other symbols", slowly)
+    monkeypatch.setitem(description.DESCRIBED, "units defined", slowly)
+    monkeypatch.setitem(description.DESCRIBED, "units consistent", slowly)
     report = check_fmu(exported(STACK, 2), timeout=0.3)
     assert not report.passed
     assert report.rows[-1].name == "time"

@@ -21,8 +21,7 @@ from psa_casadi.export.importer.fmu import (
     OK,
     Fmu,
 )
-from psa_casadi.export.importer.instance3 import Update
-from tests.fmi3_instances import Instance3, loaded
+from tests.fmi3_instances import Instance3, Update, loaded
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow_but
 

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.export.check.evidence import repeated
-from psa_casadi.export.check.playback import played_again
-from psa_casadi.export.fmu import evidence_files as files
-from psa_casadi.export.fmu.reference_results import FOLDER
+from psa_casadi.export.check.measured import Playback, played_again
+from psa_casadi.export.fmu import evidence
+from psa_casadi.export.fmu.reference_run import FOLDER
 from psa_casadi.export.importer.fmu import Fmu
 from tests.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
 from tests.fmu_models import assert_valid
@@ -28,11 +28,11 @@ def test_the_manifest_tells_the_role_of_every_file_of_evidence() -> None:
         place = source.removeprefix("../../") if source.startswith("..") else f"{FOLDER}/{source}"
         assert place in found
         roles[place] = related.attrib["role"]
-    assert roles[files.PAGE] == "report"
-    assert roles[files.META_DATA] == "meta-data"
-    assert roles[files.VALIDATION] == "experiment/validation"
-    assert roles[files.UNCERTAINTY] == "experiment/uncertainty-analysis"
-    assert roles[files.START] == roles[f"{files.SETS}/mean.ssv"] == "parameter"
+    assert roles[evidence.PAGE] == "report"
+    assert roles[evidence.META_DATA] == "meta-data"
+    assert roles[evidence.VALIDATION] == "experiment/validation"
+    assert roles[evidence.UNCERTAINTY] == "experiment/uncertainty-analysis"
+    assert roles[evidence.START] == roles[f"{evidence.SETS}/mean.ssv"] == "parameter"
     assert {n for n in found if n.startswith("extra/")} - set(roles) == {
         f"{FOLDER}/fmi-ls-manifest.xml"
     }
@@ -40,8 +40,8 @@ def test_the_manifest_tells_the_role_of_every_file_of_evidence() -> None:
 
 def test_experiments_name_files_that_are_there() -> None:
     found = files_inside(evident_fmu())
-    (whole,) = ET.fromstring(found[files.VALIDATION])
-    spread = ET.fromstring(found[files.UNCERTAINTY])
+    (whole,) = ET.fromstring(found[evidence.VALIDATION])
+    spread = ET.fromstring(found[evidence.UNCERTAINTY])
     assert [e.tag for e in whole] == ["Parameters", "Stimuli", "References"]
     assert len(spread) == 1 + 2 * 3 + 2  # the mean, pairs of three parameters, two samples
     for experiment in (whole, *spread):
@@ -51,7 +51,7 @@ def test_experiments_name_files_that_are_there() -> None:
 def test_meta_data_and_page_say_the_same() -> None:
     """Names and order as the schema of SSP Traceability 1.0 has them (SRMD.xsd, STC.xsd)."""
     found, model = files_inside(evident_fmu()), evident_model()
-    root = ET.fromstring(found[files.META_DATA])
+    root = ET.fromstring(found[evidence.META_DATA])
     space = "{http://ssp-standard.org/SSPTraceability1/%s}"
     assert root.tag == space % "SimulationResourceMetaData" + "SimulationResourceMetaData"
     assert set(root.attrib) == {"version", "name", "generationTool"}
@@ -62,7 +62,7 @@ def test_meta_data_and_page_say_the_same() -> None:
         for entry in part:
             assert entry.tag == space % "SSPTraceabilityCommon" + "ClassificationEntry"
             entries.setdefault(entry.attrib["keyword"], []).append(entry.text or "")
-    page = found[files.PAGE].decode()
+    page = found[evidence.PAGE].decode()
     assert model.evidence is not None
     assert model.evidence.held_out is not None
     (record,) = entries["record"]
@@ -80,7 +80,7 @@ def test_meta_data_and_page_say_the_same() -> None:
 
 def test_meta_data_say_who_publishes_the_model() -> None:
     by = psa.Publication(author="A. N. Other", version="2.1", license="CC BY 4.0")
-    root = ET.fromstring(files.meta_data(replace(evident_model(), publication=by)))
+    root = ET.fromstring(evidence.meta_data(replace(evident_model(), publication=by)))
     assert {n: root.attrib[n] for n in ("author", "fileversion", "license", "version")} == {
         "author": "A. N. Other", "fileversion": "2.1", "license": "CC BY 4.0", "version": "1.0.0",
     }  # fmt: skip
@@ -93,16 +93,16 @@ def test_parameter_sets_are_as_their_schema_has_them() -> None:
     for name in sets:
         assert_valid(found[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
     names = re.findall(
-        r'Parameter name="(\w+)"', found[f"{files.SETS}/sigma_02_minus.ssv"].decode()
+        r'Parameter name="(\w+)"', found[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
     )
     assert names == ["k_L", "A", "tau"]
 
 
 def test_a_model_without_evidence_has_no_such_files() -> None:
-    assert files.evidence_files(psa.stack_model("demo"), 20).entries == {}
-    none = files.evidence_files(evident_model().plant(), 0)
-    assert not [n for n in none.entries if n.startswith(files.SETS)]
-    assert files.UNCERTAINTY not in none.related
+    assert evidence.evidence_files(psa.stack_model("demo"), 20).entries == {}
+    none = evidence.evidence_files(evident_model().plant(), 0)
+    assert not [n for n in none.entries if n.startswith(evidence.SETS)]
+    assert evidence.UNCERTAINTY not in none.related
 
 
 def test_what_a_person_says_of_a_record_stays_text() -> None:
@@ -117,10 +117,10 @@ def test_what_a_person_says_of_a_record_stays_text() -> None:
         runs=(replace(told.runs[0], record=name),),
         reference=replace(told.reference, record=name),
     )
-    texts = files.evidence_texts(replace(model, evidence=odd), 0)
-    assert "&lt;b&gt;&amp;" in texts[files.PAGE]
-    assert "<b>" not in texts[files.PAGE]
-    read = "".join(ET.fromstring(texts[files.META_DATA]).itertext())
+    texts = evidence.evidence_texts(replace(model, evidence=odd), 0)
+    assert "&lt;b&gt;&amp;" in texts[evidence.PAGE]
+    assert "<b>" not in texts[evidence.PAGE]
+    read = "".join(ET.fromstring(texts[evidence.META_DATA]).itertext())
     assert f"{name}, sha256" in read
 
 
@@ -145,8 +145,9 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
     found = files_inside(path)
     assert len(list(sets.iterdir())) == 8
     for file in sets.iterdir():
-        assert found[f"{files.SETS}/{file.name}"] == file.read_bytes()
+        assert found[f"{evidence.SETS}/{file.name}"] == file.read_bytes()
     with Fmu(path) as fmu:  # with the sensor, whose reading is compared then
-        (playback,) = repeated(fmu, evident_model(), [noisy_record()]).playbacks[1:]
+        playback = repeated(fmu, evident_model(), [noisy_record()])[-1]
+        assert isinstance(playback, Playback)
         assert playback.output == "measured_displacement"
         assert played_again(fmu, playback).figure < 1e-4

@@ -17,10 +17,7 @@ from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.fmu.reference_results import (
-    FOLDER,
-    NOTES,
-)
+from psa_casadi.export.fmu.reference_run import FOLDER, NOTES
 from psa_casadi.export.fmu.terminals import terminal_entries, terminals_and_icons, terminals_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS, stack_model

@@ -7,11 +7,11 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, Fmu, FmuError
-from psa_casadi.export.importer.instance3 import Instance3, Update
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from tests import sampled_fmus
+from tests.fmi3_instances import Instance3, Update
 from tests.fmu_models import exported, model_named
 from tests.sampled_models import PERIOD, loop
 from tests.tiers import slow, slow_but
@@ -90,8 +90,7 @@ def test_a_jump_within_a_long_step() -> None:
             slave.set({"voltage": 30.0})
 
     with Fmu(exported(STACK, 3)) as fmu:
-        options = {"tolerance": 1e-10, "start_time": 1e6, "watcher": jump}
-        with fmu.start3(CO_SIMULATION, **options) as slave:
+        with Instance3(fmu, watcher=jump).start(tolerance=1e-10, start_time=1e6) as slave:
             slave.set({"voltage": 100.0})
             slave.step(1e6, 1e4)
             varied = slave.get(["displacement"])[0]

@@ -18,10 +18,8 @@ from psa_casadi.components import BASE
 from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, played_inputs
 from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
-from psa_casadi.export.fmu.fixed import FIXED_ENTRY
-from psa_casadi.export.fmu.sources import STRICT
-from psa_casadi.export.importer.calls import CO_SIMULATION
-from psa_casadi.export.importer.fmu import Fmu, FmuError
+from psa_casadi.export.fmu.sources import FIXED_ENTRY, STRICT
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.model.compose import compose
 from psa_casadi.report.words.text import check_sentence

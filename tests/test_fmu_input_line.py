@@ -8,6 +8,7 @@ import pytest
 from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, Fmu, FmuError, Instance
 from psa_casadi.reference import simulate
 from psa_casadi.units import FloatArray
+from tests.fmi3_instances import Instance3
 from tests.fmu_models import exported, model_named
 
 STACK = "P-885.51"
@@ -132,8 +133,7 @@ def test_a_jump_in_event_mode_starts_a_new_line() -> None:
     with Fmu(exported(STACK, 3)) as fmu:
         ends = []
         for line in (0.0, 1.0):
-            options = {"events": True, "values": {"input_line": line}}
-            with fmu.start3(CO_SIMULATION, **options) as slave:
+            with Instance3(fmu, events=True).start({"input_line": line}) as slave:
                 slave.require("EnterStepMode")
                 for k, voltage in enumerate((20.0, 20.0, 90.0)):
                     if k == 2:

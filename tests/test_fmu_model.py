@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
-from psa_casadi.model.from_casadi.ports import ports_of
+from psa_casadi.model.ports import ports_of
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import start_state
 from tests.plain_fmu import pendulum

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
-from psa_casadi.export.importer.calls import MODEL_EXCHANGE
-from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
 from tests.fmu_models import exported, model_named

@@ -7,7 +7,7 @@ import pytest
 
 from build_scripts.compile_everywhere import complaint
 from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
-from psa_casadi.export.fmu.texts import exported_texts
+from psa_casadi.export.fmu.sources import exported_texts
 from psa_casadi.simulation.compiler import OPTIMISE, zig_command
 from tests.c_host.build import (
     EMULATED,

@@ -19,7 +19,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.common.parameter_sets import parameter_set
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.reference_results import (
+from psa_casadi.export.fmu.reference_run import (
     EXPERIMENTS,
     FOLDER,
     INPUTS,
@@ -203,7 +203,7 @@ def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
     def fails(*_: object, **__: object) -> None:
         raise SimulationError("no")
 
-    monkeypatch.setattr("psa_casadi.export.fmu.reference_results.run", fails)
+    monkeypatch.setattr("psa_casadi.export.fmu.reference_run.run", fails)
     with zipfile.ZipFile(export_fmu(flexure, tmp_path / "m.fmu", fmi=3)) as archive:
         names = set(archive.namelist())
         page = archive.read("documentation/index.html").decode()

@@ -16,9 +16,7 @@ from psa_casadi.export.check.structure import settled_start_error
 from psa_casadi.export.common.variable_table import START_VOLTAGE, variable_table
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE
-from psa_casadi.export.importer.fmu import Fmu, FmuError, Instance
-from psa_casadi.export.importer.instance3 import Instance3
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import simulate as reference
 from psa_casadi.scratch import temporary_folder
@@ -26,6 +24,7 @@ from psa_casadi.simulation.history import settled_at
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.variables import Parameter, State
+from tests.fmi3_instances import Instance3
 from tests.fmu_models import exported, model_named
 from tests.tiers import slow
 

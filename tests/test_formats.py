@@ -19,8 +19,7 @@ from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record, read_records, write_record
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.column_map import parse_columns
-from psa_casadi.records.read.columns import Source
+from psa_casadi.records.read.columns import Source, parse_columns
 from tests.record_files import HEADER, ROWS, write
 from tests.tiers import slow, slow_but
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components import MONITOR
-from psa_casadi.components.flexure import FLEXURE
-from psa_casadi.diagnosis.columns import decision_sentence
+from psa_casadi.components.outputs import MONITOR
+from psa_casadi.components.surroundings import FLEXURE
+from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Objective, fit
@@ -23,11 +23,11 @@ from psa_casadi.identification.fitting.further import COLUMNS, scaled
 from psa_casadi.identification.prepare import columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.compose import compose
+from psa_casadi.notes import texts
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
 from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.shown import sentences
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import Way
 from tests.plants import further_columns as plants
@@ -133,11 +133,11 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
         columns_of(compose([FLEXURE]), [r])
     found = columns_of(starting_model([r]), [r])
     assert found.fitted == ("monitor_voltage",)
-    assert sentences(found.left_out) == ("strain is left out: it never changes.",)
+    assert texts(found.left_out) == ("strain is left out: it never changes.",)
     assert "monitor_voltage" in found.model.output_names
     turned = replace(r, current=-np.gradient(time), monitor_voltage=None, strain=None)
     (said,) = columns_of(starting_model([turned]), [turned]).left_out
-    assert "does not follow the voltage as a capacitance's does" in said.sentence
+    assert "does not follow the voltage as a capacitance's does" in str(said)
     with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
         replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
 
@@ -166,7 +166,7 @@ def test_a_turned_sign_is_told() -> None:
         found = columns_of(starting_model([record]), [record])
         experiments = with_levels([whole(record)], found.fitted)
         (further,) = fit(found.model, experiments, [], sigma=[1e-8], evaluations=1).further
-        assert ("its sign is probably turned" in sentences(further.notes)[-1]) is told
+        assert ("its sign is probably turned" in texts(further.notes)[-1]) is told
 
 
 @pytest.mark.parametrize(
@@ -186,15 +186,15 @@ def test_a_turned_sign_is_told() -> None:
     ],
 )
 def test_decisions_in_words(now: dict[str, float], then: dict[str, float], said: str) -> None:
-    assert said in decision_sentence("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now)
+    assert said in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
 
 
 def test_a_column_explains_nothing_where_something_is_left() -> None:
     of = {"load_stiffness": 0.5, "sensor_nonlinearity": 0.5}
-    clear = decision_sentence("load_force", {}, of, 0.0, EFFECTS, clear=True)
+    clear = str(decided("load_force", {}, of, 0.0, EFFECTS, clear=True))
     assert "load_stiffness is in the column" in clear
-    assert "nothing is named" in decision_sentence("load_force", {}, of, 0.0, EFFECTS, clear=False)
-    assert "decides nothing" in decision_sentence("load_force", {}, {}, 0.0, EFFECTS, clear=False)
+    assert "nothing is named" in str(decided("load_force", {}, of, 0.0, EFFECTS, clear=False))
+    assert "decides nothing" in str(decided("load_force", {}, {}, 0.0, EFFECTS, clear=False))
 
 
 def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> None:
@@ -206,7 +206,7 @@ def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> Non
     model, (beside,) = scaled(some.model, some.further)
     assert model.values == pytest.approx(some.model.values)  # the scale is in the model already
     assert beside.factors == pytest.approx([1.0])
-    assert "displacement_2: fitted beside the displacement" in further.notes[0].sentence
+    assert "displacement_2: fitted beside the displacement" in str(further.notes[0])
 
 
 @slow

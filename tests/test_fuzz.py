@@ -26,28 +26,35 @@ if not hasattr(os, "fork"):
     pytest.skip("the inputs are attacked in forked processes", allow_module_level=True)
 
 from tests.benchmarks.fuzz import app
-from tests.fuzz import laboratory, valid_files
-from tests.fuzz.campaign import Amount, Tally, run
-from tests.fuzz.mutators import damaged_bytes, damaged_json, damaged_table
-from tests.fuzz.replay import replay
+from tests.fuzz import readers
+from tests.fuzz.campaign import (
+    CRASH,
+    FALSE_PASS,
+    FOREIGN,
+    HANG,
+    LEFT_OVER,
+    Amount,
+    Found,
+    Tally,
+    Target,
+    generator,
+    replay,
+    run,
+)
+from tests.fuzz.damage import damaged_bytes, damaged_json, damaged_table
 from tests.fuzz.table import TARGETS, tables
-from tests.fuzz.target import CRASH, FALSE_PASS, FOREIGN, HANG, LEFT_OVER, Found, Target, generator
 
 #: Inputs of each target in the quick tier, and in the full one.
-QUICK = {"records-csv": 500, "column-maps": 500, "paths": 200, "models": 200}
+QUICK = {"records-csv": 500, "column-maps": 300, "paths": 200, "models": 200}
 FULL = {
-    "records-csv": 1500, "records-mat": 80, "records-hdf5": 20, "records-parquet": 40,
-    "records-xlsx": 40, "records-tdms": 40, "records-h5": 20, "records-npz": 40,
-    "records-npy": 40, "records-lvm": 200, "records-dat": 200,
-    "column-maps": 1500, "mapped-records": 300, "units": 1000, "models": 400, "paths": 500,
-    "binaries": 1500, "zips": 100, "descriptions": 300, "states": 250,
+    "records-csv": 1500, "records-mat": 80, "records-parquet": 40, "records-xlsx": 40,
+    "records-tdms": 40, "records-h5": 20, "records-npz": 40, "records-npy": 40, "records-lvm": 200,
+    "records-dat": 200, "column-maps": 800, "units": 1000, "models": 400, "paths": 500,
+    "checks": 10, "states": 250,
 }  # fmt: skip
-#: Commands, which take seconds each. Kills and damaged caches are in `test_ended_commands` and
+#: A command in odd surroundings. Kills and damaged caches are in `test_ended_commands` and
 #: `test_compiler_cache`.
-COMMANDS = {
-    "harm": {"harm": "exit", "at": "step", "fmi": 2},
-    "environments": {"surroundings": "HOME a file", "run": "simulate"},
-}
+SURROUNDED = {"surroundings": "HOME a file", "run": "simulate"}
 
 
 def attacked(amounts: dict[str, int], keep: Path, jobs: int = 1) -> None:
@@ -68,27 +75,18 @@ def test_damaged_inputs(target: str, tmp_path: Path) -> None:
 
 
 @slow
-@pytest.mark.xdist_group("fuzz")  # they share the files that commands are given
-@pytest.mark.parametrize("target", COMMANDS)
-def test_commands(target: str, tmp_path: Path) -> None:
-    case = json.dumps(COMMANDS[target]).encode()
-    saved = tmp_path / f"{target}-1-0.json"
-    saved.write_bytes(case)
-    tally = replay(saved)
-    assert tally.inputs[target] == 1
+def test_a_command_in_odd_surroundings(tmp_path: Path) -> None:
+    saved = tmp_path / "environments-1-0.json"
+    saved.write_text(json.dumps(SURROUNDED))
+    tally = replay(saved, TARGETS)
+    assert tally.inputs["environments"] == 1
     assert not tally.failures, "\n\n".join(map(str, tables(tally)))
 
 
 def test_the_files_that_are_damaged_are_sound(tmp_path: Path) -> None:
-    files = {
-        "csv": [t.encode() for t in valid_files.csv_texts()],
-        "mat": [*valid_files.mat_files(), *valid_files.hdf5_files()],
-        "parquet": valid_files.parquet_files(),
-        **{suffix[1:]: contents for suffix, contents in laboratory.sound_files().items()},
-    }
-    for suffix, contents in files.items():
+    for suffix, contents in readers.sound_files().items():
         for content in contents:
-            path = tmp_path / f"r.{suffix}"
+            path = tmp_path / f"r{suffix}"
             path.write_bytes(content)
             assert read_record(path).n == 18
 
@@ -173,7 +171,7 @@ def test_damage_changes_what_it_is_given() -> None:
     changed = [damaged_bytes(data, Random(k)) != data for k in range(200)]
     assert sum(changed) > 190
     assert len({damaged_json(tree, Random(k)) for k in range(200)}) > 100
-    text = valid_files.csv_texts()[0]
+    text = readers.sound_files()[".csv"][0].decode()
     assert len({damaged_table(text, Random(k)) for k in range(200)}) > 150
     assert tree == {"a": [1, 2.5, {"b": "c"}], "d": None}
 

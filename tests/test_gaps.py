@@ -6,8 +6,8 @@ import pytest
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.identify import identify
-from psa_casadi.records.quality.gaps import gaps, without_gaps
 from psa_casadi.records.record import Record
+from psa_casadi.records.split import gaps, without_gaps
 from psa_casadi.units import FloatArray
 from tests.plants.base import simulate_base
 from tests.plants.excitation import loops

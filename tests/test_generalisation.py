@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.components import BASE
+from psa_casadi.diagnosis.colour import colour_of
+from psa_casadi.diagnosis.confirmation import held_out_excess
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.generalisation import held_out_excess
-from psa_casadi.diagnosis.noise.colour import colour_of
-from psa_casadi.diagnosis.noise.floor import noise_floor
+from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose

@@ -6,9 +6,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.corrections.correct import Correction
-from psa_casadi.diagnosis.corrections.kinds import KINDS
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.corrections import KINDS, Correction
+from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.diagnosis.judgement import (
     Weighed,
     too_small,
@@ -16,9 +15,9 @@ from psa_casadi.diagnosis.judgement import (
     verdict_of,
     withdrawn_names,
 )
-from psa_casadi.diagnosis.screening.evidence import probabilities
+from psa_casadi.diagnosis.screening import probabilities
+from psa_casadi.diagnosis.search.hypothesis import View
 from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.search.view import View
 
 
 def _share(what: str, share: float) -> Share:
@@ -80,10 +79,11 @@ def test_where_structure_remains_names_must_remove_enough(share: float, told: st
 
 
 def test_what_removes_too_little_for_a_name_stays_in_the_model() -> None:
-    (kept,) = withdrawn_names(_steps("drive_lag"), Weighed(566.0, 1, 0.4, (), ()), None, {}, "")
-    assert "in the extended model, where it removes 40 %" in kept
-    (left,) = withdrawn_names(_steps("drive_lag"), Weighed(566.0, 1, 0.04, (), ()), None, {}, "")
-    assert "would remove 4 %" in left
+    for share, words in ((0.4, "in the extended model, where it removes 40 %"),
+                         (0.04, "would remove 4 %")):  # fmt: skip
+        weighed = Weighed(566.0, 1, share, (), ())
+        (said,) = withdrawn_names(_steps("drive_lag"), weighed, None, {}, None)
+        assert words in str(said)
 
 
 def test_notes_say_what_is_not_named_and_why() -> None:
@@ -92,10 +92,8 @@ def test_notes_say_what_is_not_named_and_why() -> None:
     better = Correction(curve, 203.0, 0.0, nothing, (), (), nothing)
     assert vague_note({}) == ()
     (note,) = vague_note({"rate_dependent_hysteresis": better})
-    assert note.startswith("rate_dependent_hysteresis: in the extended model and not named")
-    assert curve.sentence in note
+    assert "(a bent curve of the drive voltage, instead of rate_dependent_hysteresis)" in str(note)
     weighed = Weighed(566.0, 1, 0.75, (), ())
-    every = {"preload_loss": better}
-    (why,) = withdrawn_names(_steps("preload_loss"), weighed, None, every, "")
-    assert curve.sentence in why
-    assert "75 %" in why
+    (why,) = withdrawn_names(_steps("preload_loss"), weighed, None, {"preload_loss": better}, None)
+    assert "75 %" in str(why)
+    assert "a bent curve of the drive voltage, instead of preload_loss" in str(why)

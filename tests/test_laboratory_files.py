@@ -11,7 +11,7 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record, record_from
-from psa_casadi.records.read.column_map import parse_columns
+from psa_casadi.records.read.columns import parse_columns
 from tests.laboratory_bytes import gcs, hdf5, lvm, named, npy, npz, tdms, xlsx
 
 N = 20

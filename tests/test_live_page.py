@@ -245,7 +245,7 @@ def test_the_page_with_its_model_is_small(page: Path) -> None:
 def test_without_compiler_a_page_says_so(
     shown: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("psa_casadi.export.web.module.has_zig", lambda: False)
+    monkeypatch.setattr("psa_casadi.export.web.has_zig", lambda: False)
     monkeypatch.setattr(live_part, "has_zig", lambda: False)
     write_report(shown, tmp_path / "page.html")
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text

@@ -8,12 +8,18 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis, scale_of
+from psa_casadi.diagnosis.search.hypothesis import (
+    Hypothesis,
+    Scale,
+    View,
+    examine,
+    held_out_confirms,
+    hypothesis,
+    in_character,
+    scale_of,
+)
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import held_out_confirms, in_character
-from psa_casadi.diagnosis.task import STEPS, Method, Task
-from psa_casadi.diagnosis.thresholds import Thresholds, thresholds, using
+from psa_casadi.diagnosis.task import STEPS, Method, Task, Thresholds, thresholds, using
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.noise.floor import noise_floor
-from psa_casadi.diagnosis.residual.coordinates import drive_of
-from psa_casadi.diagnosis.residual.misfit import misfit
+from psa_casadi.diagnosis.misfit import misfit
+from psa_casadi.diagnosis.noise import noise_floor
+from psa_casadi.diagnosis.views import drive_of
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, excitation, read_record
-from psa_casadi.records.turns import reversals
+from psa_casadi.records.drive import reversals
 from tests.misfit_cases import (
     LEVELS,
     MULTISINE,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.noise.floor import noise_floor
-from psa_casadi.diagnosis.residual.misfit import misfit
+from psa_casadi.diagnosis.misfit import misfit
+from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.records import Record, excitation
 from tests.misfit_cases import MULTISINE, NOISE, SINE, TIME, FloatArray, grid, noise, seen, shares
 
@@ -45,7 +45,8 @@ def test_the_spectrum_of_noise_lies_on_its_floor() -> None:
 def test_even_and_odd_nonlinearity_of_a_sine() -> None:
     w = 4 * np.pi * TIME
     error: FloatArray = 1.5e-8 * np.sin(w) + 2e-8 * np.cos(2 * w) + 1e-8 * np.sin(3 * w + 0.4)
-    split = seen(SINE, error).split
+    found = seen(SINE, error)
+    split = found.split
     assert split is not None
     assert split.fundamental == pytest.approx(2.0, rel=1e-6)
     assert split.excited == 1
@@ -53,7 +54,7 @@ def test_even_and_odd_nonlinearity_of_a_sine() -> None:
     assert split.even == pytest.approx(2e-8**2 / 2, rel=0.05)
     assert split.odd == pytest.approx(1e-8**2 / 2, rel=0.1)
     assert split.noise == pytest.approx(NOISE**2, rel=0.05)
-    assert "even nonlinearity (14 nm rms)" in split.sentence
+    assert "even nonlinearity (14 nm rms)" in found.sentences[-1]
 
 
 def test_a_multisine_of_odd_lines_shows_its_nonlinearity_between_them() -> None:

@@ -10,8 +10,8 @@ from scipy.signal import lsim
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.search.hypothesis import hypothesis, root_of
-from psa_casadi.diagnosis.search.modes import one_mode
-from psa_casadi.effects.modal_series import MODAL_SERIES
+from psa_casadi.diagnosis.search.moves import one_mode
+from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.start.linear_response import Shaken, modes_of
 from psa_casadi.model.model_file import dumps, loads

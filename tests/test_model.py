@@ -11,7 +11,7 @@ import pytest
 
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.components.wafers import LINEAR_FORCE
+from psa_casadi.components.stack import LINEAR_FORCE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose

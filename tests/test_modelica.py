@@ -13,7 +13,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.modelica.package import class_names, export_modelica, modelica_text
 from psa_casadi.model.compose import compose
-from psa_casadi.model.from_casadi.ode_model import ode_model
+from psa_casadi.model.ode_model import ode_model
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.variables import Input, Output, Parameter, State

@@ -5,8 +5,7 @@ from scipy.integrate import solve_ivp
 
 from psa_casadi.components import COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.modelica.acausal import reciprocal
-from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.export.modelica.package import modelica_text, reciprocal
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.simulation.stepper import run

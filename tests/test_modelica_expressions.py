@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.errors import InputError
-from psa_casadi.export.modelica.expression import Graph
+from psa_casadi.export.modelica.expression import Graph, Printer
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.export.modelica.printer import Printer
 from psa_casadi.model.compose import compose
 from psa_casadi.variables import State
 from tests.modelica_runs import pure_ode, read_back

@@ -7,17 +7,17 @@ import pytest
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.noise.colour import (
+from psa_casadi.diagnosis.colour import (
     Colour,
     colour_of,
     excess_power,
     left_correlation,
     noise_rms,
+    omnibus,
     uncertain,
 )
-from psa_casadi.diagnosis.noise.residual_tests import omnibus
 from psa_casadi.effects import EFFECTS
-from psa_casadi.records.quality.noise import first_order_noise, high_frequency_noise
+from psa_casadi.records.noise import first_order_noise, high_frequency_noise
 from psa_casadi.units import FloatArray
 from tests.plants.make import make_record
 from tests.plants.noise import coloured

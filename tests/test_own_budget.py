@@ -8,9 +8,9 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import binom
 
-from psa_casadi.any_model.budget import removed_from
+from psa_casadi.any_model.result import removed_from
 from psa_casadi.any_model.runs import Run
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.records.signals import Signals
 
 FloatArray = npt.NDArray[np.float64]

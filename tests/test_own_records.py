@@ -8,7 +8,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.any_model.fit import fit_ode
-from psa_casadi.any_model.levels import first_levels, with_noise
+from psa_casadi.any_model.identify import first_levels, with_noise
 from psa_casadi.any_model.runs import runs_of
 from psa_casadi.records.signals import Signals, stairs
 from tests import own_plants as plants

@@ -12,10 +12,10 @@ from plotly.offline import get_plotlyjs
 
 import psa_casadi as psa
 from psa_casadi.command_line import typed
-from psa_casadi.diagnosis.held_out.errors import Errors
+from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.report.page.design_page import write_design_page
 from psa_casadi.report.page.fit_page import write_fit_report
-from psa_casadi.report.words.phrases import handy_scale, in_page_unit, length_scale, one_unit
+from psa_casadi.report.words.phrases import handy_scale, length_scale, one_unit, quantity
 from tests.html_page import Page
 from tests.report_cases import diagnosis, identification
 
@@ -85,12 +85,17 @@ def test_a_unit_of_a_page_ends_with_it() -> None:
     assert length_scale(3e-9).unit == "nm"
 
 
-def test_a_sentence_has_the_unit_of_its_page() -> None:
-    sentence = "-0.29 um at 0.17 s, +60 nm at 12 um; 3 mm, 5 umbrellas."
-    assert in_page_unit(sentence) == "-0.29 µm at 0.17 s, +60 nm at 12 µm; 3 mm, 5 umbrellas."
+def test_a_quantity_in_a_sentence_has_the_unit_of_its_page() -> None:
+    values = [(-0.29e-6, "m"), (0.17, "s"), (6e-8, "m"), (1.2e-5, "m"), (3e-3, "m"), (3.0, "V")]
+
+    def shown() -> list[str]:
+        return [quantity(*value) for value in values]
+
+    handy = ["-0.29 µm", "0.17 s", "60 nm", "12 µm", "3 mm", "3 V"]
+    assert shown() == handy
     with one_unit(handy_scale(2e-9)):
-        assert in_page_unit(sentence).startswith("-290 nm at 0.17 s, +60 nm at 12 µm; 3 mm")
+        assert shown() == ["-290 nm", *handy[1:]]
     with one_unit(handy_scale(2e-6)):
-        assert in_page_unit(sentence).startswith("-0.29 µm at 0.17 s, +0.06 µm at 12 µm; 3 mm")
+        assert shown() == [*handy[:2], "0.06 µm", *handy[3:]]
     with one_unit(length_scale(1.0, counts=True)):
-        assert in_page_unit(sentence).startswith("-0.29 µm at 0.17 s, +60 nm at 12 µm")
+        assert shown() == handy

@@ -13,10 +13,10 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import PARTS, compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.model.system.nanopositioner import nanopositioner
-from psa_casadi.model.system.system import connect
+from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
 from tests.benchmarks.nonlinearity import Controller, simulate_positioner
 from tests.tiers import slow

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psa_casadi.export.common.posterior import posterior_sets
+from psa_casadi.export.common.parameter_sets import posterior_sets
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Covariance
 from psa_casadi.model.stacks import stack_model

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.screening.peaks import residual_jumps, residual_periods
-from psa_casadi.diagnosis.screening.probes import directions
-from psa_casadi.diagnosis.search.hypothesis import root_of
-from psa_casadi.diagnosis.search.worth import shows_memory
+from psa_casadi.diagnosis.probes import directions, residual_jumps, residual_periods
+from psa_casadi.diagnosis.search.hypothesis import root_of, shows_memory
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import compose

@@ -12,14 +12,13 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.export.check.description import missing_notices, published_as
-from psa_casadi.export.check.origin import unreproducible_parts
+from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.export.ssp.archive import export_ssp
 from psa_casadi.model.model_file import dumps, loads, save_model
-from psa_casadi.model.system.system import System
+from psa_casadi.model.system import System
 from psa_casadi.variables import Publication
 from tests.fmu_models import assert_valid, entries, exported, model_named, rewritten
 from tests.tiers import slow_but

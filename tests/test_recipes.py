@@ -23,7 +23,7 @@ import psa_casadi as psa
 from build_scripts.measured_data import ROOT
 from psa_casadi.component import BALANCES
 from psa_casadi.examples.index import Example, Script, examples
-from psa_casadi.model.system.nanopositioner import nanopositioner
+from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.simulation.history import settled_at
 from tests.modelica_runs import load
 from tests.modelica_stub import STUB

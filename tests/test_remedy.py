@@ -8,18 +8,16 @@ import pytest
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.remedy.size import Size, example, sizes
+from psa_casadi.diagnosis.remedy import Size, example, sizes
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.modal_series import MODAL_SERIES
+from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Covariance, Evidence, SeenRange
 from psa_casadi.records import Record
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.words.phrases import handy_scale
-from psa_casadi.report.words.remedies import DO, RECORDS
-from psa_casadi.report.words.remedy_words import what_now
-from psa_casadi.report.words.size_words import size_text
+from psa_casadi.report.words.remedy_words import DO, RECORDS, size_text, what_now
 from psa_casadi.report.words.text import effect_page
 from psa_casadi.variables import Interval
 from tests.html_page import Page

@@ -8,11 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.noise.floor import noise_floor
+from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import Record, excitation, read_record
-from psa_casadi.records.quality.repeats import holds, repeats
-from psa_casadi.records.quality.repetitions import held, repetitions
+from psa_casadi.records.repeats import held, holds, repeats, repetitions
 
 FloatArray = NDArray[np.float64]
 
@@ -189,7 +188,7 @@ def test_a_coarse_sensor_has_at_least_the_noise_of_rounding() -> None:
     assert floor.quantum == pytest.approx(step, rel=1e-3)
     assert floor.level >= step / np.sqrt(12.0) * 0.999
     assert floor.autocovariance[0] == pytest.approx(floor.level**2)
-    assert "steps of 0.1 um" in floor.sentence
+    assert "steps of 0.1 µm" in floor.sentence
 
 
 @pytest.mark.parametrize(("file", "samples"), [("sine_1hz.csv", 5_000), ("minor_loops.csv", 1_500)])

@@ -8,8 +8,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Budget, Share
 from psa_casadi.diagnosis.result import Cause, Estimate, Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
@@ -18,8 +17,7 @@ from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.plots.figure import save_figure
 from psa_casadi.report.plots.finding_plots import evidence_plot
 from psa_casadi.report.words.phrases import length_scale, listing, number, plain, share_text
-from psa_casadi.report.words.residuals import noise_density, spectrum
-from psa_casadi.report.words.series import series_of, telling_window
+from psa_casadi.report.words.series import noise_density, series_of, spectrum, telling_window
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
 from psa_casadi.report.words.text import check_sentence, effect_page, story
 from psa_casadi.report.words.verdict_words import cause_size, verdict_sentence

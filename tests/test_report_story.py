@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from psa_casadi.cli.diagnosis_files import models
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Budget, Share
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.report.page.diagnosis import write_report
 from psa_casadi.report.page.misfit_part import drawn, split_table
-from psa_casadi.report.words.phrases import probability_text, strongest_sentence
+from psa_casadi.report.words.misfit_words import strongest
+from psa_casadi.report.words.phrases import probability_text
 from psa_casadi.report.words.tables import blindest, candidate_table
 from psa_casadi.report.words.text import story
 from tests.html_page import Page, figures, numbers
@@ -228,10 +228,10 @@ def test_a_percent_sign_stays_with_its_number(width: int) -> None:
         assert len(line) <= width
 
 
-def test_the_strongest_sentence_is_that_of_the_worst_record() -> None:
+def test_the_strongest_finding_is_that_of_the_worst_record() -> None:
     _, drifting, quiet = misfits("plant_a", 1500)
-    assert strongest_sentence([quiet, drifting]) == drifting.sentences[1]
-    assert strongest_sentence([quiet]) == ""
+    assert strongest([quiet, drifting]) == drifting.findings[1]
+    assert strongest([quiet]) is None
 
 
 def test_blind_spots_are_named_the_furthest_first_and_five_at_most() -> None:

@@ -4,8 +4,11 @@ import pytest
 from psa_casadi.report.plots.residual_plots import distribution_plot
 from psa_casadi.report.words.fit_words import residual_sentence
 from psa_casadi.report.words.phrases import Scale
-from psa_casadi.report.words.residuals import (
+from psa_casadi.report.words.series import (
+    Curve,
+    FloatArray,
     ResidualFigures,
+    Series,
     autocorrelation,
     distribution,
     residual_figures,
@@ -13,7 +16,6 @@ from psa_casadi.report.words.residuals import (
     spectrum,
     white_band,
 )
-from psa_casadi.report.words.series import Curve, FloatArray, Series
 
 SECONDS = Scale("s", 1.0)
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.export.check.check import check_fmu
-from psa_casadi.export.fmu.sources import STRICT
-from psa_casadi.export.fmu.texts import write_sources
+from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.export.importer.fmu import CO_SIMULATION, DISCARD, ERROR, Fmu, FmuError
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.sampled_fmus import exported
@@ -71,7 +70,7 @@ def test_measured_dependencies_are_listed() -> None:
     """Whatever moves the voltage at an instant is among its dependencies, and the reverse."""
     listed = {"reference", "position", "k_p"}
     with Fmu(exported("controller", 2)) as fmu:
-        names = [*fmu.names("input"), *fmu.tunable()]
+        names = [*fmu.names("input"), *fmu.varying("tunable")]
         moving = set()
         for name in names:
             with fmu.start(CO_SIMULATION) as slave:

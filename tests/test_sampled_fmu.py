@@ -11,6 +11,7 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
+from tests.fmi3_instances import Instance3
 from tests.sampled_fmus import exported
 from tests.sampled_models import PERIOD, FloatArray, expected, grid
 
@@ -164,7 +165,7 @@ def test_time_events_of_model_exchange(fmi: int) -> None:
 
 
 def test_event_mode_of_co_simulation() -> None:
-    with Fmu(exported("loop", 3)) as fmu, fmu.start3(CO_SIMULATION, events=True) as slave:
+    with Fmu(exported("loop", 3)) as fmu, Instance3(fmu, events=True).start() as slave:
         slave.update_discrete_states()
         assert slave.next_event_time == PERIOD
         slave.require("EnterStepMode")
@@ -181,8 +182,10 @@ def test_early_return_at_an_instant() -> None:
     """A step that is ended at an instant inside of it goes on to the same end."""
     ends = []
     for watcher in (None, lambda _, u: u.time if abs(u.time - 2 * PERIOD) < 1e-12 else None):
-        options = {"tolerance": 1e-10, "watcher": watcher}
-        with Fmu(exported("loop", 3)) as fmu, fmu.start3(CO_SIMULATION, **options) as slave:
+        with (
+            Fmu(exported("loop", 3)) as fmu,
+            Instance3(fmu, watcher=watcher).start(tolerance=1e-10) as slave,
+        ):
             slave.set({"reference": 1.0})
             done = slave.try_step(0.0, 3.6 * PERIOD)
             assert done.early == (watcher is not None)

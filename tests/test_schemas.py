@@ -10,7 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.corrections.patch import Patch
+from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.result import Alternative
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.check.check import CheckReport
@@ -67,7 +67,7 @@ def test_diagnoses_are_as_their_schema_says(verdict: Any) -> None:
     content = valid("diagnosis", d.to_json())
     assert content["misfit"][0]["views"]
     none = np.zeros(1)
-    patch = Patch("curve", "sensor", "It bends.", 9.0, ("lag at the drive",), (), (), none, none)
+    patch = Patch("curve", "reading", 9.0, ("lag at the drive",), (), (), none, none)
     other = Alternative("slow_creep", "offset_drift", d.model, 1.01, 1e-9, 0.1)
     assert valid("diagnosis", replace(d, patch=patch, alternatives=(other,)).to_json())["patch"]
 

@@ -14,8 +14,8 @@ from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.refitting import exchanges
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.notes import texts
 from psa_casadi.records import Record
-from psa_casadi.shown import sentences
 from tests.benchmarks.coverage import one_run
 from tests.benchmarks.records import clean_loops, with_noise
 from tests.tiers import slow
@@ -162,7 +162,7 @@ def test_oversampled_records_are_averaged_and_say_so() -> None:
     shorter, notes = prepared(Record(name="fast", time=t, voltage=v, displacement=y))
     factor = t.size // shorter.n
     assert factor >= 8
-    assert f"averaged in blocks of {factor}" in sentences(notes)[-1]
+    assert f"averaged in blocks of {factor}" in texts(notes)[-1]
     assert float(np.std(np.asarray(shorter.displacement) - 1e-7 * shorter.voltage)) == (
         pytest.approx(1e-9 / np.sqrt(factor), rel=0.1)
     )

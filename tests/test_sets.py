@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.diagnosis.noise.colour import Colour
-from psa_casadi.diagnosis.screening.probes import Direction
-from psa_casadi.diagnosis.screening.sets import best_sets
+from psa_casadi.diagnosis.colour import Colour
+from psa_casadi.diagnosis.probes import Direction
+from psa_casadi.diagnosis.screening import best_sets
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit
 

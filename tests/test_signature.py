@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
-from psa_casadi.diagnosis.residual.signature import signature, standard_voltage
+from psa_casadi.diagnosis.signature import signature, standard_voltage
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.noise.floor import knowable, known_colour, noise_floor
-from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.records.quality.quantum import last_place_of
+from psa_casadi.diagnosis.noise import knowable, known_colour, noise_floor
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.records.noise import last_place_of
 from tests.benchmarks.simulated import Case, all_cases, judged, record_of
 from tests.tiers import slow
 

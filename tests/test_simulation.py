@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from psa_casadi.components import BASE
-from psa_casadi.components.drive import DRIVE
+from psa_casadi.components.stack import DRIVE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import Model, compose

@@ -8,12 +8,10 @@ import pytest
 from scipy.stats import chi2
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.noise.colour import Colour
-from psa_casadi.diagnosis.screening.probes import Direction, directions
-from psa_casadi.diagnosis.screening.screen import Score, Screening, copies, screen
-from psa_casadi.diagnosis.screening.sets import best_sets
-from psa_casadi.diagnosis.screening.spans import Span, combined, spans
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.colour import Colour
+from psa_casadi.diagnosis.probes import Direction, Span, combined, directions, spans
+from psa_casadi.diagnosis.screening import Score, Screening, best_sets, copies, screen
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from psa_casadi.diagnosis.held_out.coverage import coverage_notes
+from psa_casadi.diagnosis.confirmation import coverage_notes
+from psa_casadi.notes import texts
 from psa_casadi.records import Record
-from psa_casadi.records.quality.noise import correlation_inflation, high_frequency_noise
+from psa_casadi.records.drive import reversals
+from psa_casadi.records.noise import correlation_inflation, high_frequency_noise
 from psa_casadi.records.split import divided, split, whole
-from psa_casadi.records.turns import reversals
 
 FloatArray = NDArray[np.float64]
 
@@ -109,14 +110,14 @@ def test_what_is_not_held_out_is_told() -> None:
     voltage = with_a_hold()
     voltage[500:600] = triangle(100, 50)  # the hold fills one block, which is fitted
     (note,) = coverage_notes([split(record(voltage))])
-    assert "held voltages" in note
-    assert note.startswith("8 % of the fitted samples")
+    assert str(note).startswith("8 % of the fitted samples")
+    assert "held voltages" in str(note)
 
 
 def test_what_is_held_out_but_not_fitted_is_told() -> None:
     """Slow and wide loops are held out; their first tenth, which tells their start, too."""
     small, slow = 0.2 * triangle(1600, 50), triangle(1600, 800)
-    found = coverage_notes(divided([record(small)], [record(slow)]))
+    found = texts(coverage_notes(divided([record(small)], [record(slow)])))
     assert len(found) == 3
     assert "large falls of 0.25 to 1 s" in found[0]
     assert "extrapolates" in found[0]

@@ -12,13 +12,13 @@ from lxml import etree  # type: ignore[import-untyped]
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
-from psa_casadi.export.ssp.layout import OUTSIDE, Port
-from psa_casadi.export.ssp.parameters import shared_parameters
-from psa_casadi.export.ssp.read_archive import SspArchive
+from psa_casadi.export.ssp.drawing import OUTSIDE, Port
 from psa_casadi.export.ssp.steps import stable_step
-from psa_casadi.model.system.nanopositioner import nanopositioner
-from psa_casadi.model.system.system import System
+from psa_casadi.export.ssp.structure import shared_parameters
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.system import System
 from tests.fmu_models import assert_valid, model_named
+from tests.ssp_master import SspArchive
 from tests.ssp_systems import archive_of, closed_loop, pushed_stage
 from tests.test_fmu_system import STACK
 from tests.tiers import slow, slow_but
@@ -146,14 +146,13 @@ def _on_each_other(
 def test_the_picture_shows_every_part_and_port(tmp_path: Path) -> None:
     wiring = wiring_of(closed_loop())
     layout = layout_of(wiring)
-    svg = save_wiring(wiring, layout, tmp_path / "wiring.svg").read_text()
+    svg = save_wiring(wiring, layout, tmp_path / "wiring.svg").read_bytes()
     with zipfile.ZipFile(archive_of("closed_loop")) as archive:
-        assert archive.read("documentation/wiring.svg").decode() == svg
-    root = etree.fromstring(svg.encode())
+        assert archive.read("documentation/wiring.svg") == svg
+    root = etree.fromstring(svg)
     shown = [e.text for e in root.iter("{*}text")]
     assert set(wiring.parts) <= set(shown)
     assert {p.name for p in layout.places if p.part} <= set(shown)
-    assert len(list(root.iter("{*}polyline"))) == len(wiring.wires)
     png = save_wiring(wiring, layout, tmp_path / "wiring.png").read_bytes()
     assert png.startswith(b"\x89PNG")
     with pytest.raises(InputError, match=r"\.svg or \.png"):

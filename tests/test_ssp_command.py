@@ -9,7 +9,7 @@ from typer.testing import CliRunner, Result
 from psa_casadi.cli.app import app
 from psa_casadi.export.ssp.archive import wiring_of
 from psa_casadi.export.ssp.steps import stable_step
-from psa_casadi.model.system.nanopositioner import nanopositioner
+from psa_casadi.model.nanopositioner import nanopositioner
 from tests.tiers import slow
 
 

@@ -10,12 +10,11 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.importer.fmu import FmuError
 from psa_casadi.export.importer.masters import FloatArray, Signals
 from psa_casadi.export.ssp.archive import wiring_of
-from psa_casadi.export.ssp.master import couple, points
-from psa_casadi.export.ssp.read_archive import SspArchive
 from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.simulation.stepper import run
 from tests.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
 from tests.benchmarks.coupling_stability import settles
+from tests.ssp_master import SspArchive, couple, points
 from tests.ssp_systems import archive_of, closed_loop, pushed_stage
 from tests.test_fmu_system import END, RATE, monolithic
 from tests.tiers import slow

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.export.check.agreement import truth_of
-from psa_casadi.export.check.origin import wrong_start_values
+from psa_casadi.export.check.description import wrong_start_values
 from psa_casadi.export.check.structure import wrong_start
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.archive import Archive

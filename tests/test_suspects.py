@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.records import Record, multisine, read_record, sine, steps, time_grid, triangle
-from psa_casadi.records.quality.quantum import quantum_of
-from psa_casadi.records.quality.suspects import cleaned, suspects
+from psa_casadi.records.noise import quantum_of
+from psa_casadi.records.suspects import cleaned, suspects
 from tests.tiers import slow, slow_but
 
 FloatArray = NDArray[np.float64]

@@ -12,11 +12,15 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.nanopositioner import (
+    controller_for,
+    margins_of,
+    nanopositioner,
+    positioner_plant,
+)
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.model.system.nanopositioner import nanopositioner, positioner_plant
-from psa_casadi.model.system.system import connect
-from psa_casadi.model.system.tuning import controller_for, margins_of
+from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output
 from tests.benchmarks import nonlinearity

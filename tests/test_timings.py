@@ -12,7 +12,7 @@ from psa_casadi.components import BASE
 from psa_casadi.model.compose import compose
 from psa_casadi.records import write_record
 from psa_casadi.records.excitation import time_grid, triangle
-from psa_casadi.report.words.timings import timings_table
+from psa_casadi.report.words.tables import timings_table
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import run

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components.validity import OUTPUT
+from psa_casadi.components.outputs import OUTPUT
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.fmu import evidence_files as files
+from psa_casadi.export.fmu import evidence
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.validity import seen_inputs, with_validity
+from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
@@ -97,7 +97,7 @@ def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> No
 
 def test_the_output_is_there_on_request_only() -> None:
     model = evident_model()
-    assert OUTPUT not in files.evidence_texts(model.plant(), 0)[files.INPUTS]
+    assert OUTPUT not in evidence.evidence_texts(model.plant(), 0)[evidence.INPUTS]
     with Archive(evident_fmu()) as archive:
         assert OUTPUT in archive.names("output")
     with pytest.raises(InputError, match="does not say what its records have shown"):

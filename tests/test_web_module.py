@@ -8,7 +8,7 @@ import pytest
 from psa_casadi.component import Component
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.web.module import web_module
+from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page.live_data import live_data

@@ -1,23 +1,44 @@
-"""Diagnose any model: fit it, search for causes at its ports, judge."""
+"""Diagnose any model; `psa.identify` and `psa.diagnose` of a stack or of any model."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
-from typing import Any
+from functools import wraps
+from inspect import signature
+from typing import Any, overload
 
-from psa_casadi.any_model.effects.table import effects_of
+from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.fit import refuse_unfit
-from psa_casadi.any_model.identify import free_of, known_zeros, search_starts
+from psa_casadi.any_model.hypothesis import Table
+from psa_casadi.any_model.identify import (
+    OdeIdentification,
+    free_of,
+    identify_ode,
+    known_zeros,
+    reweighted,
+    search_starts,
+    unlike,
+    with_noise,
+)
 from psa_casadi.any_model.judge import judged
-from psa_casadi.any_model.levels import reweighted, unlike, with_noise
+from psa_casadi.any_model.predict import sized, sizes_of
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import runs_of, told_of_columns
 from psa_casadi.any_model.search import search
-from psa_casadi.any_model.sizes import sized, sizes_of
-from psa_casadi.any_model.trials import Table
+from psa_casadi.component import Component
+from psa_casadi.diagnosis import diagnose as stacks
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.task import Method
 from psa_casadi.errors import InputError
+from psa_casadi.identification import identify as stack
+from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.start.ordinary import Hysteresis
+from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
+from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold, signals_given
+from psa_casadi.simulation.one_thread import one_thread_of_algebra
+from psa_casadi.simulation.ways import output_of
 
 
 def diagnose_ode(
@@ -54,7 +75,7 @@ def diagnose_ode(
     held = signals_given(holdout, hold, len(given) + 1) if _any(holdout) else []
     runs = runs_of(model, given, held)
     shifted = known_zeros(model, zeros)
-    progress("fitting the model from several starts")
+    progress("fitting from several starts")
     base, runs, _ = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts, zeros=shifted,
         known_start=known_start,
@@ -69,11 +90,11 @@ def diagnose_ode(
     known = search(base, runs, table, progress)
     runs = with_noise(known.best().fit, runs)
     if unlike(runs, known.runs):
-        progress("searching again with the noise that the best model leaves in every record")
+        progress("searching again, noise by record")
         known = search(reweighted(base, runs), runs, table, progress)
     progress("judging")
     found = judged(known)
-    return replace(found, notes=(*found.notes, *told_of_columns(model, runs)))
+    return replace(found, remarks=(*found.remarks, *told_of_columns(model, runs)))
 
 
 def _any(given: Any) -> bool:
@@ -88,3 +109,119 @@ def _refuse_unknown(leave_out: Sequence[str], names: Sequence[str]) -> None:
                 f"`leave_out` has '{name}', which begins the name of no effect; of the {len(names)}"
                 f" there are, the nearest are {', '.join(near)}."
             )
+
+
+Progress = Callable[[str], None]
+
+
+def _told_of(own: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add to a function's help what it is for a model of one's own."""
+
+    def told(face: Callable[..., Any]) -> Callable[..., Any]:
+        words = f"Of a model of your own, {face.__name__}{signature(own)}:\n\n    {own.__doc__}"
+        face.__doc__ = f"{face.__doc__}\n    {words}"
+        return face
+
+    return told
+
+
+@overload
+def identify(
+    records: Records,
+    *,
+    model: Model | None = None,
+    stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
+    progress: Progress = ...,
+) -> Identification: ...
+@overload
+def identify(
+    model: Model,
+    records: Any,
+    *,
+    free: Sequence[str] | None = None,
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+    hold: Hold | None = None,
+) -> OdeIdentification: ...
+@_told_of(identify_ode)
+@wraps(stack.identify)
+def identify(*given: Any, **words: Any) -> Any:
+    """Identify a stack from its records, or a model of one's own, given first, from its."""
+    model, records = _models_first(given, words)
+    if model is None or _is_stack(model):
+        return stack.identify(records, model=model, **_known(words, stack.identify))
+    return _own(identify_ode, model, records, words)
+
+
+@overload
+def diagnose(
+    records: Records,
+    *,
+    holdout: Records = (),
+    model: Model | None = None,
+    stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
+    effects: Sequence[Component] | None = None,
+    method: Method | None = None,
+    progress: Progress = ...,
+) -> Diagnosis: ...
+@overload
+def diagnose(
+    model: Model,
+    records: Any,
+    *,
+    holdout: Any = (),
+    free: Sequence[str] | None = None,
+    leave_out: Sequence[str] = (),
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+    hold: Hold | None = None,
+    progress: Progress = ...,
+) -> OdeDiagnosis: ...
+@_told_of(diagnose_ode)
+@wraps(stacks.diagnose)
+def diagnose(*given: Any, **words: Any) -> Any:
+    """Diagnose a stack's records, or a model of one's own, given first, on its records."""
+    model, records = _models_first(given, words)
+    if model is None or _is_stack(model):
+        return stacks.diagnose(records, model=model, **_known(words, stacks.diagnose))
+    return _own(diagnose_ode, model, records, words)
+
+
+@interruptible_work()
+@one_thread_of_algebra()
+def _own(work: Callable[..., Any], model: Model, records: Any, words: dict[str, Any]) -> Any:
+    return work(model, records, **_known(words, work))
+
+
+def _known(words: dict[str, Any], work: Callable[..., Any]) -> dict[str, Any]:
+    """Return the words for a piece of work. Raises InputError for one that it does not take."""
+    own = [n for n in signature(work).parameters if n not in ("model", "records")]
+    for word in words:
+        if word not in own:
+            what = "a model of your own" if "known_start" in own else "a stack"
+            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(own)}.")
+    return words
+
+
+def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model | None, Any]:
+    """Return the model, if there is one, and the records; `words` lose both."""
+    left = list(given)
+    model = left.pop(0) if left and isinstance(left[0], Model) else words.pop("model", None)
+    if left[1:] and isinstance(left[1], Model):
+        raise InputError(
+            "The model comes first and its records second: psa.diagnose(model, records). With the"
+            " records of a stack, name it: model=..."
+        )
+    records = left.pop(0) if left else words.pop("records", None)
+    if records is None or left:
+        raise InputError("Give records, or a model of your own and its records, and words beside.")
+    return model, records
+
+
+def _is_stack(model: Model) -> bool:
+    own = "voltage" in model.input_names and output_of(model) is not None
+    return own and not model.structure.foreign

@@ -1,4 +1,4 @@
-"""Prediction-error fit of any model: all outputs of all experiments, with exact sensitivities."""
+"""Prediction-error fit of any model with exact sensitivities, and how sure its values are."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,18 +7,73 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.beginnings import begun
-from psa_casadi.any_model.coordinates import coordinates_of
-from psa_casadi.any_model.predict import STEP_RTOL, output_of, shown_by
+from psa_casadi.any_model.predict import STEP_RTOL, coordinates_of, output_of, shown_by
 from psa_casadi.any_model.runs import Run, measured_spans
 from psa_casadi.errors import Problems, PsaError
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum, minimise
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
+from psa_casadi.records.noise import filtered
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.variables import Interval
 
 FloatArray = npt.NDArray[np.float64]
+
+#: How far the start is sought in the first tenth.
+_EVALUATIONS, _TOLERANCE = 30, 1e-5
+
+
+def begun(
+    model: Model,
+    runs: Sequence[Run],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    places: Sequence[int],
+    levels: Sequence[float],
+    rtol: float,
+) -> FloatArray:
+    """Return theta with initial states and zeros of held-out experiments, from their first tenth.
+
+    `places` are the outputs that count, each by its level. Where a start cannot be simulated it
+    stays as it is.
+    """
+    found = theta.copy()
+    judging = [k for k, r in enumerate(runs) if r.held_out_whole]
+
+    def one(k: int) -> FloatArray:
+        first, run = unknowns.first(k), runs[k].of_beginning()
+        own = slice(first, unknowns.first(k + 1))
+        prior = 1.0 / unknowns.prior[own]
+        weights = [(j, run.fitted(j), level * run.noise[j])
+                   for j, level in zip(places, levels, strict=True)]  # fmt: skip
+
+        def evaluate(start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+            there = theta.copy()
+            there[own] = start
+            rows, slopes = [start * prior], [np.diag(prior)]
+            for j, used, size in weights:
+                if not used.any():
+                    continue
+                try:
+                    shown, by_theta = output_of(model, run, unknowns, there, k, j, rtol)
+                except PsaError:
+                    return None
+                cut = used[: run.stop]
+                rows.append((shown[cut] - run.outputs[used, j]) / size)
+                slopes.append(by_theta[cut, own] / size)
+            return np.concatenate(rows), np.vstack(slopes)
+
+        free = np.full(own.stop - own.start, np.inf)
+        best = minimise(
+            evaluate, theta[own], (-free, free), tolerance=_TOLERANCE, evaluations=_EVALUATIONS
+        )
+        return theta[own] if best is None else best.theta
+
+    for k, start in zip(judging, side_by_side(one, judging), strict=True):
+        found[unknowns.first(k) : unknowns.first(k + 1)] = start
+    return found
+
 
 #: Share of an output's range below which no difference between a device and a model is told.
 STRAIGHT = 2e-5
@@ -293,3 +348,72 @@ def refuse_unfit(model: Model) -> None:
             " leave the sampled component out."
         )
     problems.raise_if_any()
+
+
+#: A parameter with a larger standard error than this, over its ordinary change, is not determined.
+_UNDETERMINED = 0.5
+#: Half a 95 % interval over the standard error.
+_NORMAL = 1.96
+#: Correlations of neighbours below this count as none.
+_WHITE = 0.05
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """Standard errors and 95 % intervals of the parameters by name, and what is wrong with some.
+
+    The interval of a parameter that spans decades is that of its logarithm; none goes beyond the
+    parameter's bounds. `undetermined` are not
+    told by the records, `on_bound` sit on a bound of their range.
+    """
+
+    errors: dict[str, float]
+    intervals: dict[str, Interval]
+    undetermined: tuple[str, ...]
+    on_bound: tuple[str, ...]
+
+
+def certainty(fit: OdeFit) -> Certainty:
+    """Return how sure a fit's parameters are.
+
+    Cov = (sum_j J_j^T J_j / s_j^2 + prior)^-1 over outputs j, residuals and derivatives whitened by
+    the correlation of the residual's neighbours, s_j the rms that is left.
+    """
+    information = np.diag(1.0 / fit.unknowns.prior**2)
+    for output in fit.outputs:
+        white = _whitened(output, np.column_stack([output.residuals, output.jacobian]))
+        level = max(float(np.sqrt(np.mean(white[:, 0] ** 2))), 1e-300)
+        information = information + white[:, 1:].T @ white[:, 1:] / level**2
+    names = fit.unknowns.names
+    spread = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[: len(names)]
+    slopes = np.diag(fit.unknowns.slopes(fit.theta))
+    errors, intervals, on_bound = {}, {}, []
+    for k, name in enumerate(names):
+        value, error = fit.model.values[name], float(spread[k] * abs(slopes[k]))
+        errors[name] = error
+        factor = float(np.exp(min(_NORMAL * spread[k], 300.0)))
+        half = _NORMAL * error
+        low, high = float(fit.unknowns.low[k]), float(fit.unknowns.high[k])
+        least, most = value - half, value + half
+        if fit.unknowns.log[k]:
+            least, most = value / factor, value * factor
+        intervals[name] = Interval(max(least, low), min(most, high))
+        edge = 1e-6 * (high - low) if np.isfinite(high - low) else 0.0
+        if value <= low + edge or value >= high - edge:
+            on_bound.append(name)
+    undetermined = [n for n, s in zip(names, spread, strict=True) if s > _UNDETERMINED]
+    return Certainty(errors, intervals, tuple(undetermined), tuple(on_bound))
+
+
+def _whitened(output: FittedOutput, columns: FloatArray) -> FloatArray:
+    r = _correlation(output)
+    if r < _WHITE:
+        return columns
+    parts = np.split(columns, np.cumsum(output.lengths)[:-1])
+    return np.vstack([filtered([1.0, -r], [1.0], part)[1:] for part in parts])
+
+
+def _correlation(output: FittedOutput) -> float:
+    """Return the correlation of neighbours within the experiments, 0.98 at most."""
+    top = sum(float(p[1:] @ p[:-1]) for p in output.parts)
+    return min(top / max(float(output.residuals @ output.residuals), 1e-300), 0.98)

@@ -15,22 +15,20 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.budget import removed_from
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.any_model.fit import OdeFit, fit_ode
 from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of
-from psa_casadi.any_model.levels import noise_left
-from psa_casadi.any_model.predict import shown_by, states_of, traced
+from psa_casadi.any_model.identify import noise_left
+from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, start_of, states_of, traced
+from psa_casadi.any_model.result import removed_from
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
-from psa_casadi.any_model.sizes import Sizes, sizes_of
-from psa_casadi.any_model.start import start_of
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.diagnosis.held_out.shares import Share
-from psa_casadi.diagnosis.screening.screen import independent, whitened_jacobian, without
+from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.diagnosis.screening import independent, whitened_jacobian, without
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
-from psa_casadi.model.from_casadi.ports import Port, ports_of, true_output
+from psa_casadi.model.ports import Port, ports_of, true_output
 from psa_casadi.variables import Parameter
 
 FloatArray = npt.NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Identify any model from its records: a search from several starts within the bounds."""
+"""Identify any model from its records: several starts, and the noise that every output leaves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,14 +7,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.certainty import Certainty, certainty
-from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted, refuse_unfit
-from psa_casadi.any_model.levels import first_levels, relevelled, reweighted, unlike, with_noise
+from psa_casadi.any_model.fit import (
+    Certainty,
+    OdeFit,
+    certainty,
+    fit_ode,
+    measured_outputs,
+    refitted,
+    refuse_unfit,
+)
+from psa_casadi.any_model.predict import shown_by, sized
 from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
-from psa_casadi.any_model.sizes import sized
+from psa_casadi.diagnosis.colour import Colour, noise_rms, uncertain
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.noise import first_order_noise
+from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.noise import first_order_noise
 from psa_casadi.records.signals import Hold, signals_given
 from psa_casadi.shown import StillReported, frame
 from psa_casadi.simulation.stepper import SimulationError
@@ -22,6 +30,99 @@ from psa_casadi.variables import Parameter, Provenance
 from psa_casadi.version import __version__
 
 FloatArray = npt.NDArray[np.float64]
+
+#: Noise is estimated from so many samples or more, and differs from so many standard errors on.
+_TELLING, _SURE = 32, 3.0
+
+
+def first_levels(runs: Sequence[Run]) -> tuple[float, ...]:
+    """Return levels to begin with: a tenth of every measured output's standard deviation."""
+    places = measured_outputs(runs)
+    every = np.vstack([np.where(r.used[:, None], r.outputs, np.nan) for r in runs])
+    return tuple(0.1 * float(np.nanstd(every[:, j])) for j in places)
+
+
+def relevelled(fit: OdeFit, runs: Sequence[Run], rounds: int = 4) -> OdeFit:
+    """Fit again with every output's residual as its noise level, until that stays the same."""
+    for _ in range(rounds if len(fit.outputs) > 1 else 1):
+        levels = tuple(max(o.rms, o.straight, 1e-300) for o in fit.outputs)
+        change = np.max(np.abs(np.log(np.array(levels) / np.array(fit.levels))))
+        if change < 0.02 or fit.interrupted:
+            break
+        fit = refitted(fit, runs, levels=levels)
+    return fit
+
+
+def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
+    """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
+
+    Of every output, over the usual one of all experiments (the geometric mean by samples). A share
+    that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
+    """
+    shares = [r.noise.copy() for r in runs]
+    beginnings = _beginnings(fit, runs)
+    for o in fit.outputs:
+        fitted = zip(o.runs, o.parts, strict=True)
+        begun = ((k, _at(r, e, o.index)) for k, r, e in beginnings)
+        found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
+        if len(found) < 2:
+            continue
+        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in found]
+        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in found])
+        for (k, part), own in zip(found, over, strict=True):
+            if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
+                shares[k][o.index] *= float(np.exp(own))
+    return tuple(replace(r, noise=share) for r, share in zip(runs, shares, strict=True))
+
+
+def _beginnings(fit: OdeFit, runs: Sequence[Run]) -> list[tuple[int, Run, FloatArray]]:
+    """Return the held-out experiments' beginnings, with measured minus predicted over the noise."""
+    found = []
+    for k, run in enumerate(runs):
+        if run.held_out_whole:
+            begun = run.of_beginning()
+            shown = shown_by(fit.model, begun, fit.starts()[k], begun.stop, fit.rtol, fit.zeros)
+            found.append((k, begun, (run.outputs[: begun.stop] - shown) / run.noise))
+    return found
+
+
+def _at(run: Run, errors: FloatArray, output: int) -> FloatArray:
+    """Return the errors of an output where it was measured."""
+    found: FloatArray = errors[run.fitted(output)[: run.stop], output]
+    return found
+
+
+def unlike(runs: Sequence[Run], others: Sequence[Run]) -> bool:
+    """Whether the shares of the noise differ."""
+    return any(np.any(a.noise != b.noise) for a, b in zip(runs, others, strict=True))
+
+
+def reweighted(fit: OdeFit, runs: Sequence[Run]) -> OdeFit:
+    """Fit again with other shares of the noise."""
+    return relevelled(refitted(fit, runs, evaluations=100), runs)
+
+
+def noise_left(fit: OdeFit, colour: Colour) -> list[float]:
+    """Return the noise in every output's residual, over the shares that weighted it."""
+    rows = zip(fit.outputs, colour.each, strict=True)
+    return [noise_rms(o.residuals, own) for o, own in rows]
+
+
+def noise_told(
+    fit: OdeFit, colour: Colour, runs: Sequence[Run]
+) -> tuple[tuple[Run, ...], tuple[float, ...]]:
+    """Return the experiments and every output's noise over them, in its unit, as a fit leaves it.
+
+    What a search has weighted by is from the base's residual, which holds more than noise.
+    """
+    told, levels = with_noise(fit, runs), []
+    for o, own in zip(fit.outputs, colour.each, strict=True):
+        j = o.index
+        rows = zip(o.runs, o.parts, strict=True)
+        left = np.concatenate([p * (runs[k].noise[j] / told[k].noise[j]) for k, p in rows])
+        levels.append(noise_rms(left, own) * noise_share(told, j))
+    return told, tuple(levels)
+
 
 #: Evaluations of a start's first fit, and how many of the best go on to the end.
 _QUICK, _FOLLOWED = 15, 2
@@ -38,7 +139,7 @@ _ALL = 0.8
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OdeIdentification(StillReported):
-    """A model with fitted values, how sure they are, and warnings.
+    """A model with fitted values, how sure they are, and remarks, which `warnings` tells.
 
     `errors` are the parameters' standard errors, `intervals` their 95 % intervals in
     `model.provenance`; `rms` is what is left of every measured output and `noise` the fast part of
@@ -55,17 +156,16 @@ class OdeIdentification(StillReported):
     noise: Mapping[str, float]
     costs: tuple[float, ...]
     agreed: int
-    warnings: tuple[str, ...]
+    remarks: tuple[Note, ...]
 
     def __repr__(self) -> str:
         """Return the parameters with their standard errors, and what is left of the outputs."""
-        rows = [
-            f"  {n} = {self.model.values[n]:.6g} +- {e:.2g} {self.model.parameter(n).unit}"
-            for n, e in self.errors.items()
-        ]
-        left = [f"  {n}: {v:.3g} rms left, noise {self.noise[n]:.3g}" for n, v in self.rms.items()]
-        said = [f"  {w}" for w in self.warnings]
-        return "\n".join([f"identified '{self.model.name}':", *rows, *left, *said])
+        return str(note("own_identification", found=self))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The remarks in sentences."""
+        return texts(self.remarks)
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas DataFrame: value, standard error, interval, unit."""
@@ -254,29 +354,19 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
     good = [c for c in costs if np.isfinite(c)]
     agreed = sum(c <= (1.0 + _SAME) * min(good) for c in good)
     said = []
-    if fit.interrupted:
-        said.append("The search was interrupted; these are the best values so far.")
-    elif not fit.converged:
-        said.append("The fit was cut off before it converged; its values are not final.")
+    if fit.interrupted or not fit.converged:
+        said.append(note("own_interrupted" if fit.interrupted else "cut_off"))
     if len(costs) > 1 and agreed == 1:
-        said.append(
-            f"Of {len(costs)} starts only one led to this minimum; it is the best found, and may"
-            " not be the best there is."
-        )
-    said += [f"'{n}' is not determined by these records." for n in sure.undetermined]
+        said.append(note("one_start", starts=len(costs)))
+    said += [note("own_undetermined", name=n) for n in sure.undetermined]
+    said += [note("on_bound", name=n) for n in sure.on_bound]
     said += [
-        f"'{n}' sits on a bound of its range; its interval means nothing." for n in sure.on_bound
-    ]
-    said += [
-        f"'{n}' is missed by {rms[n] / noise[n]:.2g} times its noise: the model lacks something, so"
-        " that the values bend to it, and their errors are too small; psa.diagnose looks for the"
-        " cause."
+        note("output_missed", output=n, ratio=rms[n] / noise[n])
         for n in rms
         if noise[n] > 0 and rms[n] > MISSED * noise[n]
     ]
     said += [
-        f"'{o.column}' is left with {100 * share:.0f} % of its own movement: see that its column,"
-        " and those of the inputs, are in the model's units."
+        note("output_not_followed", output=o.column, share=share)
         for o in fit.outputs
         if (share := rms[o.column] / _movement(runs, o.index)) > _ALL
     ]
@@ -291,7 +381,7 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         noise=noise,
         costs=costs,
         agreed=agreed,
-        warnings=tuple(said),
+        remarks=tuple(said),
     )
 
 

@@ -1,42 +1,167 @@
 """From what a search found in any model to a verdict, by the rules of a stack's diagnosis."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.any_model.budget import OdeBudget, removed_from
-from psa_casadi.any_model.certainty import certainty
+from psa_casadi.any_model.fit import OdeFit, certainty
 from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
-from psa_casadi.any_model.identify import with_told
-from psa_casadi.any_model.levels import noise_left, noise_told
-from psa_casadi.any_model.remedy import changes
-from psa_casadi.any_model.result import FreeFunction, OdeDiagnosis, OutputError, PortCause
+from psa_casadi.any_model.identify import MISSED, noise_left, noise_told, with_told
+from psa_casadi.any_model.result import (
+    FreeFunction,
+    OdeBudget,
+    OdeDiagnosis,
+    OutputError,
+    PortCause,
+    removed_from,
+)
 from psa_casadi.any_model.runs import Run, missed_rms
 from psa_casadi.any_model.search import Known, Names, with_cause, without
-from psa_casadi.any_model.weighing import (
-    beaten_by,
-    left_out,
-    weighed,
-    why_not_named,
-)
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.held_out.shares import Removed, Share
-from psa_casadi.diagnosis.judgement import SMALL_NOTE, least_share, rivals, verdict_by
+from psa_casadi.diagnosis.held_out import Removed, Share
+from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
-from psa_casadi.diagnosis.screening.evidence import probabilities, temperature
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.screening import probabilities, temperature
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
-from psa_casadi.records.checks import FEWEST_SAMPLES
+from psa_casadi.notes import Note, note
+from psa_casadi.records.record import FEWEST_SAMPLES
 
-_FEW = (
-    "Only {} readings are held out, and no model can be judged by fewer than {}: nothing is named."
-)
-_HELD = (
-    "The fitted samples leave no more than noise, but the held-out ones of {} {:.1f} times their"
-    " noise: these records do not say the same, or their inputs are not read alike (see `hold`)."
-)
-_UNNAMED = "A free function of {} in {} would remove {:.0%} of what is left above the noise."
+
+@dataclass(frozen=True)
+class Weighed:
+    """What causes, or a free function, remove of the base's held-out error above the noise.
+
+    `together` of all outputs, each over its noise; `each` of those that the base clearly misses.
+    """
+
+    together: float
+    each: Mapping[str, float]
+
+    @property
+    def least(self) -> tuple[str, float]:
+        """The output of which the least is removed, "" for all together, and that share."""
+        return min(self.named.items(), key=lambda item: item[1])
+
+    @property
+    def enough(self) -> bool:
+        """Whether so much of every output is removed that names may stand where more is left."""
+        return self.least[1] >= thresholds().enough
+
+    @property
+    def named(self) -> dict[str, float]:
+        """Every share by the name of its output, "" for all together."""
+        return {"": self.together, **self.each}
+
+
+@dataclass(frozen=True)
+class Beaten:
+    """A free function that takes the names away, and the output (or "") where it removes more."""
+
+    by: Free
+    output: str
+    names: float
+    function: float
+
+
+def weighed(
+    root: OdeHypothesis, errors: Sequence[float], noise: Sequence[float], together: float
+) -> Weighed:
+    """Weigh a model by the `errors` that it leaves of every output, with its share `together`.
+
+    An output counts by itself where there are several, and the base's held-out rms is above
+    `MISSED` times the noise:
+
+        share_j = (P_base,j - P_j) / (P_base,j - s_j^2)
+    """
+    rows = list(zip(root.fit.outputs, root.errors, errors, noise, strict=True))
+    if len(rows) == 1:
+        return Weighed(together, {})
+    each = {
+        o.column: (base**2 - left**2) / (base**2 - floor**2)
+        for o, base, left, floor in rows
+        if base > MISSED * floor
+    }
+    return Weighed(together, each)
+
+
+def beaten_by(
+    known: Known,
+    best: OdeHypothesis,
+    own: Weighed,
+    free: Sequence[Free],
+    noise: Sequence[float],
+) -> Beaten | None:
+    """Return the free function that takes the names away, if there is one.
+
+    It is clearly likelier, removes more of some output by more than a form may cost, and of none so
+    much less.
+    """
+    evidence, form = known.evidence(best), thresholds().form
+    for f in free:
+        clearly = thresholds().clearly * temperature(max(evidence, f.evidence))
+        if f.evidence - thresholds().price <= known.of_fitted(best) + clearly:
+            continue
+        theirs = weighed(known.found[frozenset()], f.errors, noise, f.share).named
+        more = {n: theirs[n] - share for n, share in own.named.items()}
+        where = max(more, key=lambda n: more[n])
+        if more[where] > form and min(more.values()) >= -form:
+            return Beaten(f, where, own.named[where], theirs[where])
+    return None
+
+
+def why_not_named(names: tuple[str, ...], own: Weighed, beaten: Beaten | None) -> Note:
+    """Return why causes that were found are not told."""
+    if beaten:
+        f = beaten.by
+        why = note("free_beats", of=f.of, port=f.port.words, share=beaten.function)
+        return note("own_withdrawn", names=names, share=beaten.names, output=beaten.output, why=why)
+    output, share = own.least
+    why = note("own_little", least=thresholds().enough)
+    return note("own_withdrawn", names=names, share=share, output=output, why=why)
+
+
+def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
+    """Return which causes are clearly likelier than the best ones, and add too little to be told.
+
+    Only where structure remains beside the best.
+    """
+    if not best.causes or not known.view(best).test.alarm:
+        return ()
+    clearly = thresholds().clearly * temperature(known.evidence(best))
+    better = [h for h in known.found.values() if known.score(h) > known.score(best) + clearly]
+    better = [h for h in better if known.slight(h) and known.stands(h)]
+    top = max(better, key=known.score, default=None)
+    if top is None:
+        return ()
+    names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
+    more = known.evidence(top) - known.evidence(best)
+    return (note("slight", names=names, more=more, small=small, least=thresholds().further),)
+
+
+def changes(effect: Component, fit: OdeFit, runs: Sequence[Run]) -> tuple[Size, ...]:
+    """Return by how much an effect changes each measured output within a record, at most.
+
+    It is the range of the difference of two runs from the same start, with the effect and with its
+    gain at 0; nothing where the latter cannot be simulated.
+    """
+    without = replace(fit, model=fit.model.with_values({effect.gain or "": 0.0}))
+    try:
+        moved = [
+            np.ptp(a - b, axis=0)
+            for a, b in zip(fit.predicted(runs), without.predicted(runs), strict=True)
+        ]
+    except PsaError:
+        return ()
+    most, longest = np.max(moved, axis=0), max(float(np.ptp(r.time)) for r in runs)
+    outputs = fit.model.structure.outputs
+    return tuple(
+        Size("record", float(most[k]), outputs[k].unit, None, longest, "s", None, output=o.column)
+        for k, o in zip(fit.places, fit.outputs, strict=True)
+    )
 
 
 def judged(known: Known) -> OdeDiagnosis:
@@ -60,10 +185,9 @@ def judged(known: Known) -> OdeDiagnosis:
         more=more,
     )
     named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
-    notes = [_FEW.format(held, FEWEST_SAMPLES)] if few else []
-    names = " and ".join(c.name for c in best.causes)
+    notes = [note("own_few_held_out", count=held, least=FEWEST_SAMPLES)] if few else []
     if verdict == "unexplained" and best.causes and not few:
-        notes.append(why_not_named(names, own, beaten))
+        notes.append(why_not_named(tuple(c.name for c in best.causes), own, beaten))
     if not few:
         notes += left_out(known, best)
     return _diagnosis(known, verdict, named, removed, told, left, notes, free)
@@ -103,7 +227,7 @@ def _diagnosis(
     removed: Removed,
     told: Mapping[str, Mapping[str, float]],
     left: Mapping[Names, Remaining],
-    notes: list[str],
+    notes: list[Note],
     free: Sequence[Free],
 ) -> OdeDiagnosis:
     root = known.found[frozenset()]
@@ -152,7 +276,7 @@ def _diagnosis(
             for o, level in zip(named.fit.outputs, noise, strict=True)
         ),
         remaining=left[named.names],
-        notes=(*notes, *(SMALL_NOTE.format(n, 100 * shares[n].shown[0]) for n in small)),
+        remarks=(*notes, *(note("small", effect=n, share=shares[n].shown[0]) for n in small)),
         model=with_told(named.fit.model, known.runs, sure),
         base_fit=root.fit,
         extended_fit=named.fit,
@@ -165,9 +289,8 @@ def _diagnosis(
             tuple(shares[c.effect] for c in causes),
             best_free.removes if best_free else None,
         ),
-        unnamed=_UNNAMED.format(best_free.of, best_free.port.words, best_free.share)
-        if best_free
-        else "",
+        free_function=note("free_function", of=best_free.of, port=best_free.port.words,
+                           share=best_free.share) if best_free else None,
         correction=_correction(known, best_free) if best_free else None,
     )  # fmt: skip
 
@@ -224,16 +347,15 @@ def _noise(known: Known, h: OdeHypothesis) -> tuple[tuple[Run, ...], tuple[float
 
 
 def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
-    """Say what a model leaves: of fitted samples by its test, of held-out ones by their size."""
+    """Return what a model leaves: of fitted samples by its test, of held-out ones by their size."""
     test = known.view(h).test
-    where = "What remains cannot be distinguished from noise."
     if test.alarm:
-        where = f"{test.where} {100 * test.excess:.0f} % of its power is above the noise."
-        return Remaining(False, test.p_value, where)
+        return Remaining(False, test.p_value, test.finding)
     for o, noise in zip(h.fit.outputs, _noise(known, h)[1], strict=True):
         held = any(r.judged(o.index).any() for r in known.runs)
         rms = missed_rms(known.runs, h.predicted, o.index)
         least = thresholds().unseen_ratio_of_records * float(np.hypot(noise, o.straight))
         if held and rms > least:
-            return Remaining(False, test.p_value, _HELD.format(o.column, rms / noise))
-    return Remaining(True, test.p_value, where)
+            unlike = note("held_out_unlike", output=o.column, ratio=rms / noise)
+            return Remaining(False, test.p_value, unlike)
+    return Remaining(True, test.p_value)

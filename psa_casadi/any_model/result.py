@@ -1,31 +1,71 @@
-"""What a diagnosis of any model says, as frozen records."""
+"""What a diagnosis of any model says, with its error budget.
+
+Shares are of the power above the noise, outputs over their noise, with the intervals of a stack's
+budget (`psa_casadi.diagnosis.held_out`).
+"""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.budget import OdeBudget
 from psa_casadi.any_model.fit import OdeFit
-from psa_casadi.any_model.runs import Run
-from psa_casadi.diagnosis.remedy.size import Size
-from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
+from psa_casadi.any_model.runs import Run, counted
+from psa_casadi.diagnosis.held_out import Removed, Share
+from psa_casadi.diagnosis.remedy import Size
+from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict, told
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.shown import StillReported, frame, with_units
 
 FloatArray = npt.NDArray[np.float64]
-FORMAT = "psa_casadi.own_model_diagnosis/1"
 
-_SAID: dict[Verdict, str] = {
-    "adequate": "what the model leaves cannot be distinguished from noise",
-    "cause_named": "{} named, and nothing else is left",
-    "partly_explained": "{} named, and more is left",
-    "ambiguous": "a cause is found that these records cannot tell from others",
-    "unexplained": "something is missing that no effect of the table explains",
-}
+
+@dataclass(frozen=True)
+class OdeBudget:
+    """Where the held-out error of the base model above the noise goes.
+
+    `together` is what all causes remove, `causes` what each does beside the others (the model
+    fitted again without it leaves so much more), `unnamed` what a free function would remove.
+    """
+
+    together: Share
+    causes: tuple[Share, ...]
+    unnamed: Share | None = None
+
+
+def removed_from(
+    runs: Sequence[Run], outputs: Sequence[int], base: Sequence[FloatArray], noise: Sequence[float]
+) -> Removed:
+    """Return what models remove of a base's held-out error in the given outputs of a model.
+
+    `base` are its predictions (n, ny) of all runs, `noise` is the rms of each output's noise in the
+    output's unit.
+    """
+    return Removed(partial(_judged_errors, runs, tuple(outputs)), base, tuple(noise))
+
+
+def _judged_errors(
+    runs: Sequence[Run], outputs: Sequence[int], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return the errors (n, outputs) where any output is judged, else nan.
+
+    An output of which no sample is held out is judged by its fitted ones.
+    """
+    parts = []
+    told = zip(*(counted(runs, j) for j in outputs), strict=True)
+    for r, y, own in zip(runs, predicted, told, strict=True):
+        which = np.column_stack(own)
+        errors = np.where(which, r.errors(y)[:, outputs], np.nan)
+        parts.append(errors[which.any(axis=1)])
+    return parts
+
+
+FORMAT = "psa_casadi.own_model_diagnosis/1"
 
 
 @dataclass(frozen=True)
@@ -94,8 +134,9 @@ class OdeDiagnosis(StillReported):
     The words of the verdict are those of a stack's diagnosis. `base` and `extended` (n, ny) are the
     predictions of every experiment in full, in the order of `runs`. `candidates` are all effects
     tried. `budget` says where the base's held-out error goes, with 95 % intervals. `missed` is what
-    the base leaves, `remaining` what the extended model does. `unnamed` says where a free function
-    would remove most of what is left, "" if nothing is; `correction` is that function.
+    the base leaves, `remaining` what the extended model does. `free_function` says where one would
+    remove most of what is left, None if nothing is; `correction` is that function. `remarks` are
+    what else there is to say.
     """
 
     verdict: Verdict
@@ -103,7 +144,7 @@ class OdeDiagnosis(StillReported):
     candidates: tuple[Candidate, ...]
     errors: tuple[OutputError, ...]
     remaining: Remaining
-    notes: tuple[str, ...]
+    remarks: tuple[Note | str, ...]
     model: Model
     base_fit: OdeFit
     extended_fit: OdeFit
@@ -112,7 +153,7 @@ class OdeDiagnosis(StillReported):
     extended: tuple[FloatArray, ...]
     missed: Remaining
     budget: OdeBudget
-    unnamed: str = ""
+    free_function: Note | None = None
     correction: FreeFunction | None = None
 
     @property
@@ -121,47 +162,29 @@ class OdeDiagnosis(StillReported):
         return self.budget.together.share
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """The remarks in sentences."""
+        return texts(self.remarks)
+
+    @property
+    def unnamed(self) -> str:
+        """Where a free function would remove most of what is left, "" if nothing is."""
+        return "" if self.free_function is None else str(self.free_function)
+
+    @property
     def moved(self) -> tuple[str, ...]:
         """What the base model's parameters became where the causes move them out of intervals."""
         before, after = self.base_fit.model.values, self.model.values
-        told = self.model.provenance.intervals
         return tuple(
-            f"{n} = {_told(after[n], i.low, i.high)}{_after(self.model.parameter(n).unit)}, without"
-            f" the cause{'s' * (len(self.causes) > 1)} {before[n]:.4g}"
-            for n, i in told.items()
+            str(note("moved", name=n, estimate=(after[n], i.low, i.high), without=before[n],
+                     unit=self.model.parameter(n).unit, causes=len(self.causes)))
+            for n, i in self.model.provenance.intervals.items()
             if self.causes and n in before and not i.low <= before[n] <= i.high
-        )
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         """Return the verdict, the causes with their sizes, the errors and what remains."""
-        several = len(self.causes) > 1
-        named = f"{len(self.causes)} causes are" if several else "a cause is"
-        lines = [f"{self.verdict}: {_SAID[self.verdict].format(named)}"]
-        for c, removed in zip(self.causes, self.budget.causes, strict=True):
-            lines.append(
-                f"  {c.effect} ({c.confidence:.0%} sure), {c.description}; it removes"
-                f" {removed.text} of the held-out error above the noise"
-            )
-            lines += [
-                f"    {n} = {_told(e.value, *e.interval)}{_after(e.unit)}"
-                for n, e in c.parameters.items()
-            ]
-            if c.cannot_be_told_from:
-                lines.append(f"    may as well be {', '.join(c.cannot_be_told_from)}")
-        if several:
-            lines.append(f"  together they remove {self.budget.together.text} of it")
-        for o in self.errors:
-            unit = _after(o.unit)
-            lines.append(
-                f"  {o.output}: held-out rms {o.base:.3g}{unit} of the base,"
-                f" {o.extended:.3g}{unit} of the extended model, noise {o.noise:.3g}{unit}"
-            )
-        lines += [f"  {line}" for line in self.moved]
-        lines += [
-            f"  {self.remaining.where}",
-            *(f"  {n}" for n in (*self.notes, self.unnamed) if n),
-        ]
-        return "\n".join(lines)
+        return str(note("own_diagnosis", d=self))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain lists and mappings."""
@@ -171,8 +194,8 @@ class OdeDiagnosis(StillReported):
             "causes": [asdict(c) for c in self.causes],
             "candidates": [asdict(c) for c in self.candidates],
             "errors": [asdict(e) for e in self.errors],
-            "missed": asdict(self.missed),
-            "remaining": asdict(self.remaining),
+            "missed": told(self.missed, "seen", "where"),
+            "remaining": told(self.remaining, "seen", "where"),
             "unnamed": self.unnamed,
             "correction": None if self.correction is None else self.correction.to_dict(),
             "budget": asdict(self.budget),
@@ -204,16 +227,3 @@ class OdeDiagnosis(StillReported):
             columns[f"{name}_base"] = np.concatenate([y[:, k] for y in self.base])
             columns[f"{name}_extended"] = np.concatenate([y[:, k] for y in self.extended])
         return frame(with_units(columns, units))
-
-
-def _after(unit: str) -> str:
-    return "" if unit in ("", "1") else f" {unit}"
-
-
-def _told(value: float, low: float, high: float) -> str:
-    """Return a value with its interval, in as many digits as tell them apart, four at least."""
-    half = max(high - value, value - low)
-    digits = 4
-    if 0.0 < half < abs(value):
-        digits = max(4, min(9, 1 + int(np.ceil(np.log10(abs(value) / half)))))
-    return f"{value:.{digits}g} ({low:.{digits}g} to {high:.{digits}g})"

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals, stairs, unit_hint
 from psa_casadi.records.split import divided, whole
@@ -126,20 +127,15 @@ def varied(run: Run) -> int | None:
     return int(np.argmax(spans)) if spans and max(spans) > 0 else None
 
 
-def told_of_columns(model: Model, runs: Sequence[Run]) -> tuple[str, ...]:
-    """Say which inputs look held between samples and are read as lines, and which outputs lack."""
+def told_of_columns(model: Model, runs: Sequence[Run]) -> tuple[Note, ...]:
+    """Return which inputs look held between samples and are read as lines, which outputs lack."""
     lines = [r.signals for r in runs if r.signals.hold == "linear"]
-    held = {n: [s.name for s in lines if n in stairs(s, (n,))] for n in model.input_names}
-    notes = [
-        f"The input '{n}' stands still between jumps in {', '.join(records)}, and each jump is read"
-        " as a ramp of one sampling interval; if it is held between samples, as by a digital"
-        ' controller, say so of these records: psa.Signals(..., hold="zero").'
-        for n, records in held.items()
-        if records
-    ]
+    held = {n: tuple(s.name for s in lines if n in stairs(s, (n,))) for n in model.input_names}
     absent = [n for n in model.output_names if not any(n in r.signals.columns for r in runs)]
-    notes += [f"No record has a column '{n}'; that output is not compared." for n in absent]
-    return tuple(notes)
+    return (
+        *(note("stairs", input=n, records=records) for n, records in held.items() if records),
+        *(note("no_column", output=n) for n in absent),
+    )
 
 
 def _refuse_twins(given: Sequence[Signals], holdout: Sequence[Signals], problems: Problems) -> None:

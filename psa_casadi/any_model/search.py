@@ -14,22 +14,20 @@ from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted
 from psa_casadi.any_model.hypothesis import (
     OdeHypothesis,
     OdeView,
+    Table,
     can_be_told,
     held_out_confirms,
     held_out_gain,
     hypothesis_of,
     look,
 )
-from psa_casadi.any_model.levels import relevelled
+from psa_casadi.any_model.identify import relevelled
 from psa_casadi.any_model.runs import Run
-from psa_casadi.any_model.trials import Table
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.colour import Colour
-from psa_casadi.diagnosis.screening.evidence import evidence
-from psa_casadi.diagnosis.screening.screen import Score
-from psa_casadi.diagnosis.screening.sets import Together, best_sets
-from psa_casadi.diagnosis.search.worth import another_minimum, inside_ranges
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.colour import Colour
+from psa_casadi.diagnosis.screening import Score, Together, best_sets, evidence
+from psa_casadi.diagnosis.search.hypothesis import another_minimum, inside_ranges
+from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError

@@ -34,8 +34,7 @@ def compare(
     from psa_casadi.report.documents.findings import read_findings
     from psa_casadi.report.page.comparison_page import write_comparison
     from psa_casadi.report.page.population_page import write_population
-    from psa_casadi.report.words.comparison_words import difference_sentence
-    from psa_casadi.report.words.population_words import population_sentences
+    from psa_casadi.report.words.population_words import difference_sentence, population_sentences
 
     given = Given(effects)
     given.outputs({"--output": output}, files)

@@ -144,7 +144,7 @@ def rivals(
     """Return the base, the rivals and the noise, fitted to records if there are any."""
     from psa_casadi.design.experiment.criteria import noise_of_fit, rival_of_fit
     from psa_casadi.design.experiment.experiment import rival_of_effect
-    from psa_casadi.diagnosis.search.contenders import fit_contenders
+    from psa_casadi.diagnosis.search.steps import fit_contenders
     from psa_casadi.identification.search import CORE
 
     if not records:

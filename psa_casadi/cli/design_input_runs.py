@@ -200,7 +200,7 @@ def _on_fmu(task: Task, path: Target, voltage: np.ndarray) -> TrackingError:
 
 
 def _played(task: Task, time: np.ndarray, voltage: np.ndarray) -> np.ndarray:
-    from psa_casadi.export.played import played_on_fmu
+    from psa_casadi.export.importer.masters import played_on_fmu
 
     return played_on_fmu(task.plant, time, voltage)
 

@@ -180,7 +180,7 @@ def diagnose(
 
 
 def _tell_timings(spent: "Timings", quiet: bool) -> None:
-    from psa_casadi.report.words.timings import timings_table
+    from psa_casadi.report.words.tables import timings_table
 
     show("", quiet)
     show_table(timings_table(spent.stages), quiet)

@@ -21,18 +21,18 @@ def alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative
 
 
 def noted(d: "Diagnosis", left_out: Sequence[str]) -> "Diagnosis":
-    """Say in the notes which effects were not looked for."""
+    """Say in the remarks which effects were not looked for."""
     from dataclasses import replace
 
     if not left_out:
         return d
     names = ", ".join(dict.fromkeys(left_out))
-    return replace(d, notes=(*d.notes, f"Not looked for, as --leave-out says: {names}."))
+    return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
 
 
 def models(d: "Diagnosis", output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
-    from psa_casadi.report.words.verdict_words import added
+    from psa_casadi.report.words.phrases import added
 
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"
@@ -102,25 +102,26 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
 
     from psa_casadi.design.experiment.experiment import resolving_experiment
     from psa_casadi.diagnosis.result import NextExperiment
-    from psa_casadi.diagnosis.search.contenders import one_of_each
+    from psa_casadi.diagnosis.search.steps import one_of_each
     from psa_casadi.errors import PsaError
     from psa_casadi.report.page.experiment_part import sentences, write_voltage
 
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
         return d
+    before = d.next_experiment
     try:
         design = resolving_experiment(d, progress=progress)
     except PsaError as error:
-        why = f"{d.next_experiment.why} No record could be designed: {error}"
-        return replace(d, next_experiment=replace(d.next_experiment, why=why))
+        reasons = (*before.reasons, f"No record could be designed: {error}")
+        return replace(d, next_experiment=replace(before, reasons=reasons))
     each = sentences(design, d.model.values.get("C_p"))
     if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
-        why = " ".join((d.next_experiment.why, *each[:-1], same)).rstrip()
-        return replace(d, next_experiment=replace(d.next_experiment, why=why))
+        reasons = (*before.reasons, *each[:-1], *same)
+        return replace(d, next_experiment=replace(before, reasons=reasons))
     write_voltage(path, design.record)
-    why = " ".join((f"Apply {path} and diagnose all records together.", *each, same)).rstrip()
-    following = NextExperiment(str(path), design.names, why, dict(design.chance))
+    reasons = (f"Apply {path} and diagnose all records together.", *each, *same)
+    following = NextExperiment(str(path), design.names, reasons, dict(design.chance))
     return replace(d, next_experiment=following)
 
 

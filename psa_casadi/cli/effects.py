@@ -12,7 +12,7 @@ from psa_casadi.cli.screen import EffectsOption, show, show_table, tell_written,
 if TYPE_CHECKING:
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
-    from psa_casadi.diagnosis.remedy.size import Size
+    from psa_casadi.diagnosis.remedy import Size
     from psa_casadi.model.compose import Model
 
 
@@ -33,7 +33,7 @@ def effects(
 ) -> None:
     """List the effects that a diagnosis looks for; show one: equation, signature, size, remedy."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.effects.modal_series import MODAL_SERIES
+    from psa_casadi.effects.mechanics import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.report.words.tables import effects_table
     from psa_casadi.report.words.text import effect_page
@@ -78,7 +78,7 @@ def _known(given: "Given", name: str | None, names: list[str], figure: Path | No
 
 def _seen(effect: "Component", stack: "Model | None") -> "tuple[Model, tuple[Size, ...]] | None":
     """Return how large an effect is on a stack, None where there is no compiler to simulate it."""
-    from psa_casadi.diagnosis.remedy.size import example
+    from psa_casadi.diagnosis.remedy import example
     from psa_casadi.errors import MachineError
 
     try:
@@ -88,7 +88,7 @@ def _seen(effect: "Component", stack: "Model | None") -> "tuple[Model, tuple[Siz
 
 
 def _draw(effect: "Component", path: Path) -> None:
-    from psa_casadi.diagnosis.residual.signature import signature
+    from psa_casadi.diagnosis.signature import signature
     from psa_casadi.report.plots.signature_figure import save_signature
 
     save_signature(effect, signature(effect), path)

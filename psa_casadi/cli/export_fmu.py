@@ -103,10 +103,10 @@ def fmu(
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
     from psa_casadi.cli.export_c import error_table, step_words
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.fixed_step.plan import limit_words
+    from psa_casadi.export.fixed_step.code import limit_words
     from psa_casadi.export.fmu.archive import export_fmu
-    from psa_casadi.export.fmu.fixed import FIXED_ENTRY
     from psa_casadi.export.fmu.platforms import chosen_platforms
+    from psa_casadi.export.fmu.sources import FIXED_ENTRY
     from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
     given = Given(effects)
@@ -160,7 +160,7 @@ def fmu(
 
 def write_sets(model: "Model", samples: int, folder: Path | None) -> int:
     """Write the parameter sets to a folder, if one is named, and return how many there are."""
-    from psa_casadi.export.fmu.evidence_files import set_files
+    from psa_casadi.export.fmu.evidence import set_files
     from psa_casadi.files import atomic_write, make_folder
 
     texts = set_files(model, samples)

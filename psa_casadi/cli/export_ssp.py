@@ -58,7 +58,7 @@ def ssp(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
-    from psa_casadi.model.system.nanopositioner import nanopositioner
+    from psa_casadi.model.nanopositioner import nanopositioner
 
     given = Given(effects)
     given.outputs({"--output": output, "--picture": picture}, [model])
@@ -89,7 +89,7 @@ def ssp(
 
 
 def _ports(wiring: "WiredParts", quiet: bool) -> None:
-    from psa_casadi.export.ssp.layout import OUTSIDE, Port
+    from psa_casadi.export.ssp.drawing import OUTSIDE, Port
 
     for kind in ("input", "output"):
         named = [

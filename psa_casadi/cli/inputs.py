@@ -19,8 +19,7 @@ from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, read_record, read_records
-from psa_casadi.records.read.column_map import files_named, parse_columns
-from psa_casadi.records.read.columns import ColumnMap
+from psa_casadi.records.read.columns import ColumnMap, files_named, parse_columns
 from psa_casadi.simulation.history import settled_at
 from psa_casadi.units import parse_unit, to_si, units_of
 

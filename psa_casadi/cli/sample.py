@@ -79,7 +79,7 @@ def sample(
     from psa_casadi.report.documents.posterior_file import posterior_file
     from psa_casadi.report.plots.figure import DPI
     from psa_casadi.report.plots.posterior_figure import posterior_figure
-    from psa_casadi.report.words.posterior_words import posterior_text
+    from psa_casadi.report.words.text import posterior_text
     from psa_casadi.strict_json import json_text
 
     given = Given(effects, quiet=quiet)

@@ -1,20 +1,25 @@
-"""Diagnose: fit the base, search for causes, judge."""
+"""Diagnose: fit the base, ask whether it is driven, search for causes, judge, weigh columns."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.base_fit.between_samples import smooth_between
-from psa_casadi.diagnosis.columns import decisions
-from psa_casadi.diagnosis.driven import driven
-from psa_casadi.diagnosis.noise.stuck_readings import without_stuck_readings
-from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
+from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
+from psa_casadi.diagnosis.judgement import told_from
+from psa_casadi.diagnosis.noise import without_stuck_readings
+from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupted, Verdict
+from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
-from psa_casadi.diagnosis.task import Method, Task, Tried
-from psa_casadi.diagnosis.thresholds import using
-from psa_casadi.diagnosis.verdict import conclude
+from psa_casadi.diagnosis.task import Method, Task, Tried, shows_ringing, thresholds, using
+from psa_casadi.diagnosis.verdict import NAMING, conclude
+from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.further import COLUMNS
+from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import unfinished
 from psa_casadi.identification.prepare import averaged, columns_of, with_levels
 from psa_casadi.identification.refitting import Progress, relevelled
@@ -24,8 +29,14 @@ from psa_casadi.identification.search import (
     is_measured,
     loads_as_curves,
     search_forms,
+    without_column,
 )
 from psa_casadi.identification.start.doubts import (
+    correlation,
+    doubtful_quantity,
+    doubtful_time,
+    doubtful_unit,
+    doubtful_voltage,
     refuse_few,
     refuse_other_time,
     refuse_still,
@@ -37,27 +48,243 @@ from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
-from psa_casadi.records.excerpts import excerpts
-from psa_casadi.records.quality.gaps import without_gaps
-from psa_casadi.records.quality.suspects import cleaned, masked, suspects
+from psa_casadi.notes import Note, note
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, divided, in_one_order
-from psa_casadi.shown import sentences
+from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
+from psa_casadi.records.suspects import cleaned, masked, suspects
 from psa_casadi.simulation.ahead import compiled_ahead
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
 
+FloatArray = npt.NDArray[np.float64]
+
+#: A voltage with less of its variance about a parabola over time is not told from a drift.
+_TREND = 0.05
+#: Samples that a linear filter of the voltage looks back, and that it needs for each of them.
+_TAPS, _EACH = 128, 8
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Whether a displacement follows the voltage, and what of sign and unit is wrong.
+
+    `filtered` says that it does not follow by the base model, but by another linear one.
+    """
+
+    follows: bool
+    notes: tuple[Note | str, ...]
+    filtered: bool = False
+
+
+def driven(
+    base: Fit, model: Model, experiments: Sequence[Experiment], progress: Progress
+) -> Driven:
+    """Return whether the `base` fit explains the displacement; else what the other sign explains.
+
+    `model` is where the base fit started.
+    """
+    if shows_ringing(experiments) and explained(base, experiments) < thresholds().follows:
+        base = from_resonances(base, experiments, progress) or base
+    share = explained(base, experiments)
+    records = [e.record for e in experiments]
+    doubts = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_quantity)
+    notes = tuple(s for doubt in doubts if (s := doubt(records)))
+    if share >= thresholds().follows and correlation(records) > thresholds().falling:
+        return Driven(follows=True, notes=notes)
+    progress("with the sign flipped")
+    other = _flipped(model, experiments)
+    shown = max(share, 0.0)
+    if other > max(share, thresholds().follows):
+        return Driven(False, (note("flipped", flipped=other, share=shown), *notes))
+    if share < thresholds().follows:
+        linear = filtered(experiments)
+        if linear > thresholds().follows:
+            return Driven(False, (note("filtered", linear=linear, share=shown), *notes), True)
+        quantity = doubtful_quantity(records)
+        said = note("not_driven", share=shown)
+        return Driven(False, (said, quantity) if quantity else (said,))
+    return Driven(follows=True, notes=notes)
+
+
+def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
+    """Share of the displacements' variance that a fit explains over whole records; 1 is all.
+
+    A drift does not count, a parabola over time: a base can make one from its start alone. It does
+    where the voltage itself is hardly more than that.
+    """
+    left = total = 0.0
+    for e, y in zip(experiments, base.predicted(experiments), strict=True):
+        given = measured(e.record)
+        valid = np.isfinite(given)
+        time, v = e.record.time[valid], e.record.voltage[valid]
+        moving = np.sum(_about_trend(time, v) ** 2) > _TREND * np.sum((v - np.mean(v)) ** 2)
+        about = _about_trend if moving else _about_mean
+        left += float(np.sum(about(time, (given - y)[valid]) ** 2))
+        total += float(np.sum(about(time, given[valid]) ** 2))
+    return 1.0 - left / total if total > 0 else 0.0
+
+
+def _about_mean(_: FloatArray, signal: FloatArray) -> FloatArray:
+    found: FloatArray = signal - np.mean(signal)
+    return found
+
+
+def _about_trend(time: FloatArray, signal: FloatArray) -> FloatArray:
+    t = (time - time[0]) / max(float(time[-1] - time[0]), 1e-300)
+    columns = np.column_stack([np.ones_like(t), t, t**2])
+    found: FloatArray = signal - columns @ np.linalg.lstsq(columns, signal, rcond=None)[0]
+    return found
+
+
+def filtered(experiments: Sequence[Experiment]) -> float:
+    """Share of the displacements' variance that linear filters of the voltage explain.
+
+    A finite impulse response for each record beside a parabola over time; variances per degree of
+    freedom, so that a filter of what has nothing to do with the voltage explains nothing.
+    """
+    left = total = 0.0
+    for e in experiments:
+        record, y = e.record, measured(e.record)
+        taps = max(1, min(_TAPS, record.n // _EACH))
+        past = np.concatenate([np.full(taps - 1, record.voltage[0]), record.voltage])
+        lagged = np.lib.stride_tricks.sliding_window_view(past, taps)[record.mask]
+        time = record.time[record.mask]
+        shown, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
+        rest = shown - columns @ np.linalg.lstsq(columns, shown, rcond=None)[0]
+        left += record.n * float(np.sum(rest**2)) / max(rest.size - taps - 3, 1)
+        total += record.n * float(np.sum(shown**2)) / max(rest.size - 3, 1)
+    return 1.0 - left / total if total > 0 else 0.0
+
+
+def _flipped(model: Model, experiments: Sequence[Experiment]) -> float:
+    other = [
+        replace(e, record=replace(e.record, displacement=-measured(e.record))) for e in experiments
+    ]
+    try:
+        return explained(fit_base(model, other), other)
+    except PsaError:
+        return 0.0
+
+
+#: The places that effects belong to, in the order in which they are told.
+_PLACES = ("drive", "sensor", "plant", "environment")
+#: Probability below which an effect is no rival.
+_RIVAL = 0.01
+
+
+def decisions(
+    steps: Sequence[Step],
+    task: Task,
+    table: Sequence[Component],
+    search: Callable[[Task], Sequence[Step]],
+    verdict: Verdict,
+) -> tuple[Decision, ...]:
+    """Return what every fitted column, and a measured load, decided.
+
+    `table` are all effects, `search` finds the steps of a task, `verdict` is that on `steps`. Each
+    column costs a search.
+    """
+    experiments = task.experiments
+    columns = [q.column for q in experiments[0].further]
+    if is_measured(experiments):
+        columns.append(LOAD)
+    found = []
+    for column in columns:
+        task.progress(f"the same without {column}")
+        effects = task.table
+        if column == LOAD:
+            effects = tuple(e for e in table if e in effects or e.measured_by == LOAD)
+        alone = replace(
+            task,
+            experiments=without_column(experiments, column),
+            table=effects,
+            keep=lambda _: None,
+            watch=lambda _: None,
+        )
+        found.append(_decision(column, steps, search(alone), effects, verdict))
+    return tuple(found)
+
+
+def _decision(
+    column: str,
+    steps: Sequence[Step],
+    before: Sequence[Step],
+    table: Sequence[Component],
+    verdict: Verdict,
+) -> Decision:
+    first, last = steps[0].view.of, steps[-1].view.of
+    now, then = _named(steps) if verdict in NAMING else {}, _named(before)
+    effects = {e.name: e for e in table}
+    k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
+    gained = further_gains(first.fit, last.fit, steps[-1].screening.colour).get(column, 0.0)
+    ruled_out = tuple(n for n in then if n not in now)
+    return Decision(
+        column=column,
+        role="input" if k is None else "output",
+        unit="N" if k is None else COLUMNS[column].unit,
+        noise=None if k is None else steps[-1].screening.colour.further[k].rms,
+        base_rms=None if k is None else first.held_further[k],
+        extended_rms=None if k is None else last.held_further[k],
+        named=now,
+        named_without=then,
+        ruled_out=ruled_out,
+        evidence=gained,
+        outcome=decided(column, now, then, gained, effects, clear=verdict == "adequate"),
+    )
+
+
+def _named(steps: Sequence[Step]) -> dict[str, float]:
+    """Return the named set of every cause, with the probability of each effect."""
+    found: dict[str, float] = {}
+    for step in steps:
+        if step.chosen is None:
+            continue
+        for name in (step.cause.name, *told_from(step)):
+            if step.probability.get(name, 0.0) >= _RIVAL:
+                found.setdefault(name, step.probability[name])
+    return found
+
+
+def decided(
+    column: str,
+    now: Mapping[str, float],
+    then: Mapping[str, float],
+    gained: float,
+    table: Mapping[str, Component],
+    *,
+    clear: bool,
+) -> Note:
+    """Return what a column decided, from what is named with it and without it.
+
+    `clear` says that nothing is left to name with the column.
+    """
+    before = tuple(then.items())
+    gone, new = [n for n in then if n not in now], tuple(n for n in now if n not in then)
+    if not now and not then:
+        return note("column_agrees" if clear else "column_decides_nothing", column=column)
+    if not gone and not new:
+        return note("column_adds", column=column, gained=gained)
+    held = [n for n in gone if n in table and table[n].measured_by == column]
+    if held and not now and clear:
+        return note("column_holds", column=column, effect=held[0], before=before)
+    if not gone:
+        return note("column_names", column=column, new=new, then=tuple(then))
+    if not now:
+        return note("column_clears", column=column, before=before)
+    kept = {table[n].belongs_to for n in now if n in table}
+    lost = {table[n].belongs_to for n in gone if n in table} - kept
+    places = tuple(p for p in _PLACES if p in lost)
+    return note(
+        "column_rules_out",
+        column=column, places=places, effects=tuple(gone), now=tuple(now), before=before,
+    )  # fmt: skip
+
+
 #: So many further stuck readings are worth a second search.
 MORE = 3
-#: Steps of a sensor over a record's range below which it is coarse, and what is said then.
+#: Steps of a sensor over a record's range below which it is coarse.
 COARSE = 32
-COARSE_NOTE = (
-    "{}: the sensor resolves {:.0f} steps over the whole range. They make up the model's error:"
-    " nothing smaller can be distinguished from them."
-)
-#: What is said of readings that a stuck sensor repeats.
-STUCK_NOTE = "{} readings repeat the last one far from the model, as a stuck sensor does; masked."
 
 
 @interruptible_work()
@@ -102,7 +329,7 @@ def diagnose(
             (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
             start, scale_given = chosen_start(clean, model, stiffness)
             (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
-            said += [*sentences((*means, *means_too)), *long, *long_too]
+            said += [*means, *means_too, *long, *long_too]
             experiments = divided(clean, judged)
             columns = columns_of(start, [e.record for e in experiments])
             experiments = with_levels(experiments, columns.fitted)
@@ -113,7 +340,7 @@ def diagnose(
             start = start.without(c.name for c in searched if c.gain is not None)
             there = {c.name for c in start.components}
             table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-            said += [*sentences(columns.left_out), *preferred]
+            said += [*columns.left_out, *preferred]
         so_far: list[Fit] = []
         task = Task(
             experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden
@@ -122,7 +349,7 @@ def diagnose(
             # from the end: the screening begins at the front
             with compiled_ahead(start.with_effect(e) for e in reversed(table)):
                 found = _diagnose(start, task, scale_given)
-            return replace(found, notes=(*found.notes, *said))
+            return replace(found, remarks=(*found.remarks, *said))
         except KeyboardInterrupt:
             if not so_far:
                 raise
@@ -134,17 +361,17 @@ def _in_form(
     hysteresis: Hysteresis | None,
     experiments: Sequence[Experiment],
     progress: Progress,
-) -> tuple[Model, tuple[str, ...]]:
+) -> tuple[Model, tuple[Note, ...]]:
     """Return where the base fit starts, in the form that is asked for; and why it is the best."""
     forms = forms_of(start, hysteresis)
     if len(forms) == 1:
         return forms[0], ()
     found, why = search_forms(forms, experiments, progress=progress)
-    preferred = () if why is None else (why.sentence,)
-    return next(m for m in forms if m.components == found.best.model.components), preferred
+    best = next(m for m in forms if m.components == found.best.model.components)
+    return best, () if why is None else (why,)
 
 
-def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]:
+def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
     """Return the records without suspect samples, and where a sensor was saturated or coarse.
 
     And the share of the readings that a saturated sensor has made.
@@ -156,16 +383,17 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[str], float]
     refuse_other_time(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
-    said = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
-    refuse_few(records, clean, said)
+    saturation = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
+    refuse_few(records, clean, saturation)
+    said: list[Note | str] = [*saturation]
     for r, own in zip(records, found, strict=True):
         if own.quantum is not None and r.range_m < COARSE * own.quantum:
-            said.append(COARSE_NOTE.format(r.name, r.range_m / own.quantum))
+            said.append(note("coarse", record=r.name, steps=r.range_m / own.quantum))
     saturated = sum(own.counts["saturated"] for own in found)
     return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 
 
-def _on_one_clock(records: Sequence[Record], said: list[str]) -> list[Record]:
+def _on_one_clock(records: Sequence[Record], said: list[Note | str]) -> list[Record]:
     """Return the records with their readings on one clock; what is done to them goes to `said`."""
     done = [on_one_clock(r) for r in records]
     said += [s for _, own in done for s in own]
@@ -192,7 +420,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         found = conclude(
             steps, experiments, table, scale_given, driven=seen.filtered, hidden=task.hidden
         )
-        return replace(found, notes=(*found.notes, *seen.notes))
+        return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = _search(base, task)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
@@ -205,14 +433,14 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
-    turned = sentences([note for f in steps[0].fit.further for note in f.turned])
-    notes = (*seen.notes, *between, *([STUCK_NOTE.format(stuck)] if stuck else []), *turned)
-    return replace(found, notes=(*found.notes, *notes))
+    turned = [n for f in steps[0].fit.further for n in f.turned]
+    remarks = (*seen.notes, *between, *([note("stuck", count=stuck)] if stuck else []), *turned)
+    return replace(found, remarks=(*found.remarks, *remarks))
 
 
 def _with_smooth_voltage(
     start: Model, steps: list[Step], task: Task
-) -> tuple[list[Step], Task, tuple[str, ...]]:
+) -> tuple[list[Step], Task, tuple[Note, ...]]:
     """Search again where the voltage is smooth between its samples; return what holds, and notes.
 
     As it is where the base's error shows none of it, or is no less with it.

@@ -6,10 +6,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.held_out.errors import errors_of, held_out_parts
-from psa_casadi.diagnosis.held_out.parts import jackknife
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.held_out import Budget, Share, errors_of, held_out_parts, jackknife
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit

@@ -3,18 +3,15 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from psa_casadi.diagnosis.corrections.correct import Correction
-from psa_casadi.diagnosis.held_out.shares import Share
+from psa_casadi.diagnosis.corrections import Correction, corrections
+from psa_casadi.diagnosis.held_out import Share, removed_from
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.diagnosis.screening.evidence import credible_set, temperature
+from psa_casadi.diagnosis.screening import credible_set, temperature
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.thresholds import thresholds
-
-#: What is said of a cause that is part of the extended model and not named.
-SMALL_NOTE = (
-    "{} is in the extended model and removes {:.0f} % of the held-out error above the noise. It is"
-    " not named: structure remains, and so little may only correct the form of what is named."
-)
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.notes import Note, note
+from psa_casadi.records.split import Experiment
 
 
 @dataclass(frozen=True)
@@ -132,54 +129,85 @@ def withdrawn_names(
     weighed: Weighed,
     beaten: Correction | None,
     vague: Mapping[str, Correction],
-    doubt: str,
-) -> tuple[str, ...]:
-    """Say which names were found but not told, and why: `doubt` is that of held-out samples.
+    doubt: Note | None,
+) -> tuple[Note, ...]:
+    """Return which names were found but not told, and why: `doubt` is that of held-out samples.
 
     An unnamed correction has `beaten` all of them, or some have beaten each of them (`vague`).
     """
-    names = [s.cause.name for s in steps if s.chosen is not None]
+    names = tuple(s.cause.name for s in steps if s.chosen is not None)
     if not names:
         return ()
-
-    def found(remove: str) -> str:
-        return (
-            f"{', '.join(names)}: found with a ln of the Bayes factor over the base of"
-            f" {weighed.evidence:.0f}, {remove} {100 * max(0.0, weighed.share):.0f} % of the"
-            " held-out error above the noise"
-        )
-
-    would = found("would remove")
-    if doubt:
-        return (f"{would}; not named, because {doubt}.",)
-    if beaten is not None:
+    kept = False
+    if doubt is not None:
+        why = doubt
+    elif beaten is not None:
         share = weighed.shares[list(weighed.corrections).index(beaten)]
-        return (
-            f"{would}; not named, because an unnamed correction explains more:"
-            f" {beaten.kind.sentence}, with {beaten.evidence:.0f} and {100 * share:.0f} %.",
-        )
-    if vague:
-        return (f"{would}; not named: {_each(vague)}.",)
-    little = f"that is less than {100 * thresholds().enough:.0f} % and much remains"
-    if weighed.adds:
-        they = "it removes" if len(names) == 1 else "they remove"
-        kept = found(f"in the extended model, where {they}")
-        return (f"{kept}; not named, because {little}.",)
-    return (f"{would}; not named, because {little}.",)
+        why = note("beaten", by=beaten.kind.name, port=beaten.kind.port,
+                   evidence=beaten.evidence, share=share)  # fmt: skip
+    elif vague:
+        why = _each(vague)
+    else:
+        why, kept = note("little", least=thresholds().enough), weighed.adds
+    return (
+        note("withdrawn", names=names, evidence=weighed.evidence, share=max(0.0, weighed.share),
+             kept=kept, why=why),
+    )  # fmt: skip
 
 
-def vague_note(vague: Mapping[str, Correction]) -> tuple[str, ...]:
-    """Say which causes stay in the model without a name, as corrections describe them better."""
-    if not vague:
-        return ()
-    names = ", ".join(vague)
-    return (f"{names}: in the extended model and not named: {_each(vague)}.",)
+def vague_note(vague: Mapping[str, Correction]) -> tuple[Note, ...]:
+    """Return which causes stay in the model without a name, as corrections describe them better."""
+    return (note("vague", names=tuple(vague), why=_each(vague)),) if vague else ()
 
 
-def _each(vague: Mapping[str, Correction]) -> str:
+def _each(vague: Mapping[str, Correction]) -> Note:
     free = 1.0 - thresholds().form
-    better = "; ".join(
-        f"{c.kind.sentence}, {'freer in form than' if c.copies >= free else 'instead of'} {name}"
-        for name, c in vague.items()
+    return note(
+        "better_unnamed",
+        each=tuple((c.kind.name, c.kind.port, n, c.copies >= free) for n, c in vague.items()),
     )
-    return f"beside the model without it, an unnamed correction explains more ({better})"
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """What hypotheses of one search are weighed with: records, score, rms of the noise [m]."""
+
+    experiments: Sequence[Experiment]
+    scale: Scale
+    noise: float
+
+    def weigh(self, before: Hypothesis, after: Hypothesis, *, beside: bool = True) -> Weighed:
+        """Weigh the causes that one hypothesis has more than another against corrections of that.
+
+        Without any corrections where it is not `beside` them.
+        """
+        found = (
+            corrections(before.fit, self.experiments, self.scale.colour, after.predicted)
+            if beside
+            else ()
+        )
+        removed = removed_from(self.experiments, before.predicted, self.noise)
+        whole = self.scale.evidence(after)
+        return Weighed(
+            evidence=whole - self.scale.evidence(before),
+            causes=len(after.causes) - len(before.causes),
+            share=removed.from_base(after.predicted),
+            corrections=found,
+            shares=[removed.from_base(c.predicted) for c in found],
+            whole=whole,
+        )
+
+    def vague(self, steps: Sequence[Step]) -> dict[str, Correction]:
+        """Return those of several causes that an unnamed correction describes better, by name.
+
+        Each is weighed beside the model without it, all others kept.
+        """
+        if len(steps) < 3:
+            return {}
+        last, found = steps[-1].view.of, {}
+        for s in steps:
+            if s.chosen is not None and s.without is not None:
+                better = self.weigh(s.without, last).beaten_by()
+                if better is not None:
+                    found[s.cause.name] = better
+        return found

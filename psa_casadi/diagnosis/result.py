@@ -8,15 +8,15 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.corrections.patch import Patch
-from psa_casadi.diagnosis.held_out.errors import Errors, Gain
-from psa_casadi.diagnosis.noise.floor import NoiseFloor
-from psa_casadi.diagnosis.remedy.size import Size
-from psa_casadi.diagnosis.residual.misfit import Misfit
+from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
+from psa_casadi.diagnosis.misfit import Misfit
+from psa_casadi.diagnosis.noise import NoiseFloor
+from psa_casadi.diagnosis.patch import Patch
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame, with_units
 
@@ -26,6 +26,8 @@ Verdict = Literal[
 ]
 
 FORMAT = "psa_casadi.diagnosis/1"
+#: What remains is noise.
+NOISE = note("noise_only")
 
 
 @dataclass(frozen=True)
@@ -78,30 +80,45 @@ class BlindSpot:
     effect: str
     smallest_detectable_gain: float
     unit: str
-    why: str
+    reason: Note | str
+
+    @property
+    def why(self) -> str:
+        """The reason as a sentence."""
+        return str(self.reason)
 
 
 @dataclass(frozen=True)
 class Remaining:
-    """What is left: whether it is noise, and where it is not."""
+    """What is left: whether it is noise, and what is seen in it where it is not."""
 
     white: bool
     p_value: float
-    where: str
+    seen: Note | str = NOISE
+
+    @property
+    def where(self) -> str:
+        """What is seen, as a sentence."""
+        return str(self.seen)
 
 
 @dataclass(frozen=True)
 class NextExperiment:
     """The experiment that would distinguish the rivals.
 
-    `voltage_csv` is the file with the voltage to play, where one was written; `chance` is for each
-    rival the probability that it is then named if it is the cause.
+    `voltage_csv` is the file with the voltage to play, where one was written; `reasons` say what it
+    is good for; `chance` is for each rival the probability that it is then named, if it is the one.
     """
 
     voltage_csv: str | None
     separates: tuple[str, ...]
-    why: str
+    reasons: tuple[Note | str, ...]
     chance: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def why(self) -> str:
+        """The reasons in sentences."""
+        return " ".join(texts(self.reasons))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +155,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Decision:
-    """What a further column decided: what is named with it and without it, and in words.
+    """What a further column decided: what is named with it and without it, and the outcome.
 
     An `output` is fitted, with `noise` and held-out errors `base_rms` and `extended_rms` in its SI
     `unit`; an `input` drives the model, and has none. `named` and `named_without` hold the named
@@ -156,7 +173,12 @@ class Decision:
     named_without: Mapping[str, float]
     ruled_out: tuple[str, ...]
     evidence: float
-    sentence: str
+    outcome: Note
+
+    @property
+    def sentence(self) -> str:
+        """The outcome as a sentence."""
+        return str(self.outcome)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -167,7 +189,8 @@ class Diagnosis(Reported):
     predictions [m] of every record in full, in the order of `experiments`. `noise` is the floor of
     every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
     records with enough samples. `contenders` are the fitted rivals of an ambiguous verdict.
-    `doubt` says why held-out samples cannot confirm a cause, "" where they can.
+    `doubted` says why held-out samples cannot confirm a cause, None where they can; `remarks` what
+    else there is to say.
     `budget` says where the base's held-out error goes, `patch` the unnamed correction that would
     remove most of what the named causes leave. `alternatives` are models for causes of which the
     records do not tell whether an exported plant holds them. `columns` say what each further column
@@ -184,7 +207,7 @@ class Diagnosis(Reported):
     blind_to: tuple[BlindSpot, ...]
     remaining: Remaining
     next_experiment: NextExperiment
-    notes: tuple[str, ...]
+    remarks: tuple[Note | str, ...]
     experiments: tuple[Experiment, ...]
     base_fit: Fit
     extended_fit: Fit
@@ -195,11 +218,21 @@ class Diagnosis(Reported):
     misfit: tuple[Misfit, ...] = ()
     remainder: tuple[Misfit, ...] = ()
     contenders: tuple[Contender, ...] = ()
-    doubt: str = ""
+    doubted: Note | None = None
     budget: Budget | None = None
     patch: Patch | None = None
     alternatives: tuple[Alternative, ...] = ()
     columns: tuple[Decision, ...] = ()
+
+    @property
+    def doubt(self) -> str:
+        """Why held-out samples cannot confirm a cause, "" where they can."""
+        return "" if self.doubted is None else str(self.doubted)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The remarks in sentences."""
+        return texts(self.remarks)
 
     @property
     def kept(self) -> tuple[str, ...]:
@@ -243,10 +276,10 @@ class Diagnosis(Reported):
             "budget": None if self.budget is None else asdict(self.budget),
             "patch": None if self.patch is None else self.patch.to_dict(),
             "alternatives": [a.to_dict() for a in self.alternatives],
-            "columns": [asdict(c) for c in self.columns],
-            "blind_to": [asdict(b) for b in self.blind_to],
-            "remaining": asdict(self.remaining),
-            "next_experiment": asdict(self.next_experiment),
+            "columns": [told(c, "outcome", "sentence") for c in self.columns],
+            "blind_to": [told(b, "reason", "why") for b in self.blind_to],
+            "remaining": told(self.remaining, "seen", "where"),
+            "next_experiment": told(self.next_experiment, "reasons", "why"),
             "notes": list(self.notes),
             "noise": [
                 {"record": n.record, "rms": n.level, "source": n.source, "sentence": n.sentence}
@@ -262,6 +295,14 @@ class Diagnosis(Reported):
     def to_json(self) -> str:
         """Return the text of DIAGNOSIS.json."""
         return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def told(part: Any, code: str, text: str) -> dict[str, Any]:
+    """Return a part of a result for a file: the sentence in the place of its code."""
+    return {
+        text if n == code else n: getattr(part, text) if n == code else v
+        for n, v in asdict(part).items()
+    }
 
 
 def unnamed_causes(budget: Budget | None, causes: tuple[Cause, ...]) -> tuple[str, ...]:

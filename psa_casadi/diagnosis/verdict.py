@@ -1,4 +1,9 @@
-"""From the steps of the search to verdict, confidence, blind spots and what to do next."""
+"""From the steps of a search to the diagnosis: verdict, blind spots, rivals, next record.
+
+What belongs to the sensor or the environment stays out of an exported plant. Where the records
+cannot tell such a cause from one of the plant, which of the two is exported is not theirs to say.
+So there are two models, and the difference of their plants' displacements is told.
+"""
 
 from collections.abc import Sequence
 
@@ -6,63 +11,213 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.alternatives import alternatives
-from psa_casadi.diagnosis.blind_spots import blind_spots, shown
-from psa_casadi.diagnosis.budget import Budget, budget
-from psa_casadi.diagnosis.corrections.correct import corrections
-from psa_casadi.diagnosis.corrections.export import with_patch
-from psa_casadi.diagnosis.corrections.patch import patch_of
+from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
+from psa_casadi.diagnosis.corrections import corrections
 from psa_casadi.diagnosis.evidence import diagnosis_evidence
-from psa_casadi.diagnosis.held_out.confirmation import unconfirmed
-from psa_casadi.diagnosis.held_out.coverage import coverage_notes
-from psa_casadi.diagnosis.held_out.errors import (
+from psa_casadi.diagnosis.held_out import (
+    Budget,
+    budget,
     errors_of,
     gain_of,
     lost_elsewhere,
     whole_residuals,
 )
-from psa_casadi.diagnosis.held_out.generalisation import Excess, held_out_excess
 from psa_casadi.diagnosis.judgement import (
-    SMALL_NOTE,
+    Balance,
     told_from,
     too_small,
     vague_note,
     verdict_of,
     withdrawn_names,
 )
-from psa_casadi.diagnosis.next_record import next_experiment
-from psa_casadi.diagnosis.noise.floor import NoiseFloor, noise_floor, pooled_level
-from psa_casadi.diagnosis.remedy.size import sizes
-from psa_casadi.diagnosis.residual.misfit import FEWEST, Misfit, misfit
+from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
+from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
+from psa_casadi.diagnosis.patch import patch_of, with_patch
+from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
+    Alternative,
+    BlindSpot,
     Candidate,
     Cause,
     Diagnosis,
     Estimate,
+    NextExperiment,
     Remaining,
     Verdict,
 )
-from psa_casadi.diagnosis.search.contenders import contenders
-from psa_casadi.diagnosis.search.hypothesis import Scale
-from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.task import same_curves
-from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.diagnosis.weighing import Balance
-from psa_casadi.errors import InputError
+from psa_casadi.diagnosis.search.fits import to_end, with_cause
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
+from psa_casadi.diagnosis.search.steps import Step, contenders
+from psa_casadi.diagnosis.task import same_curves, thresholds
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.determinacy import Determinacy, determinacy
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
-from psa_casadi.records.split import Experiment
+from psa_casadi.notes import Note, note
+from psa_casadi.records.record import Record
+from psa_casadi.records.repeats import held, repeats
+from psa_casadi.records.split import Experiment, counts, loop_sizes
+from psa_casadi.simulation.simulate import simulate_record
+from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
+
+
+def shown(steps: Sequence[Step]) -> set[str]:
+    """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
+
+    Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
+    """
+    price = thresholds().price
+    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > price}
+    return fitted.union(*(told_from(s) for s in steps))
+
+
+def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
+    """Return effects whose smallest gain that shows on these records is more than ordinary."""
+    spots = []
+    present = {c.name for c in final.fit.model.components}
+    for effect in table:
+        if effect.name in present:
+            continue
+        scores = [s for s in final.screening.scores if s.direction.effect is effect]
+        gain = next(p for p in effect.parameters if p.name == effect.gain)
+        extended = final.fit.model.with_effect(effect, {gain.name: 0.0})
+        practical = gain.typical(extended.values)
+        factor = np.sqrt(final.screening.threshold)
+        smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
+        if smallest > practical:
+            why = note(
+                "blind_spot" if np.isfinite(smallest) else "blind",
+                effect=effect.name, gain=gain.name,
+                smallest=(smallest, gain.unit), ordinary=(practical, gain.unit),
+            )  # fmt: skip
+            spots.append(BlindSpot(effect.name, float(min(smallest, 1e300)), gain.unit, why))
+    return tuple(spots)
+
+
+#: A hold lasts so long [s]; the durations of the largest rises lie in so many bands, each a factor
+#: of four wide, and loops have so many sizes.
+_HOLD, _RATES, _SIZES = 3.0, 2, 3
+
+
+def next_experiment(
+    causes: Sequence[Cause],
+    verdict: Verdict,
+    alike: Sequence[Sequence[str]],
+    records: Sequence[Record],
+    *,
+    doubted: bool,
+) -> NextExperiment:
+    """Return what to do next; `alike` are groups of effects that only a resonance tells apart."""
+    if verdict == "not_driven":
+        return NextExperiment(None, (), (note("correct_columns"),))
+    if doubted:
+        return NextExperiment(None, (), (note("record_again"),))
+    open_ones = [(c.effect, *c.cannot_be_told_from) for c in causes if c.cannot_be_told_from]
+    rivals = tuple(dict.fromkeys(n for own in open_ones for n in own))
+    same = [own for own in open_ones if any(set(own) <= set(group) for group in alike)]
+    steps = [note("same_curve", effects=own) for own in same]
+    if verdict in ("unexplained", "partly_explained") or len(same) < len(open_ones):
+        steps.append(useful_records(records))
+    if steps:
+        return NextExperiment(None, rivals, tuple(steps))
+    return NextExperiment(None, (), (note("no_next"),))
+
+
+def useful_records(records: Sequence[Record]) -> Note:
+    """Return what to record next: what of holds, rates, amplitudes and repeats is lacking.
+
+    Where nothing is, other conditions or quantities must decide.
+    """
+    span = max(float(np.ptp(r.voltage)) for r in records)
+    kinds = counts(records, [np.ones(r.n, dtype=bool) for r in records], span)
+    moves = [k for k in kinds if k.way]
+    largest = max((k.size for k in moves), default=0)
+    holds = max((float(r.time[b - 1] - r.time[a]) for r in records for a, b in held(r)), default=0)
+    there = {
+        "hold": holds >= _HOLD,
+        "rates": len({k.band for k in moves if k.size == largest}) >= _RATES,
+        "amplitudes": loop_sizes(records, span) >= _SIZES,
+        "repeats": any(repeats(r) is not None for r in records),
+    }
+    lacking = tuple(what for what, found in there.items() if not found)
+    return note("lacking", what=lacking) if lacking else note("other_conditions")
+
+
+def alternatives(
+    named: Sequence[Step],
+    final: Fit,
+    experiments: Sequence[Experiment],
+    table: Sequence[Component],
+    *,
+    stiffness_given: bool,
+) -> tuple[Alternative, ...]:
+    """Return, for each cause that may lie on the other side of the sensor, the model with that one.
+
+    Of several such effects the likeliest that can be fitted and simulated.
+    """
+    effects = {e.name: e for e in table}
+    found = []
+    for step in named:
+        other = [
+            n
+            for n in told_from(step)
+            if n in effects and effects[n].in_plant != step.cause.in_plant
+        ]
+        for name in sorted(other, key=lambda n: -step.probability.get(n, 0.0)):
+            fitted = _fitted(step, name, experiments)
+            if fitted is None:
+                continue
+            try:
+                differs = _difference(final, fitted.fit, experiments)
+            except PsaError:
+                continue
+            told = determinacy(fitted.fit, experiments)
+            records = [e.record for e in experiments]
+            evidence = diagnosis_evidence(fitted.fit, told, experiments, fitted.predicted)
+            model = with_provenance(
+                fitted.fit.model, told, records, stiffness_given, evidence=evidence
+            )
+            found.append(
+                Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
+            )
+            break
+    return tuple(found)
+
+
+def _fitted(step: Step, name: str, experiments: Sequence[Experiment]) -> Hypothesis | None:
+    """Return the hypothesis with another effect in a cause's place, fitted to its end."""
+    known = step.instead.get(name)
+    if known is None and step.beside is not None:
+        starts = step.beside.starts_of(name)
+        known = with_cause(step.beside.of, experiments, starts) if starts else None
+    return known if known is None or known.final else to_end(known, experiments)
+
+
+def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[float, float]:
+    """Return by how much the plants of two fits differ on the records: most [m], and % of range.
+
+    About the mean difference of each record, as the sensor's zero is free.
+    """
+    most = span = 0.0
+    for k, e in enumerate(experiments):
+        moved = []
+        for fit in (one, other):
+            plant = fit.model.plant()
+            names = memory_names(plant.structure)
+            memory = {n: v for n, v in fit.starts()[k].items() if n in names}
+            moved.append(simulate_record(plant, e.record, memory).outputs["displacement"])
+        apart = moved[0] - moved[1]
+        most = max(most, float(np.max(np.abs(apart - np.mean(apart)))))
+        span = max(span, e.record.range_m)
+    return most, 100.0 * most / span
+
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Verdicts that name causes.
 NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
-_HELD_OUT = (
-    "The held-out samples' error is {:.2f} times what the fitted ones let expect: something matters"
-    " there that these do not show."
-)
 
 
 @stage("judging")
@@ -99,20 +254,21 @@ def conclude(
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
     lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
     doubt = unconfirmed(experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden)
-    vague = {} if beaten is not None or doubt else balance.vague(steps)
+    stands = beaten is None and doubt is None
+    vague = balance.vague(steps) if stands else {}
     verdict: Verdict = (
         "not_driven"
         if not driven
         else verdict_of(
             steps,
             missing=missing,
-            withdrawn=bool(beaten or doubt),
+            withdrawn=not stands,
             share=weighed.share,
             unseen=bool(unseen),
             unnamed=vague,
         )
     )
-    weak = verdict == "unexplained" and not (beaten or doubt or vague) and weighed.adds
+    weak = verdict == "unexplained" and stands and not vague and weighed.adds
     kept = [s for s in steps if s.chosen] if verdict in NAMING or weak else []
     final = last if kept else first
     patch = patch_of(
@@ -159,17 +315,17 @@ def conclude(
             verdict,
             same_curves(experiments, table, first.fit),
             [e.record for e in experiments],
-            doubted=bool(doubt),
+            doubted=doubt is not None,
         ),
-        doubt=doubt if verdict in ("adequate", "unexplained") else "",
-        notes=(
+        doubted=doubt if verdict in ("adequate", "unexplained") else None,
+        remarks=(
             *model.provenance.notes,
             *(
                 withdrawn_names(steps, weighed, beaten, vague, doubt)
                 if verdict == "unexplained"
                 else vague_note(vague)
             ),
-            *(SMALL_NOTE.format(c.what, 100 * max(c.share, 0.0)) for c in small),
+            *(note("small", effect=c.what, share=max(c.share, 0.0)) for c in small),
             *coverage_notes(experiments),
         ),
         experiments=tuple(experiments),
@@ -274,11 +430,10 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
 
 
 def _remaining(r: Step, beyond: Excess) -> Remaining:
-    """Describe what is left; `beyond` the fit where that leaves nothing to be seen."""
-    where = "What remains cannot be distinguished from noise."
-    if r.test.alarm:
-        where = f"{r.test.where} {100 * r.test.excess:.0f} % of its power is above the noise."
-    elif beyond:
-        where = _HELD_OUT.format(beyond.factor)
+    """Return what is left; `beyond` the fit where that leaves nothing to be seen."""
     p_value = min(r.test.p_value, beyond.p_value)
-    return Remaining(not (r.test.alarm or beyond), p_value, where)
+    if r.test.alarm:
+        return Remaining(False, p_value, r.test.finding)
+    if beyond:
+        return Remaining(False, p_value, note("held_out_error", factor=beyond.factor))
+    return Remaining(True, p_value)

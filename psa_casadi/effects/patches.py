@@ -10,9 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.effects.sizes import static_stiffness
-from psa_casadi.scales import reading_scale, stroke_scale, voltage_scale
-from psa_casadi.smooth import stop_rate
+from psa_casadi.scales import reading_scale, static_stiffness, stroke_scale, voltage_scale
+from psa_casadi.shapes import stop_rate
 from psa_casadi.variables import Parameter, State, Values
 
 #: Terms of a curve and of one for each direction or over time; play and stop elements; relaxations.

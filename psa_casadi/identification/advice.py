@@ -18,10 +18,10 @@ from psa_casadi.identification.determinacy import (
 )
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
+from psa_casadi.records.drive import reversals
 from psa_casadi.records.excitation import decaying_triangle, multisine, sine, time_grid
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.records.turns import reversals
 from psa_casadi.shown import Worded
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import settling_time

@@ -15,8 +15,7 @@ from psa_casadi.identification.fitting.unknowns import (
     memory_sizes,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.filtering import convolved
-from psa_casadi.records.quality.noise import autocovariance
+from psa_casadi.records.noise import autocovariance, convolved
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray

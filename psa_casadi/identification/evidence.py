@@ -15,8 +15,7 @@ from psa_casadi.model.evidence import (
     ReferenceRun,
     SeenRange,
 )
-from psa_casadi.records.quality.fast_noise import fast_noise
-from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.noise import fast_noise, runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs

@@ -35,13 +35,12 @@ from psa_casadi.identification.start.starting_points import linear_start
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
-from psa_casadi.records.excerpts import excerpts
-from psa_casadi.records.quality.gaps import without_gaps
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, whole
-from psa_casadi.shown import Note, Reported, frame, sentences
+from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
+from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.variables import Provenance
 from psa_casadi.version import __version__
@@ -51,8 +50,8 @@ _MISSED = 1.5
 #: Rounds of fitting with every record's own residual as its noise level.
 _LEVEL_ROUNDS = 2
 
-FORCE_NOTE = Note("force_assumed")
-INTERRUPTED = Note("interrupted")
+FORCE_NOTE = note("force_assumed")
+INTERRUPTED = note("interrupted")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,12 +81,12 @@ class Identification(Reported):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is to be doubted, in words."""
-        return sentences(self.doubts)
+        return texts(self.doubts)
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """What was done to the records and found in them, in words."""
-        return sentences(self.notes)
+        return texts(self.notes)
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas DataFrame: value, 95 % interval, unit, meaning."""
@@ -135,7 +134,7 @@ def identify(
     fitted, long = excerpts(every)
     known = {r.sha256: r for r in parts}
     said = [*cut, *(s for _, own in ready for s in own), *long]
-    refuse_few(given_records, fitted, sentences(said))
+    refuse_few(given_records, fitted, texts(tuple(said)))
     start, given = chosen_start(every, model, stiffness)
     columns = columns_of(start, fitted)
     forms = forms_of(columns.model, hysteresis)
@@ -195,7 +194,7 @@ def identify(
             *said,
             *((preferred,) if preferred else ()),
             *columns.left_out,
-            *(" ".join(sentences(f.notes)) for f in best.further),
+            *(" ".join(texts(f.notes)) for f in best.further),
         ),
         combinations=open_ones,
         advice=advised or (),
@@ -225,8 +224,8 @@ def with_provenance(
         force_scale="given" if stiffness_given else "assumed",
         interrupted=interrupted,
         notes=(
-            *((INTERRUPTED.sentence,) if interrupted else ()),
-            *(() if stiffness_given else (FORCE_NOTE.sentence,)),
+            *((str(INTERRUPTED),) if interrupted else ()),
+            *(() if stiffness_given else (str(FORCE_NOTE),)),
             *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
@@ -240,7 +239,7 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
         package_version=__version__,
         free=best.unknowns.names,
         force_scale="given" if stiffness_given else "assumed",
-        notes=(INTERRUPTED.sentence, *(() if stiffness_given else (FORCE_NOTE.sentence,))),
+        notes=(str(INTERRUPTED), *(() if stiffness_given else (str(FORCE_NOTE),))),
         interrupted=True,
     )
     return replace(best.model, provenance=provenance, evidence=None)
@@ -272,22 +271,22 @@ def _of_fit(
     if best.interrupted:
         notes.append(INTERRUPTED)
     elif not best.converged:
-        notes.append(Note("cut_off"))
+        notes.append(note("cut_off"))
     followed = [s for s in searched.starts if s.agrees is not None]
     if searched.not_unique:
-        notes.append(Note("not_unique", (searched.not_unique,)))
+        notes.append(note("not_unique", names=searched.not_unique))
     elif sum(bool(s.agrees) for s in followed) == 1:
-        notes.append(Note("one_start", (len(searched.starts),)))
-    notes += [Note("on_bound", (name,)) for name in found.on_bound]
+        notes.append(note("one_start", starts=len(searched.starts)))
+    notes += [note("on_bound", name=name) for name in found.on_bound]
     alone = [n for n in found.undetermined if n not in searched.not_unique]
     if alone:
-        notes.append(Note("undetermined", (alone,)))
+        notes.append(note("undetermined", names=alone))
     for e, residual in zip(experiments, best.residuals_of(experiments), strict=True):
         if len(residual) < 8:
             continue
         rms, noise = float(np.sqrt(np.mean(residual**2))), high_frequency_noise(residual)
         if noise > 0 and rms > _MISSED * noise:
-            notes.append(Note("missed", (e.record.name, rms / noise)))
+            notes.append(note("missed", record=e.record.name, times=rms / noise))
     return notes
 
 

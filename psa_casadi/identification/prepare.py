@@ -12,13 +12,12 @@ from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.identification.start.ordinary import capacitance_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
 from psa_casadi.records.decimate import decimated
-from psa_casadi.records.excerpts import MOST
-from psa_casadi.records.quality.fast_noise import fast_noise
-from psa_casadi.records.quality.suspects import cleaned, masked, suspects
+from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, Level
-from psa_casadi.shown import Note
+from psa_casadi.records.split import MOST, Experiment, Level
+from psa_casadi.records.suspects import cleaned, masked, suspects
 
 
 def as_read(record: Record) -> Record:
@@ -34,7 +33,7 @@ def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
     """
     found = suspects(record)
     clean, clocks = on_one_clock(masked(record, found))
-    said = [*found.sentences(record.name), *clocks]
+    said: tuple[Note | str, ...] = (*found.sentences(record.name), *clocks)
     shorter, averages = _averaged(clean)
     return shorter, (*said, *averages)
 
@@ -59,7 +58,7 @@ def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
     shorter, factor = decimated(record, noise, slope)
     if factor == 1:
         return record, ()
-    return shorter, (Note("averaged", (record.name, record.n, factor)),)
+    return shorter, (note("averaged", record=record.name, samples=record.n, block=factor),)
 
 
 #: Noise level of a column before a fit has told it, over the standard deviation of the column.
@@ -95,7 +94,7 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
                 f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
             )
         elif why := _says_nothing(column, given):
-            said.append(Note(why, (column,)))
+            said.append(note(why, column=column))
         else:
             model = wider
             fitted.append(column)

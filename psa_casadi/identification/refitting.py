@@ -23,7 +23,7 @@ from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured, predict
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, Level
 from psa_casadi.units import FloatArray
 

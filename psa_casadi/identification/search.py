@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.components import MEMORY_SPECTRUM
+from psa_casadi.components.stack import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.force_start import retuned
@@ -41,10 +41,10 @@ from psa_casadi.identification.start.starting_points import (
     starting_points,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
-from psa_casadi.shown import Note
 from psa_casadi.simulation.timings import stage
 from psa_casadi.units import FloatArray
 
@@ -293,8 +293,9 @@ def search_forms(
     ranked = sorted(found, key=lambda s: _criterion(s.best, experiments))
     if len(ranked) < 2:
         return ranked[0], None
-    pairs = ((_form(s.best), 1e9 * s.best.rms) for s in ranked)
-    return ranked[0], Note("form", tuple(word for pair in pairs for word in pair))
+    (better, left), (other, other_left) = ((_form(s.best), 1e9 * s.best.rms) for s in ranked)
+    said = note("form", better=better, left=left, other=other, other_left=other_left)
+    return ranked[0], said
 
 
 def _form(found: Fit) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 from psa_casadi.component import Component
 from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.modal_series import MODAL_SERIES
+from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.effects.patches import PATCHES
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write, why_not_read

@@ -25,7 +25,7 @@ import casadi as ca
 from psa_casadi.component import Component, OnDemand
 from psa_casadi.components import BASE, COMPONENTS
 from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.modal_series import MODAL_SERIES
+from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import compose
 

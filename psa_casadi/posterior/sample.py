@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,9 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.posterior.chains import (
+    Chains,
     chains_of,
     data_tree,
     predictive,
@@ -21,14 +23,10 @@ from psa_casadi.posterior.chains import (
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.scratch import temporary_folder
-from psa_casadi.shown import Note, Shown, frame, sentences
+from psa_casadi.shown import Shown, frame
 from psa_casadi.simulation.one_thread import one_thread_of_algebra
 from psa_casadi.simulation.side_by_side import one_thread
 from psa_casadi.simulation.ways import output_of
-
-if TYPE_CHECKING:
-    from psa_casadi.posterior.chains import Chains
-
 
 #: Share of the highest density interval, and its ends.
 HDI = 0.94
@@ -84,12 +82,12 @@ class Posterior(Shown):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is to be doubted, in words."""
-        return sentences(self.doubts)
+        return texts(self.doubts)
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """What was done to the records and the prior's draws, in words."""
-        return sentences(self.notes)
+        return texts(self.notes)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the data tree as netCDF 4, whole or not at all; `arviz.from_netcdf` reads it.
@@ -154,21 +152,21 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
     count, draws, _ = chains.u.shape
     doubts = []
     if chains.divergences:
-        doubts.append(Note("diverged", (chains.divergences, count * draws)))
+        doubts.append(note("diverged", count=chains.divergences, transitions=count * draws))
     apart = [f.name for f in figures if not f.r_hat <= MOST_RHAT]
     if apart:
-        doubts.append(Note("chains_disagree", (apart, MOST_RHAT)))
+        doubts.append(note("chains_disagree", names=apart, limit=MOST_RHAT))
     few = [f.name for f in figures if f.ess < LEAST_ESS * count]
     if few:
-        doubts.append(Note("few_draws", (few, LEAST_ESS)))
+        doubts.append(note("few_draws", names=few, limit=LEAST_ESS))
     if not task.converged:
-        doubts.append(Note("start_cut_off"))
+        doubts.append(note("start_cut_off"))
     for e, worth in zip(task.experiments, task.inflation, strict=True):
         if worth > _COLOURED:
-            doubts.append(Note("coloured", (e.record.name, worth)))
+            doubts.append(note("coloured", record=e.record.name, worth=worth))
     held = [f.name for f in figures if f.prior_share > _PRIOR_SHARE]
     if held:
-        doubts.append(Note("of_the_prior", (held,)))
+        doubts.append(note("of_the_prior", names=held))
     return tuple(doubts)
 
 
@@ -241,7 +239,7 @@ def sample(
         after = predictive(task, flat[some], rng, fit_offset=False)
     tree = data_tree(task, found, theta, before, after)
     figures = figures_of(task, tree)
-    failed = [Note("prior_fails", (before.failed, _PREDICTED))] if before.failed else []
+    failed = [note("prior_fails", count=before.failed, draws=_PREDICTED)] if before.failed else []
     return Posterior(
         model=task.model.with_values(task.unknowns.values(task.theta)),
         tree=tree,

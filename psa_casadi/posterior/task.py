@@ -22,11 +22,10 @@ from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.gaps import without_gaps
-from psa_casadi.records.quality.noise import autocovariance
+from psa_casadi.notes import Note
+from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, Level, whole
-from psa_casadi.shown import Note
+from psa_casadi.records.split import Experiment, Level, whole, without_gaps
 from psa_casadi.simulation.ways import Way
 from psa_casadi.units import FloatArray
 

@@ -17,8 +17,8 @@ from psa_casadi.records.read.reading import (
     read_records,
     record_from,
     records_given,
+    write_record,
 )
-from psa_casadi.records.read.write_csv import write_record
 from psa_casadi.records.record import Record
 
 __all__ = [

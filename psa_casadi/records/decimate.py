@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
-from psa_casadi.records.quality.fast_noise import fast_noise
+from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 

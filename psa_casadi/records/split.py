@@ -2,14 +2,144 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.records.record import Record
-from psa_casadi.records.stretches import stretches
-from psa_casadi.records.turns import reversals
+from psa_casadi.records.drive import reversals
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
+from psa_casadi.records.repeats import held
+from psa_casadi.records.suspects import HIDDEN
+
+#: Turns by less than this share of the span are no reversals here; sizes of rises and falls are
+#: told apart at these shares of it, durations by this factor.
+_TURNS, _SIZES, _FACTOR = 0.01, (0.1, 0.5), 4.0
+_SIZE_WORDS = ("small", "medium", "large")
+
+
+class Kind(NamedTuple):
+    """A kind of stretch: `way` 1 up, -1 down, 0 held; size 0 to 2; log_4 of the duration in s."""
+
+    way: int
+    size: int
+    band: int
+
+    def near(self, other: "Kind") -> bool:
+        """Whether kinds go the same way and lie side by side in size and duration."""
+        close = abs(self.size - other.size) <= 1 and abs(self.band - other.band) <= 1
+        return self.way == other.way and close
+
+    @property
+    def words(self) -> str:
+        """The kind in words, such as "large rises of 0.1 to 0.4 s"."""
+        if self.way == 0:
+            return "held voltages"
+        low, high = _FACTOR**self.band, _FACTOR ** (self.band + 1)
+        way = "rises" if self.way > 0 else "falls"
+        return f"{_SIZE_WORDS[self.size]} {way} of {low:.2g} to {high:.2g} s"
+
+
+def stretches(record: Record, span: float) -> tuple[tuple[Kind, ...], npt.NDArray[np.intp]]:
+    """Return the kinds of stretches of a record, and which of them each sample (n,) belongs to.
+
+    A stretch lasts from one reversal of the voltage to the next; its size is told in shares of the
+    `span` [V]. What is held within it is a kind of its own.
+    """
+    if not span > 0:
+        return (Kind(0, 0, 0),), np.zeros(record.n, dtype=np.intp)
+    v, t = record.voltage, record.time
+    ends = [0, *reversals(v, _TURNS * span).tolist(), record.n - 1]
+    each: list[Kind] = []
+    which = np.zeros(record.n, dtype=np.intp)
+    for start, stop in pairwise(ends):
+        change, lasts = float(v[stop] - v[start]), float(t[stop] - t[start])
+        size = int(np.searchsorted(_SIZES, abs(change) / span))
+        band = int(np.floor(np.log(max(lasts, record.sample_time)) / np.log(_FACTOR)))
+        which[start : stop + 1] = len(each)
+        each.append(Kind(1 if change > 0 else -1, size, band))
+    for start, stop in held(record):
+        which[start:stop] = len(each)
+    each.append(Kind(0, 0, 0))
+    kinds = tuple(sorted({each[k] for k in np.unique(which)}))
+    place = np.array([kinds.index(k) if k in kinds else 0 for k in each], dtype=np.intp)
+    return kinds, place[which]
+
+
+def loop_sizes(records: Sequence[Record], span: float) -> int:
+    """Return how many sizes the ways between two reversals have, a tenth of the `span` [V] apart.
+
+    The ways to the first reversal and from the last one are no part of a loop.
+    """
+    ways = [np.abs(np.diff(r.voltage[reversals(r.voltage, _TURNS * span)])) for r in records]
+    sizes = np.sort(np.concatenate(ways)) / span
+    return int(np.sum(np.diff(sizes) > _SIZES[0])) + 1 if sizes.size else 0
+
+
+def counts(
+    records: Sequence[Record], chosen: Sequence[npt.NDArray[np.bool_]], span: float
+) -> dict[Kind, int]:
+    """Return how many of the `chosen` samples of the records belong to each kind."""
+    found: dict[Kind, int] = {}
+    for record, mask in zip(records, chosen, strict=True):
+        kinds, which = stretches(record, span)
+        for kind, count in zip(kinds, np.bincount(which[mask], minlength=len(kinds)), strict=True):
+            found[kind] = found.get(kind, 0) + int(count)
+    return {k: n for k, n in found.items() if n}
+
+
+#: An interval is a gap from so many times the intervals beside it on.
+_LONG = 10.0
+
+
+def without_gaps(records: Iterable[Record]) -> tuple[list[Record], list[str]]:
+    """Return the records, cut into parts where a gap hides what the voltage did; and what was cut.
+
+    A part begins as a record does, with a state that nobody knows: what the stack remembers of a
+    gap is not what a straight line of the voltage would have left.
+    """
+    parts, said = [], []
+    for record in records:
+        at = gaps(record)
+        if not at:
+            parts.append(record)
+            continue
+        ends = [0, *(k + 1 for k in at), record.n]
+        parts += [record.slice(a, b) for a, b in pairwise(ends)]
+        places = ", ".join(
+            f"{record.time[k + 1] - record.time[k]:.4g} s from {record.time[k]:.6g} s on"
+            for k in at
+        )
+        said.append(
+            f"{record.name}: no sample for {places}, while the voltage moves: what it did there is"
+            f" not known, so that the {len(at) + 1} parts count as records of their own."
+        )
+    return parts, said
+
+
+def gaps(record: Record) -> tuple[int, ...]:
+    """Return the samples after which there is a gap that hides a motion of the voltage.
+
+    It is many times as long as the intervals before and after it, and a voltage that went on as it
+    did before, or as it does after it, would have missed its other end by more than a share of its
+    range. Both parts have samples enough for a record.
+    """
+    step, change = np.diff(record.time), np.diff(record.voltage)
+    inner = np.arange(1, step.size - 1)
+    around = np.maximum(step[:-2], step[2:])
+    missed = [
+        np.abs(change[inner] - step[inner] * change[side] / step[side])
+        for side in (inner - 1, inner + 1)
+    ]
+    hidden = np.maximum(*missed) > HIDDEN * np.ptp(record.voltage)
+    found: list[int] = []
+    for k in inner[(step[inner] > _LONG * around) & hidden].tolist():
+        begin = found[-1] + 1 if found else 0
+        if k + 1 - begin >= FEWEST_SAMPLES and record.n - (k + 1) >= FEWEST_SAMPLES:
+            found.append(k)
+    return tuple(found)
+
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -164,3 +294,79 @@ def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Exper
     if not holdout:
         return tuple(split(r) for r in records)
     return (*(whole(r) for r in records), *(judging(r) for r in holdout))
+
+
+#: Samples that are fitted of all records together. A fit takes some 0.1 ms and 2 kB for each, a
+#: diagnosis 0.1 ms and 6 kB; with so many the intervals are a few parts in ten thousand, and what
+#: the model lacks is larger.
+MOST = 200_000
+#: Parts that stand for one record, and the samples that it may have however many records there are.
+PARTS, LEAST = 4, 20_000
+#: What comes this close to the highest or the lowest voltage, over its range, reaches it.
+
+
+def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
+    """Return the records with parts in place of those that are too long, and sentences on these.
+
+    All together have `MOST` samples at most, and every record its fair share of them, at least
+    `LEAST`. The parts of a record are of equal length: its beginning, then in turn what shows the
+    most kinds of stretch (rises, falls and holds, see `stretches`) and ends of the voltage's range
+    that the parts so far do not, as far from these as it can be. A part begins as a record does,
+    with a state that nobody knows.
+    """
+    shares = _shares([r.n for r in records])
+    found: list[Record] = []
+    said: list[str] = []
+    for record, share in zip(records, shares, strict=True):
+        if record.n <= share:
+            found.append(record)
+            continue
+        length = share // PARTS
+        begins = [k * length for k in _chosen(record, length)]
+        found += [record.slice(a, a + length) for a in begins]
+        places = ", ".join(f"{record.time[a]:.4g} s" for a in begins)
+        lasts = record.time[length] - record.time[0]
+        said.append(
+            f"{record.name}: of {record.n} samples {PARTS} parts of {length} are used, which begin"
+            f" at {places}: they have each kind of rise, fall and hold that fits into them, and"
+            f" tell nothing slower than a part, {lasts:.3g} s; give a record with fewer samples a"
+            " second for that."
+        )
+    return found, said
+
+
+def _shares(counts: Sequence[int]) -> list[int]:
+    """Return how many samples each record may have: what short ones leave is the others'."""
+    shares, left = [0] * len(counts), MOST
+    for done, k in enumerate(sorted(range(len(counts)), key=lambda k: counts[k])):
+        shares[k] = min(counts[k], max(LEAST, left // (len(counts) - done)))
+        left -= shares[k]
+    return shares
+
+
+def _chosen(record: Record, length: int) -> list[int]:
+    """Return which of the parts of a length stand for a record, in the order of time."""
+    shown = _kinds(record, length)
+    chosen = [0]
+    while len(chosen) < PARTS:
+        new = np.sum(shown & ~np.any(shown[chosen], axis=0), axis=1)
+        away = np.min(np.abs(np.subtract.outer(np.arange(len(shown)), chosen)), axis=1)
+        new[chosen] = -1
+        chosen.append(int(np.lexsort((away, new))[-1]))
+    return sorted(chosen)
+
+
+def _kinds(record: Record, length: int) -> npt.NDArray[np.bool_]:
+    """Return which kinds of stretch each part of a record shows, and ends of the voltage's range.
+
+    Shape (parts, kinds + 2).
+    """
+    v, span = record.voltage, float(np.ptp(record.voltage))
+    kinds, which = stretches(record, span)
+    shown = np.zeros((record.n // length, len(kinds) + 2), dtype=np.bool_)
+    last = len(shown) * length
+    part = np.arange(last) // length
+    shown[part, which[:last]] = True
+    shown[part[v[:last] >= np.max(v) - _REACHED * span], -2] = True
+    shown[part[v[:last] <= np.min(v) + _REACHED * span], -1] = True
+    return shown

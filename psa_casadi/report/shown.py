@@ -29,12 +29,11 @@ from psa_casadi.report.plots.figure import (
 )
 from psa_casadi.report.plots.one_output import one_output
 from psa_casadi.report.plots.posterior_figure import posterior_figure
-from psa_casadi.report.words.own_series import own_fit_series, own_series
+from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.phrases import number, percent, plain
-from psa_casadi.report.words.posterior_words import posterior_text
 from psa_casadi.report.words.series import most_telling
 from psa_casadi.report.words.tables import Table, parameter_table
-from psa_casadi.report.words.text import identification_text, story
+from psa_casadi.report.words.text import identification_text, posterior_text, story
 from psa_casadi.simulation.simulate import Trajectory
 
 Own = OdeDiagnosis | OdeIdentification

@@ -15,9 +15,8 @@ import numpy as np
 
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.records.read.apart import head_of
-from psa_casadi.records.read.column_map import TABLE, columns_of, parse_columns
-from psa_casadi.records.read.head import Head
+from psa_casadi.records.read.apart import Head, head_of
+from psa_casadi.records.read.columns import TABLE, columns_of, parse_columns
 from psa_casadi.records.read.reading import read_records
 from psa_casadi.records.record import Record
 

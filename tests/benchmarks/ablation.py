@@ -6,8 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from psa_casadi.diagnosis.task import STEPS, Method
-from psa_casadi.diagnosis.thresholds import Thresholds
+from psa_casadi.diagnosis.task import STEPS, Method, Thresholds
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden import diagnose_all
 from tests.benchmarks.hidden_cases import Case, Found, study

@@ -11,8 +11,8 @@ import numpy as np
 
 from psa_casadi import datasets
 from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import Record
-from psa_casadi.records.turns import reversals
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.hidden_cases import names_of
 from tests.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share

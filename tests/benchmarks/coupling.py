@@ -19,10 +19,8 @@ import numpy as np
 from psa_casadi.export.importer.fmu import FloatArray, FmuError
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.archive import export_ssp
-from psa_casadi.export.ssp.master import couple, points
-from psa_casadi.export.ssp.read_archive import SspArchive
-from psa_casadi.model.system.nanopositioner import nanopositioner, positioner_plant
-from psa_casadi.model.system.system import System
+from psa_casadi.model.nanopositioner import nanopositioner, positioner_plant
+from psa_casadi.model.system import System
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.stepper import run as integrate
@@ -30,6 +28,7 @@ from tests.benchmarks.coupling_figure import picture
 from tests.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
 from tests.benchmarks.coupling_stability import Limit, limits, limits_table
 from tests.benchmarks.table import Outcome, Progress, TitledTable
+from tests.ssp_master import SspArchive, couple, points
 
 _END, _FREQUENCY, _TRUTH_STEP, _TRUTH, _TOLERANCE = 4e-3, 250.0, 2.5e-7, 1e-10, 1e-9
 _STEPS = (1e-5, 5e-6, 2.5e-6, 1.25e-6, 6.25e-7)

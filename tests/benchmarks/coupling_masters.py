@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from fmpy.ssp.simulation import simulate_ssp
 
-from psa_casadi.export.ssp.layout import OUTSIDE, Wire
-from psa_casadi.export.ssp.read_archive import SspArchive
+from psa_casadi.export.ssp.drawing import OUTSIDE, Wire
+from tests.ssp_master import SspArchive
 
 FloatArray = npt.NDArray[np.float64]
 #: The system's inputs as functions of time; 0 at the start, as fmpy sets them so.

@@ -14,13 +14,12 @@ import numpy as np
 from psa_casadi.export.importer.fmu import FmuError
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.archive import wiring_of
-from psa_casadi.export.ssp.master import couple, points
-from psa_casadi.export.ssp.read_archive import SspArchive
 from psa_casadi.export.ssp.steps import stable_step
-from psa_casadi.model.system.system import System
+from psa_casadi.model.system import System
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.table import TitledTable
+from tests.ssp_master import SspArchive, couple, points
 
 _STIFFNESSES = (5e6, 2e7, 5e7, 1e8, 2e8, 5e8)
 _KICK, _COUNT, _CLOSE, _LONG, _TOLERANCE = 1.0, 1500, 0.02, 1e-3, 1e-7

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.noise.residual_tests import whiteness
+from psa_casadi.diagnosis.colour import whiteness
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.identify import Identification, identify

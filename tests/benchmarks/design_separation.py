@@ -26,10 +26,9 @@ from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.design.experiment.search import GRID
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.screening.evidence import levelled
-from psa_casadi.diagnosis.search.contenders import one_of_each
-from psa_casadi.diagnosis.search.hypothesis import hypothesis
-from psa_casadi.diagnosis.search.view import examine
+from psa_casadi.diagnosis.screening import levelled
+from psa_casadi.diagnosis.search.hypothesis import examine, hypothesis
+from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError

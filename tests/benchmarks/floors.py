@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from psa_casadi import datasets
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.errors import Errors, errors_of
+from psa_casadi.diagnosis.held_out import Errors, errors_of
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import read_records

@@ -10,10 +10,9 @@ from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.screen import Quiet, show, working
 from psa_casadi.errors import InputError
 from tests.benchmarks.table import Outcome, Progress
-from tests.fuzz.campaign import Amount, Tally
+from tests.fuzz.campaign import Amount, Tally, replay
 from tests.fuzz.campaign import run as attack
-from tests.fuzz.replay import replay
-from tests.fuzz.table import chosen_targets, tables
+from tests.fuzz.table import TARGETS, chosen_targets, tables
 
 _SECONDS, _QUICK_SECONDS = 60.0, 10.0
 
@@ -51,7 +50,7 @@ def fuzz(
 ) -> None:
     """Attack the package with damaged inputs; exit code 1 if anything fails."""
     if again is not None:
-        tally = replay(again)
+        tally = replay(again, TARGETS)
         for distinct in tally.distinct.values():
             show(distinct.first.detail, quiet)
     else:

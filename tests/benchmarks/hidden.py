@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.errors import Gain, gain_of
+from psa_casadi.diagnosis.held_out import Gain, gain_of
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.model.compose import Model
 from psa_casadi.records.read.reading import read_record

@@ -11,7 +11,7 @@ from functools import partial
 from psa_casadi import datasets
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out.errors import errors_of
+from psa_casadi.diagnosis.held_out import errors_of
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit

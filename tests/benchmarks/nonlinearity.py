@@ -22,8 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from scipy.integrate import odeint
 
-from psa_casadi.model.system.nanopositioner import nanopositioner, positioner_plant
-from psa_casadi.model.system.tuning import margins_of
+from psa_casadi.model.nanopositioner import margins_of, nanopositioner, positioner_plant
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.table import Outcome, Progress, TitledTable
 

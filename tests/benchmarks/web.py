@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.web.module import web_module
+from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page.document import Document

@@ -24,12 +24,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fixed_step.export import export_c
-from psa_casadi.export.fixed_step.planning import fixed_step
+from psa_casadi.export.fixed_step.export import export_c, fixed_step
 from psa_casadi.export.fixed_step.probe import VOLTAGES
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.sources import compiled_files
-from psa_casadi.export.fmu.texts import exported_texts
+from psa_casadi.export.fmu.sources import compiled_files, exported_texts
 from psa_casadi.export.importer.fmu import Fmu, FmuError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model

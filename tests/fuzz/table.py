@@ -5,35 +5,12 @@ from collections.abc import Sequence
 from psa_casadi.errors import InputError
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.table import TitledTable
-from tests.fuzz import (
-    archives,
-    binaries,
-    blobs,
-    cache,
-    checks,
-    environments,
-    kills,
-    laboratory,
-    models,
-    readers,
-)
-from tests.fuzz.campaign import Tally
-from tests.fuzz.target import KINDS, Target
+from tests.fuzz import commands, fmus, readers, surroundings
+from tests.fuzz.campaign import KINDS, Tally, Target
 
 TARGETS: dict[str, Target] = {
     target.name: target
-    for module in (
-        readers,
-        laboratory,
-        models,
-        binaries,
-        archives,
-        checks,
-        blobs,
-        kills,
-        environments,
-        cache,
-    )
+    for module in (readers, fmus, commands, surroundings)
     for target in module.TARGETS
 }
 
@@ -54,52 +31,30 @@ def chosen_targets(names: Sequence[str]) -> list[Target]:
 
 def tables(tally: Tally) -> tuple[TitledTable, ...]:
     """Return what was counted by target, and the distinct failures, if there are any."""
-    counted = _counts(tally)
-    return (counted, _failures(tally)) if tally.failures else (counted,)
-
-
-def _counts(tally: Tally) -> TitledTable:
-    names = [n for n in TARGETS if tally.inputs[n]]
     rows = []
-    for name in names:
-        failures = [tally.kinds[name, kind] for kind in KINDS]
-        rows.append(
-            _row(name, tally.inputs[name], tally.accepted[name], failures, tally.seconds[name])
-        )
-    failures = [sum(tally.kinds[n, kind] for n in names) for kind in KINDS]
-    sums = (tally.inputs.total(), tally.accepted.total())
-    rows.append(_row("all", *sums, failures, sum(tally.seconds.values())))
-    head = ("target", "inputs", "accepted", *KINDS, "inputs per s of a core")
-    return TitledTable(
+    for name in (*(n for n in TARGETS if tally.inputs[n]), "all"):
+        own = [n for n in TARGETS if name in (n, "all")]
+        inputs, accepted = (sum(c[n] for n in own) for c in (tally.inputs, tally.accepted))
+        seconds = sum(tally.seconds[n] for n in own)
+        failures = [sum(tally.kinds[n, kind] for n in own) for kind in KINDS]
+        counts = [f"{n:,}" for n in (inputs, accepted, *failures)]
+        rows.append((name, *counts, f"{inputs / max(seconds, 1e-9):,.3g}"))
+    counted = TitledTable(
         f"Inputs and failures, seed {tally.seed}",
-        Table(head, tuple(rows)),
+        Table(("target", "inputs", "accepted", *KINDS, "inputs per s of a core"), tuple(rows)),
         "accepted: read or done without an error; all others were refused with a sentence.",
     )
-
-
-def _row(
-    name: str, inputs: int, accepted: int, failures: Sequence[int], seconds: float
-) -> tuple[str, ...]:
-    rate = f"{inputs / seconds:,.3g}" if seconds < inputs else f"{inputs / max(seconds, 1e-9):.2g}"
-    return (name, f"{inputs:,}", f"{accepted:,}", *(f"{n:,}" for n in failures), rate)
-
-
-def _failures(tally: Tally) -> TitledTable:
-    rows = [
-        (
-            d.first.target,
-            d.first.kind,
-            f"{d.times:,}",
-            " ".join(d.first.sentence.split())[:150],
-            f"{d.first.index}",
-            str(d.file or "-"),
-        )
+    if not tally.failures:
+        return (counted,)
+    found = tuple(
+        (d.first.target, d.first.kind, f"{d.times:,}", " ".join(d.first.sentence.split())[:150],
+         f"{d.first.index}", str(d.file or "-"))
         for d in tally.distinct.values()
-    ]
-    head = ("target", "kind", "times", "the first of them", "input", "file")
-    return TitledTable(
+    )  # fmt: skip
+    failed = TitledTable(
         "Distinct failures",
-        Table(head, tuple(rows)),
+        Table(("target", "kind", "times", "the first of them", "input", "file"), found),
         "Again, from the file: python -m tests.benchmarks fuzz --replay FILE;"
         f" from the seed: fuzz --only TARGET --seed {tally.seed} --from INPUT --inputs 1.",
     )
+    return counted, failed

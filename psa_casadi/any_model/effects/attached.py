@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from psa_casadi.component import Component, Equations, Expression, Remedy, Symbols
 from psa_casadi.model.compose import Model
-from psa_casadi.model.from_casadi.ports import Port, with_ports
+from psa_casadi.model.ports import Port, with_ports
 from psa_casadi.variables import Parameter, State
 
 #: An ordinary size of an effect over what it acts on, and the largest that a fit may reach.

@@ -1,4 +1,4 @@
-"""What may be missing in the rate of a state: friction, losses, curves, hysteresis, a constant."""
+"""Effects in the rate of a state, and the table of all effects of a model."""
 
 from collections.abc import Sequence
 
@@ -14,13 +14,13 @@ from psa_casadi.any_model.effects.attached import (
     rounded,
     scale_of,
 )
-from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of
-from psa_casadi.any_model.sizes import Sizes
+from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of, signal_effects
+from psa_casadi.any_model.predict import Sizes
 from psa_casadi.component import Expression, Symbols
-from psa_casadi.effects.bend import ANGLES
 from psa_casadi.model.compose import Model
-from psa_casadi.model.from_casadi.ports import Port, ports_of, rate_unit, state_unit
-from psa_casadi.smooth import magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.model.ports import Port, ports_of, state_unit
+from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.units import rate_unit
 from psa_casadi.variables import Parameter, State
 
 #: A rate below this share of its size has no direction.
@@ -271,3 +271,14 @@ def _is_rate(port: Port, state: str) -> bool:
 
 def _range(name: str, model: Model, sizes: Sizes, x: str) -> Parameter:
     return scale_of(f"{name}_range", sizes.states[x], state_unit(model, x), x)
+
+
+def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
+    """Return every generic effect at every port of a model that has no effects yet."""
+    found: list[Attached] = []
+    for port in ports_of(model):
+        if port.kind == "rate":
+            found += rate_effects(model, port, sizes)
+        else:
+            found += signal_effects(port, sizes)
+    return tuple(found)

@@ -46,7 +46,7 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 
 from psa_casadi.design.experiment.limits import Limits
-from psa_casadi.diagnosis.noise.colour import Colour, colour_of
+from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.levenberg_marquardt import minimise

@@ -23,12 +23,12 @@ from psa_casadi.design.experiment.criteria import (
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
 from psa_casadi.design.experiment.search import BRIEF, GRID, Best, Effort, Progress, coarse, search
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.screening.evidence import temperature
-from psa_casadi.diagnosis.search.contenders import one_of_each, same_curve_note
-from psa_casadi.diagnosis.task import FAST
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.screening import temperature
+from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.task import FAST, thresholds
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import note
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
 
@@ -347,7 +347,7 @@ def _slow(limits: Limits) -> bool:
 def _check_curves(rivals: Sequence[Rival], limits: Limits) -> None:
     curves = {c.curve for r in rivals for c in r.model.components if c.name == r.name}
     if _slow(limits) and len(rivals) > 1 and len(curves) == 1 and None not in curves:
-        raise InputError(same_curve_note([r.name for r in rivals]))
+        raise InputError(str(note("same_curve", effects=tuple(r.name for r in rivals))))
 
 
 def _pairs(found: Mapping[str, Mapping[tuple[str, str], float]]) -> tuple[Pair, ...]:

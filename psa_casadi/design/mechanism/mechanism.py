@@ -6,7 +6,7 @@ from math import inf, isfinite, sqrt
 
 import numpy as np
 
-from psa_casadi.components.prestress import (
+from psa_casadi.components.surroundings import (
     PRESTRESS_MECHANISM,
     PRESTRESS_MOUNTS,
     PRESTRESS_PORT,

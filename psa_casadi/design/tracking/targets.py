@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
-from psa_casadi.records.quality.runs import runs_of
+from psa_casadi.records.noise import runs_of
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.convert import Request
+from psa_casadi.records.read.samples import Request
 from psa_casadi.simulation.linear_part import linear_part
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import start_state

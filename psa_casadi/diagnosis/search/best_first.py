@@ -9,17 +9,16 @@ one of them is better; where much is left, from another base and with all effect
 
 import numpy as np
 
-from psa_casadi.diagnosis.base_fit.ringing import ringing
-from psa_casadi.diagnosis.base_fit.variants import (
+from psa_casadi.diagnosis.base_fit import (
     SEEN,
     from_band,
     from_resonances,
     instead_of,
     instead_of_mode,
+    ringing,
     rings,
 )
-from psa_casadi.diagnosis.noise.colour import noise_rms
-from psa_casadi.diagnosis.search.exchange import exchange
+from psa_casadi.diagnosis.colour import noise_rms
 from psa_casadi.diagnosis.search.fits import (
     afresh,
     any_afresh,
@@ -27,14 +26,17 @@ from psa_casadi.diagnosis.search.fits import (
     with_cause,
     without,
 )
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names, Searched, is_left
-from psa_casadi.diagnosis.search.modes import one_mode, with_modes
-from psa_casadi.diagnosis.search.several import fit_from_other_parents, fit_sets
-from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.task import Task
-from psa_casadi.diagnosis.thresholds import thresholds
-from psa_casadi.effects.structural_mode import STRUCTURAL_MODE
+from psa_casadi.diagnosis.search.moves import (
+    exchange,
+    fit_from_other_parents,
+    fit_sets,
+    one_mode,
+    with_modes,
+)
+from psa_casadi.diagnosis.task import Task, thresholds
+from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage

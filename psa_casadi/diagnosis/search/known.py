@@ -6,21 +6,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.screening.evidence import temperature
-from psa_casadi.diagnosis.screening.probes import Direction
-from psa_casadi.diagnosis.search.fits import begun_again, to_end
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, root_of, scale_of, tried
-from psa_casadi.diagnosis.search.quick_fits import cost_beside
-from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import (
+from psa_casadi.diagnosis.colour import excess_power, noise_rms
+from psa_casadi.diagnosis.probes import Direction
+from psa_casadi.diagnosis.screening import temperature
+from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
+from psa_casadi.diagnosis.search.hypothesis import (
+    Hypothesis,
+    Scale,
+    View,
     another_minimum,
+    examine,
     held_out_confirms,
     in_character,
+    root_of,
+    scale_of,
     shows_memory,
+    tried,
 )
-from psa_casadi.diagnosis.task import State, Task
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import State, Task, thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 

@@ -1,23 +1,43 @@
-"""The causes of the best hypothesis one by one: what each was chosen from, and how likely it is."""
+"""The causes of the best hypothesis one by one, and the rivals of each."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.noise.residual_tests import Omnibus
-from psa_casadi.diagnosis.screening.evidence import levelled, probabilities, temperature
-from psa_casadi.diagnosis.screening.screen import Screening
-from psa_casadi.diagnosis.search.fits import with_cause, without
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, root_of
+from psa_casadi.diagnosis.colour import Omnibus
+from psa_casadi.diagnosis.result import Contender
+from psa_casadi.diagnosis.screening import (
+    Screening,
+    credible_set,
+    levelled,
+    probabilities,
+    temperature,
+)
+from psa_casadi.diagnosis.search.fits import to_end, with_cause, without
+from psa_casadi.diagnosis.search.hypothesis import (
+    Hypothesis,
+    View,
+    examine,
+    hypothesis,
+    in_character,
+    root_of,
+    scale_of,
+)
 from psa_casadi.diagnosis.search.known import Searched
-from psa_casadi.diagnosis.search.view import View, examine
-from psa_casadi.diagnosis.search.worth import in_character
-from psa_casadi.diagnosis.task import Task
-from psa_casadi.diagnosis.thresholds import thresholds
+from psa_casadi.diagnosis.task import Task, same_curves, thresholds
+from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.prepare import as_read
+from psa_casadi.identification.refitting import Progress
+from psa_casadi.identification.search import fit_base
+from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment, whole
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -185,3 +205,70 @@ def _promising(
 
 def _named(h: Hypothesis, name: str) -> Component:
     return next(c for c in h.causes if c.name == name)
+
+
+def contenders(
+    step: Step, experiments: Sequence[Experiment], names: Sequence[str] = ()
+) -> tuple[Contender, ...]:
+    """Return effects of one step of the search with their fits; those not fitted are fitted now.
+
+    Without `names` they are the fewest that hold the cause with the probability `credible`. An
+    effect whose fit fails is left out.
+    """
+    names = names or credible_set(step.probability, thresholds().credible)
+    found = dict(step.fitted)
+    scale = scale_of(step.view.of, step.screening.colour, 0.0, experiments)
+    known = dict(step.evidence)
+    for name in names:
+        scores = [] if name in found else step.view.starts_of(name)
+        fitted = with_cause(step.view.of, experiments, scores) if scores else None
+        if fitted is not None:
+            found[name] = to_end(fitted, experiments)
+            known[name] = scale.gain(found[name], step.view.of)
+    return tuple(Contender(n, found[n].fit, known[n]) for n in names if n in found)
+
+
+def one_of_each(
+    found: Sequence[Contender], experiments: Sequence[Experiment]
+) -> tuple[tuple[Contender, ...], tuple[Note, ...]]:
+    """Return contenders of which a voltage may tell one from another, and what none will tell.
+
+    Of effects that bend the same curve the best fit stands for all.
+    """
+    best = sorted(found, key=lambda c: c.fit.cost)
+    own = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
+    groups = same_curves(experiments, own, best[0].fit) if best else ()
+    rest = {name for group in groups for name in group[1:]}
+    same = tuple(note("same_curve", effects=group) for group in groups)
+    return tuple(c for c in found if c.effect not in rest), same
+
+
+def fit_contenders(
+    records: Sequence[Record],
+    effects: Sequence[Component],
+    *,
+    model: Model | None = None,
+    progress: Progress = lambda _: None,
+) -> tuple[Fit, tuple[Contender, ...], tuple[Experiment, ...]]:
+    """Fit the base and each of the named effects to records in full, without a verdict.
+
+    Raises InputError where an effect cannot be fitted to them.
+    """
+    experiments = tuple(whole(as_read(r)) for r in records)
+    start = chosen_start(records, model, None)[0].without(e.name for e in effects)
+    base = fit_base(start, experiments, progress=progress)
+    plain = hypothesis((), base, experiments, final=True)
+    if plain is None:
+        raise InputError(["The fitted base cannot be simulated over the whole of these records."])
+    task = Task(experiments, tuple(effects), progress=progress)
+    seen = examine(plain, task)
+    progress("fitting the rivals")
+    step = Step(seen, evidence=seen.estimated())
+    chosen = contenders(step, experiments, [e.name for e in effects])
+    lost = {e.name for e in effects} - {c.effect for c in chosen}
+    if lost:
+        raise InputError(
+            f"{', '.join(sorted(lost))} could not be fitted to these records, so there is nothing"
+            " to tell apart; leave the records out to design from ordinary sizes."
+        )
+    return base, chosen, experiments

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.export.check.rows import BREAKDOWNS
 from psa_casadi.export.check.truth import Run, Truth
+from psa_casadi.export.common.markup import time_scale
 from psa_casadi.export.common.variable_table import starts_at_voltage
-from psa_casadi.export.fmu.model_description import time_scale
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate

@@ -1,45 +1,42 @@
 """The check of an FMU: is it valid, does it behave, does it agree with its model."""
 
 import os
-import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from psa_casadi.component import Component
-from psa_casadi.components.validity import OUTPUT as VALIDITY
+from psa_casadi.components.outputs import OUTPUT as VALIDITY
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.export.check import binaries
 from psa_casadi.export.check.agreement import truth_of
+from psa_casadi.export.check.apart import OVERTIME, rows_apart
 from psa_casadi.export.check.description import (
-    inconsistent_units,
-    invalid,
-    misplaced_binaries,
-    missing_functions,
-    missing_notices,
-    needless_symbols,
-    new_libraries,
-    oldest_systems,
-    published_as,
-    undefined_units,
-)
-from psa_casadi.export.check.evidence import Repeated, repeated, wrong_evidence
-from psa_casadi.export.check.fixed_step import StatedStep, fixed_truth, stated_step
-from psa_casadi.export.check.origin import (
+    DESCRIBED,
     not_compared,
+    published_as,
     unreproducible_parts,
     wrong_dependencies,
     wrong_start_values,
 )
-from psa_casadi.export.check.process import OVERTIME, started
-from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, CheckRow, count, stopped
-from psa_casadi.export.check.task import MEMORY, TIMEOUT, Limits, Task
-from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.check.evidence import repeated, wrong_evidence
+from psa_casadi.export.check.fixed_step import fixed_truth, stated_step
+from psa_casadi.export.check.measured import Task
+from psa_casadi.export.check.rows import (
+    LEFT_OUT,
+    LEFT_OUT3,
+    OF_BINARIES,
+    Check,
+    CheckRow,
+    plain,
+    stopped,
+)
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
-from psa_casadi.export.fmu.fixed import fixed_step_of
-from psa_casadi.export.fmu.validity import with_validity
-from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.unpack import archive_problems
+from psa_casadi.export.fmu.evidence import with_validity
+from psa_casadi.export.fmu.sources import fixed_step_of
+from psa_casadi.export.importer.archive import Archive, archive_problems
 from psa_casadi.files import why_not_read
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
@@ -49,12 +46,16 @@ from psa_casadi.strict_json import read_json_text
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
 
+#: What a whole check, and the foreign code in it, may take unless told otherwise [s], [bytes].
+TIMEOUT, MEMORY = 600.0, 4 << 30
+
 
 @dataclass(frozen=True)
 class CheckReport:
     """All checks of one FMU; `compared` says whether there was a model to compare with.
 
-    `left_out` names the checks that this kind of FMU has nothing for.
+    `left_out` names the checks that this kind of FMU has nothing for, or that need lief where that
+    is not installed.
     """
 
     path: Path
@@ -101,13 +102,20 @@ def check_fmu(
     or a bomb is not unpacked, and nothing of it runs.
 
     Its binary for this machine must load on systems like this one, with `portable` on old ones.
+    Without lief (`pip install lief`) the binaries are not inspected.
 
     Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
     checks that mean nothing there.
 
-    Raises InputError if the file is no FMU, or if evidence is asked of one with a fixed step.
+    Raises InputError if the file is no FMU, if evidence is asked of one with a fixed step, or if
+    `portable` is asked without lief.
     """
     path = Path(path)
+    if portable and not binaries.has_lief():
+        raise InputError(
+            "What a binary needs of its system is not seen without lief; run `pip install lief`,"
+            " or leave --portable out."
+        )
     rows = _archive_rows(path)
     if not all(row.passed for row in rows):
         return CheckReport(path, tuple(rows), compared=False)
@@ -120,29 +128,29 @@ def check_fmu(
                 f"{path}: this FMU takes fixed steps of {stated.step:g} s and carries no evidence;"
                 " leave --evidence and --record out, or check an FMU with the adaptive solver."
             )
-        carried = (archive.directory / MODEL_ENTRY).is_file()
-        with started(_INTEGRATOR if model or carried else ()) as process:
-            for row in _described(archive, chosen, tuple(effects), portable=portable):
-                rows.append(row)
-                if time.monotonic() > end:
-                    rows.append(stopped("time", OVERTIME.format(timeout)))
-                    return CheckReport(path, tuple(rows), compared=False)
-            truth = _truth(chosen[0], archive.version, stated) if chosen else None
-            again = Repeated((), ())
-            if evidence or records:
-                again = repeated(archive, chosen[0] if chosen else None, records)
-            rows += again.rows
-            key, limits = secrets.token_bytes(32), Limits(timeout, memory)
-            task = Task(path, archive.directory, truth, key, limits, again.playbacks)
-            rows += process.rows(task, end)
+        for check in _described(archive, chosen, tuple(effects)):
+            rows.append(check.row())
+            if time.monotonic() > end:
+                rows.append(stopped("time", OVERTIME.format(timeout)))
+                return CheckReport(path, tuple(rows), compared=False)
+        compared = chosen[0] if chosen else None
+        truth = None
+        if compared:
+            version = archive.version
+            truth = (
+                fixed_truth(compared, version, stated) if stated else truth_of(compared, version)
+            )
+        again = repeated(archive, compared, records) if evidence or records else ()
+        rows += [row for row in again if isinstance(row, CheckRow)]
+        runs = tuple(run for run in again if not isinstance(run, CheckRow))
+        task = Task(path, archive.directory, truth, timeout, memory, portable, runs)
+        rows += rows_apart(task, end)
+        left_out = LEFT_OUT + (LEFT_OUT3 if archive.version == 3 else ()) if stated else ()
+    if not binaries.has_lief():
+        left_out = (*left_out, *OF_BINARIES)
     last = "start of a run" if stated else "equations"
-    compared = any(row.name == last for row in rows)
-    left_out = LEFT_OUT + (LEFT_OUT3 if archive.version == 3 else ())
-    return CheckReport(path, tuple(rows), compared, left_out if stated else ())
-
-
-def _truth(model: Model, version: int, stated: StatedStep | None) -> Truth:
-    return fixed_truth(model, version, stated) if stated else truth_of(model, version)
+    done = any(row.name == last for row in rows)
+    return CheckReport(path, tuple(rows), done, left_out)
 
 
 def _archive_rows(path: Path) -> list[CheckRow]:
@@ -154,41 +162,39 @@ def _archive_rows(path: Path) -> list[CheckRow]:
         raise InputError(f"{path}: cannot be read ({why_not_read(error)}); name an FMU.") from error
     if head != b"PK":
         raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
-    found = archive_problems(path)
-    listed = {
-        "archive names": found.names, "archive size": found.size, "archive intact": found.damage,
-    }  # fmt: skip
-    return [count(name, _same, problems) for name, problems in listed.items()]
-
-
-def _same(problems: tuple[str, ...]) -> tuple[str, ...]:
-    return problems
+    return [
+        CheckRow(name, float(len(problems)), 0.0, not problems, plain("; ".join(problems)))
+        for name, problems in archive_problems(path).items()
+    ]
 
 
 def _described(
-    archive: Archive, chosen: list[Model], effects: tuple[Component, ...], *, portable: bool
-) -> Iterator[CheckRow]:
-    """Yield what the files say; `chosen` has the model, or gets the one inside, as exported."""
-    yield count("description valid", invalid, archive)
-    for name, check in _DESCRIBED.items():
-        yield count(name, check, archive)
-    libc = count("GNU libc", new_libraries, archive, portable=portable)
-    yield replace(libc, remark=oldest_systems(archive)) if libc.passed else libc
+    archive: Archive, chosen: list[Model], effects: tuple[Component, ...]
+) -> Iterator[Check]:
+    """Yield what the files say; `chosen` has the model, or gets the one inside, as exported.
+
+    Each check is to be made before the next one is taken.
+    """
+    for name, check in DESCRIBED.items():
+        yield Check(name, partial(check, archive))
     if not chosen and (archive.directory / MODEL_ENTRY).is_file():
-        yield count("model inside", _read_model, archive, chosen, effects)
+        yield Check("model inside", partial(_read_model, archive, chosen, effects))
     if chosen:
         chosen[:] = [as_exported(archive, chosen[0])]
-        for name, compared in _ORIGIN.items():
-            yield count(name, compared, archive, chosen[0])
-        if chosen[0].evidence is not None and fixed_step_of(archive.directory) is None:
-            yield count("evidence inside", wrong_evidence, archive, chosen[0])
-        yield _reproducible(archive, chosen[0])
+        model = chosen[0]
+        yield Check("start values", partial(wrong_start_values, archive, model))
+        yield Check("dependencies of the model", partial(wrong_dependencies, archive, model))
+        if model.evidence is not None and fixed_step_of(archive.directory) is None:
+            yield Check("evidence inside", partial(wrong_evidence, archive, model))
+        yield Check("reproducible", partial(_reproducible, archive, model))
 
 
-def _reproducible(archive: Archive, model: Model) -> CheckRow:
-    """Return the row of the export made again; one that passes says what it did not compare."""
-    row = count("reproducible", unreproducible_parts, archive, model)
-    return replace(row, remark=not_compared(archive)) if row.passed else row
+def _reproducible(archive: Archive, model: Model) -> Iterable[str] | CheckRow:
+    """Return what differs in the export made again; a row says what was not compared."""
+    problems = list(unreproducible_parts(archive, model))
+    if problems:
+        return problems
+    return CheckRow("reproducible", 0.0, 0.0, True, not_compared(archive))
 
 
 def _read_model(
@@ -232,19 +238,3 @@ def _names(component: Component) -> Iterator[str]:
     yield from (s.name for s in (*component.states, *component.sampled))
     yield from (q.name for q in component.inputs)
     yield from (y.name for y in component.outputs)
-
-
-#: What the runs of a model need, imported ahead.
-_INTEGRATOR = ("scipy.integrate",)
-_DESCRIBED: dict[str, Callable[[Archive], Iterable[str]]] = {
-    "units defined": undefined_units,
-    "units consistent": inconsistent_units,
-    "functions present": missing_functions,
-    "no other symbols": needless_symbols,
-    "binaries in their folders": misplaced_binaries,
-    "licence inside": missing_notices,
-}
-_ORIGIN: dict[str, Callable[[Archive, Model], Iterable[str]]] = {
-    "start values": wrong_start_values,
-    "dependencies of the model": wrong_dependencies,
-}

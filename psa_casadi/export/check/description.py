@@ -1,16 +1,17 @@
-"""What modelDescription.xml and the binaries say by themselves, without a call."""
+"""What modelDescription.xml says by itself, without a call."""
 
 import math
-import platform
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, replace
 from typing import Any
 
+import casadi as ca
 import fmpy
 from fmpy.model_description import ValidationError
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.publication import (
     LICENSE_ENTRY,
     SOURCES_NOTICE,
@@ -18,19 +19,21 @@ from psa_casadi.export.common.publication import (
     copyright_line,
     terms_of_code,
 )
-from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
-from psa_casadi.export.importer.archive import FUNCTIONS, Archive
-from psa_casadi.export.importer.binary_file import Binary, read_binary
-from psa_casadi.export.importer.calls import MODEL_EXCHANGE
-from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu.archive import planned_step
+from psa_casadi.export.fmu.description import Key, at_the_start, dependencies, without_sampled
+from psa_casadi.export.fmu.sources import (
+    FIXED_ENTRY,
+    FROM_CASADI,
+    exported_texts,
+    fixed_entry,
+    fixed_step_of,
+)
+from psa_casadi.export.importer.archive import Archive
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.compiler import INSTALL_ZIG
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Publication
 
-#: The GNU C library of the oldest systems that a portable binary loads on: of 2012, or the first.
-_OLDEST_LIBC: tuple[int, ...] = (2, 17)
-_FIRST_LIBC: dict[str, tuple[int, ...]] = {"riscv64-linux": (2, 27)}
 _BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 #: Names by FMI's grammar of the convention "structured" (FMI 2.0.4, 2.2.9; FMI 3.0.2, 2.4.7.5.1), a
 #: pattern whose work is linear in their length; the convention "flat" bars three characters.
@@ -108,84 +111,6 @@ def _misnamed(unit: Any, powers: dict[str, int]) -> Iterator[str]:
         yield f"the unit '{unit.name}' is not known: {error}"
 
 
-def wrong_nominals(fmu: Fmu) -> Iterator[str]:
-    """Nominal values are positive; those of the states are the same in description and binary."""
-    for name, nominal in fmu.nominals.items():
-        if not 0.0 < nominal < math.inf:
-            yield f"'{name}' has the nominal value {nominal:g}"
-    states = fmu.states()
-    with fmu.start(MODEL_EXCHANGE) as instance:
-        found = instance.vector("GetNominalsOfContinuousStates", len(states))
-    for name, nominal in zip(states, found, strict=True):
-        if nominal != fmu.nominals[name]:
-            yield f"'{name}' has another nominal value in the binary, {nominal:g}"
-
-
-def missing_functions(archive: Archive) -> Iterator[str]:
-    """Every function of the standard is in every binary, as importers look them all up."""
-    for place, binary in _binaries(archive):
-        for name in _functions(archive) - binary.exports:
-            yield f"{name} is missing in {place}"
-
-
-def needless_symbols(archive: Archive) -> Iterator[str]:
-    """Nothing but the functions of the standard is exported: two FMUs in a process stay apart."""
-    for place, binary in _binaries(archive):
-        for name in binary.exports - _functions(archive):
-            yield f"{name} is exported by {place}"
-
-
-def new_libraries(archive: Archive, *, portable: bool = False) -> Iterator[str]:
-    """No Linux binary needs a newer GNU C library than the systems have that it is for.
-
-    One for this machine's platform is for systems like this one, as its own compiler makes it. All
-    others, and every one if `portable`, are for systems from 2.17 (of 2012) on, or 2.27 on RISC-V.
-    """
-    for place, binary in _binaries(archive):
-        have = _FIRST_LIBC.get(binary.platform, _OLDEST_LIBC)
-        if not portable and binary.platform == host_platform().name:
-            have = max(have, _libc(platform.libc_ver()[1]) or have)
-        for need in _libc_needs(binary):
-            if (_libc(need) or (math.inf,)) > have:
-                yield (
-                    f"{place} needs GLIBC_{need}, which systems with GNU libc {_dotted(have)} lack;"
-                    f" for one that loads there run `{INSTALL_ZIG}` and export it again"
-                )
-
-
-def oldest_systems(archive: Archive) -> str:
-    """Return what the Linux binaries load on, "" if none needs the GNU C library."""
-    newest = {
-        place: max(filter(None, map(_libc, _libc_needs(binary))), default=())
-        for place, binary in _binaries(archive)
-    }
-    return "; ".join(
-        f"{p} loads on GNU libc {_dotted(v)} and later" for p, v in newest.items() if v
-    )
-
-
-def _libc_needs(binary: Binary) -> list[str]:
-    return sorted(n.removeprefix("GLIBC_") for n in binary.needs if n.startswith("GLIBC_"))
-
-
-def _libc(version: str) -> tuple[int, ...] | None:
-    """Return the numbers of a version of the GNU C library, None if it has others than numbers."""
-    parts = version.split(".")
-    return tuple(map(int, parts)) if all(p.isdigit() for p in parts) else None
-
-
-def _dotted(version: tuple[int, ...]) -> str:
-    return ".".join(map(str, version))
-
-
-def misplaced_binaries(archive: Archive) -> Iterator[str]:
-    """Every binary is for the platform of its folder; importers load it by the folder alone."""
-    for place, binary in _binaries(archive):
-        known = PLATFORMS.get(binary.platform)
-        if (known.binaries(archive.version) if known else binary.platform) != place:
-            yield f"{place} holds a binary for {binary.platform}, which does not load there"
-
-
 def missing_notices(archive: Archive) -> Iterator[str]:
     """An FMU with C code of this package states its licence and holds the notice of that code."""
     for name in ("license", "copyright"):
@@ -214,15 +139,131 @@ def published_as(archive: Archive, model: Model) -> Model:
     return replace(model, publication=Publication(**own))
 
 
-def _functions(archive: Archive) -> frozenset[str]:
-    return frozenset(archive.prefix + name for name in FUNCTIONS[archive.version])
+#: The checks by the names of their rows.
+DESCRIBED: dict[str, Callable[[Archive], Iterable[str]]] = {
+    "description valid": invalid,
+    "units defined": undefined_units,
+    "units consistent": inconsistent_units,
+    "licence inside": missing_notices,
+}
 
 
-def _binaries(archive: Archive) -> Iterator[tuple[str, Binary]]:
-    """Yield folder and binary, one after the other; an archive without any is an error."""
-    count = 0
-    for path in archive.binaries():
-        yield path.parent.name, read_binary(path)
-        count += 1
-    if not count:
-        raise InputError("The FMU has no binary; export it with --platforms host or all.")
+_XML = "modelDescription.xml"
+_CASADI = re.compile(r"generated by CasADi (\d[\w.+-]*?)\.?\n")
+
+
+def wrong_start_values(archive: Archive, model: Model) -> Iterator[str]:
+    """The start values of parameters are the model's values; those of states and inputs too."""
+    starts = {v.name: v.start for v in archive.description.modelVariables}
+    for variable in variable_table(model):
+        name, value = variable.name, variable.start
+        if variable.kind == "parameter" and name not in starts:
+            yield f"the parameter '{name}' of the model is not in the FMU"
+        elif value is not None and (starts.get(name) is None or float(starts[name]) != value):
+            yield f"'{name}' starts at {starts.get(name)}, the model has {value!r}"
+
+
+def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
+    """The dependencies are the sparsity of the model's Jacobian: none missing, none superfluous."""
+    names = {(v.kind, v.index): v.name for v in variable_table(model)}
+
+    def named(found: dict[Key, dict[Key, str]]) -> dict[str, dict[str, str]]:
+        return {
+            names[unknown]: {names[k]: kind for k, kind in known.items()}
+            for unknown, known in found.items()
+        }
+
+    found = dependencies(model.structure)
+    truth = named({unknown: without_sampled(known) for unknown, known in found.items()})
+    initial = named(at_the_start(model))
+    if fixed_step_of(archive.directory) is not None:  # there parameters are constants
+        for claims in (*truth.values(), *initial.values()):
+            for parameter in model.parameter_names:
+                claims.pop(parameter, None)
+    yield from _listed(archive, names)
+    described = archive.description
+    indicators = described.eventIndicators if archive.version == 3 else []
+    for entry in (*described.outputs, *described.derivatives, *indicators):
+        yield from _differences(entry, truth.get(entry.variable.name, {}), kinds=True)
+    for entry in described.initialUnknowns:
+        yield from _differences(entry, initial.get(entry.variable.name, {}), kinds=False)
+
+
+def _listed(archive: Archive, names: dict[Key, str]) -> Iterator[str]:
+    """The lists of outputs and derivatives name those of the model, in its order."""
+    described = archive.description
+    for kind, entries in (("output", described.outputs), ("derivative", described.derivatives)):
+        expected = [name for (found, _), name in names.items() if found == kind]
+        if [e.variable.name for e in entries] != expected:
+            yield f"the list of {kind}s is not the model's: {', '.join(expected)}"
+
+
+def _differences(entry: Any, truth: dict[str, str], *, kinds: bool) -> Iterator[str]:
+    unknown = entry.variable.name
+    claimed = [v.name for v in entry.dependencies or []]
+    for known in sorted(truth.keys() - set(claimed)):
+        yield f"'{unknown}' depends on '{known}', which its dependencies do not list"
+    for known in sorted(set(claimed) - truth.keys()):
+        yield f"'{unknown}' does not depend on '{known}', which its dependencies list"
+    if kinds:
+        for known, kind in zip(claimed, entry.dependenciesKind or [], strict=False):
+            if kind != truth.get(known, kind):
+                yield f"'{unknown}' depends on '{known}' in the way '{truth[known]}', not '{kind}'"
+
+
+def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
+    """Exported again, the model gives the same description, token and sources, byte for byte.
+
+    Another version of CasADi writes other C for the same equations: what it wrote stands then as it
+    is, and its token says whether it was changed since.
+    """
+    tool = str(archive.description.generationTool)
+    if tool != generation_tool():
+        yield f"it was exported by {tool}, this is {generation_tool()}; export it again to compare"
+        return
+    found = {p.relative_to(archive.directory).as_posix(): p for p in archive.directory.rglob("*")}
+    untouched = _as_found(archive) if other_casadi(archive) else {}
+    step = fixed_step_of(archive.directory)
+    fixed = planned_step(model, archive.identifier, archive.version, step) if step else None
+    token, texts, xml = exported_texts(
+        model, archive.identifier, archive.version, fixed, given=untouched
+    )
+    if token != archive.token:
+        yield f"the token is {archive.token}, not {token}"
+    expected = {f"sources/{name}": text for name, text in texts.items()}
+    expected[_XML] = xml
+    if fixed:
+        expected[FIXED_ENTRY] = fixed_entry(fixed).decode("utf-8")
+    for name, text in sorted(expected.items()):
+        if name not in found:
+            yield f"{name} is missing"
+        elif found[name].read_bytes() != text.encode("utf-8"):
+            yield f"{name} differs"
+    more = {n for n, p in found.items() if n.startswith("sources/") and p.is_file()} - set(expected)
+    for name in sorted(more):
+        yield f"{name} is not among the sources of the model"
+
+
+def other_casadi(archive: Archive) -> str:
+    """Return the version of CasADi that an FMU was made with; empty if it is the one in use."""
+    source = archive.directory / "sources" / "model.c"
+    try:
+        said = _CASADI.search(source.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError):
+        return ""
+    return said[1] if said and said[1] != ca.CasadiMeta.version() else ""
+
+
+def not_compared(archive: Archive) -> str:
+    """Return what `unreproducible_parts` takes as it is; empty if it compares all."""
+    other = other_casadi(archive)
+    this = ca.CasadiMeta.version()
+    return other and (
+        f"its C is CasADi {other}'s, unchanged since; this is CasADi {this}: 'equations' compares"
+    )
+
+
+def _as_found(archive: Archive) -> dict[str, str]:
+    """Return the texts that CasADi wrote, as they are in the archive; a missing one is left out."""
+    places = {name: archive.directory / "sources" / name for name in FROM_CASADI}
+    return {n: p.read_bytes().decode("utf-8") for n, p in places.items() if p.is_file()}

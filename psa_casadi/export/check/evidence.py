@@ -1,16 +1,16 @@
 """What an FMU carries as evidence: whether it is the model's, and what it takes to repeat it."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.check.playback import ERROR_LIMIT, Playback
-from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow, count, stopped
-from psa_casadi.export.common.posterior import MOST_SAMPLES
-from psa_casadi.export.fmu.evidence_files import (
+from psa_casadi.export.check.measured import ERROR_LIMIT, Playback
+from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, stopped
+from psa_casadi.export.common.parameter_sets import MOST_SAMPLES
+from psa_casadi.export.fmu.evidence import (
     OUTPUTS,
     SETS,
     VALIDATION,
@@ -34,14 +34,6 @@ _NONE = (
 )
 
 
-@dataclass(frozen=True)
-class Repeated:
-    """Rows that need no run, and the runs to play."""
-
-    rows: tuple[CheckRow, ...]
-    playbacks: tuple[Playback, ...]
-
-
 def wrong_evidence(archive: Archive, model: Model) -> Iterator[str]:
     """The files of evidence are what the model's evidence makes them."""
     folder = archive.directory
@@ -58,26 +50,25 @@ def wrong_evidence(archive: Archive, model: Model) -> Iterator[str]:
     yield from (f"{name} is not among the model's" for name in sorted(found - set(expected)))
 
 
-def repeated(archive: Archive, model: Model | None, records: Sequence[Record]) -> Repeated:
-    """Return what `psa check --evidence` tells, with records that stand behind the model."""
+def repeated(
+    archive: Archive, model: Model | None, records: Sequence[Record]
+) -> tuple[CheckRow | Playback, ...]:
+    """Return what `psa check --evidence` tells: rows that need no run, and runs to play."""
     evidence = model.evidence if model else None
     if model is None or evidence is None:
-        return Repeated((count("evidence", lambda: (_NONE,)),), ())
-    rows = [count("records as stated", _strange, evidence, records)] if records else []
-    playbacks = []
+        return (Check("evidence", lambda: (_NONE,)).row(),)
+    found: list[CheckRow | Playback] = []
+    if records:
+        found.append(Check("records as stated", partial(_strange, evidence, records)).row())
     try:
         if evidence.reference is not None:
-            playbacks.append(_reference(archive, model))
+            found.append(_reference(archive, model))
     except BREAKDOWNS as error:
-        rows.append(stopped("reference run", f"the check stopped: {error}"))
+        found.append(stopped("reference run", f"the check stopped: {error}"))
     for record in records:
-        for run in (r for r in evidence.runs if r.sha256 == record.sha256):
-            found = _of_record(archive, model, record, run)
-            if isinstance(found, Playback):
-                playbacks.append(found)
-            else:
-                rows.append(found)
-    return Repeated(tuple(rows), tuple(playbacks))
+        runs = (r for r in evidence.runs if r.sha256 == record.sha256)
+        found += [_of_record(archive, model, record, run) for run in runs]
+    return tuple(found)
 
 
 def _strange(evidence: Evidence, records: Sequence[Record]) -> Iterator[str]:

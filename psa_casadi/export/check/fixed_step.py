@@ -13,7 +13,7 @@ from psa_casadi.export.check.agreement import bare_truth, expected_outputs, has_
 from psa_casadi.export.check.rows import BREAKDOWNS
 from psa_casadi.export.check.truth import Run, Truth
 from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, played_inputs, shown_output
-from psa_casadi.export.fmu.fixed import FIXED_ENTRY, fixed_step_of
+from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.strict_json import parse_json, read_json_text

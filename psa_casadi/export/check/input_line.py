@@ -3,9 +3,8 @@
 import numpy as np
 
 from psa_casadi.export.common.variable_table import INPUT_LINE
-from psa_casadi.export.fmu.fixed import fixed_step_of
-from psa_casadi.export.importer.calls import CO_SIMULATION
-from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.fmu.sources import fixed_step_of
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.units import FloatArray
 
 #: Parts of a step in which its line is followed by values that are held.

@@ -1,138 +1,229 @@
-"""The checks that run the foreign code of an FMU, in turn; their process may end in any of them."""
+"""The checks that touch the binaries of an FMU, in turn; their process may end in any of them."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+import secrets
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.binaries import binary_checks
 from psa_casadi.export.check.calls import CALLS
-from psa_casadi.export.check.comparison import compare
-from psa_casadi.export.check.description import wrong_nominals
-from psa_casadi.export.check.events import (
-    event_indicators,
-    event_mode,
-    intermediate_update,
-    wrong_indicators,
-)
+from psa_casadi.export.check.events import event_indicators, wrong_indicators
 from psa_casadi.export.check.input_line import input_line_error
-from psa_casadi.export.check.playback import played_again
-from psa_casadi.export.check.rows import (
-    BREAKDOWNS,
-    LEFT_OUT,
-    LEFT_OUT3,
-    CheckRow,
-    count,
-    figure,
-    stopped,
-)
+from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, Check, CheckRow, stopped
 from psa_casadi.export.check.structure import (
     adjoint_error,
     directional_error,
     equation_error,
     incomplete_dependencies,
     settled_start_error,
+    wrong_nominals,
     wrong_start,
 )
-from psa_casadi.export.check.task import Task
-from psa_casadi.export.check.truth import Truth
+from psa_casadi.export.check.truth import Run, Truth
 from psa_casadi.export.common.variable_table import INPUT_LINE
-from psa_casadi.export.fmu.fixed import fixed_step_of
-from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
+from psa_casadi.export.fmu.sources import fixed_step_of
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
+
+FloatArray = npt.NDArray[np.float64]
+
+#: How far a repeated run may be off, as a share of its range, by the version of FMI: in FMI 3.0
+#: inputs cannot move within a step, see `_played`.
+RUN_LIMITS = {2: 1e-5, 3: 5e-4}
+#: How far a repeated error may be off, as a share of what is stated.
+ERROR_LIMIT = 0.02
+_TOLERANCE = 1e-9
+#: What a held input may move in a step, over its range, in at most so many steps between samples.
+_STEP, _MOST_STEPS = 1e-3, 1000
+
+
+@dataclass(frozen=True)
+class Playback:
+    """Inputs (n, nu) at times (n,) [s], start values, and what an output must be then (n,).
+
+    With `stated`, the rms over finite samples of what is expected must be that [m]; else the
+    output itself must be equal.
+    """
+
+    name: str
+    times: FloatArray
+    inputs: Signals
+    start: Mapping[str, float]
+    output: str
+    expected: FloatArray
+    stated: float | None = None
+
+
+def played_again(fmu: Fmu, playback: Playback) -> CheckRow:
+    """Return the row of a run that is repeated."""
+    found = _played(fmu, playback)
+    valid = np.isfinite(playback.expected)
+    error = found[valid] - playback.expected[valid]
+    if playback.stated is None:
+        size = float(np.ptp(playback.expected[valid])) or 1.0
+        largest = float(np.max(np.abs(error))) / size
+        remark = f"largest difference of {playback.output} over its range"
+        limit = RUN_LIMITS[fmu.version]
+        return CheckRow(playback.name, largest, limit, largest <= limit, remark)
+    rms = float(np.sqrt(np.mean(error**2)))
+    off = abs(rms / playback.stated - 1.0) if playback.stated > 0.0 else float("inf")
+    remark = f"{1e6 * rms:.4g} um rms, stated {1e6 * playback.stated:.4g} um"
+    return CheckRow(playback.name, off, ERROR_LIMIT, off <= ERROR_LIMIT, remark)
+
+
+def _played(fmu: Fmu, p: Playback) -> FloatArray:
+    """Return the output (n,), inputs linear between the times.
+
+    Co-simulation of FMI 3.0 has no such inputs. There they are held at the mean over a step, which
+    leaves the end of the step late by half of it; from steps and half steps follows what none is.
+    """
+    if fmu.version == 2:
+        return _stepped(fmu, p, p.inputs)
+    whole, halves = (_stepped(fmu, p, _held_means(p.inputs, parts)) for parts in (1, 2))
+    return 2.0 * halves - whole
+
+
+def _stepped(fmu: Fmu, p: Playback, inputs: Signals) -> FloatArray:
+    """Return the output at the times of a playback, stepped from knot to knot of inputs."""
+    found = co_simulate(
+        fmu, inputs.times, inputs, [p.output], tolerance=_TOLERANCE, values=dict(p.start)
+    )
+    return np.asarray(found[np.isin(inputs.times, p.times), 0])
+
+
+def _held_means(inputs: Signals, parts: int) -> Signals:
+    """Return inputs that are held at the mean of both ends of a step, many where they move much.
+
+    Every step is cut into so many parts.
+    """
+    size = np.maximum(np.ptp(inputs.values, axis=0), 1e-300)
+    moved = np.max(np.abs(np.diff(inputs.values, axis=0)) / size, axis=1)
+    counts = parts * np.clip(np.ceil(moved / _STEP), 1, _MOST_STEPS).astype(int)
+    steps = [
+        np.linspace(a, b, m, endpoint=False)
+        for a, b, m in zip(inputs.times, inputs.times[1:], counts, strict=False)
+    ]
+    fine = inputs.on(np.concatenate([*steps, inputs.times[-1:]]))
+    ends = np.vstack([fine.values[1:], fine.values[-1:]])
+    return Signals(fine.names, fine.times, 0.5 * (fine.values + ends), held=True)
+
 
 _EQUATION_LIMIT = 1e-9
 _LINE_LIMIT = 0.05
 #: Both starts come of runs at tolerances of 1e-6 and less.
 _START_LIMIT = 1e-5
 
-#: The name of a check that begins now, or the row of the one that began last.
-Progress = Iterator[str | CheckRow]
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be checked: an FMU by its path (for messages) and its unpacked folder.
+
+    `truth` is what to compare with, `playbacks` are runs to repeat. All checks may take `timeout`
+    [s], the foreign code `memory` [bytes] beside Python's own; that is limited on Linux only.
+    `key` marks what its process tells.
+    """
+
+    path: Path
+    unpacked: Path
+    truth: Truth | None
+    timeout: float
+    memory: int
+    portable: bool = False
+    playbacks: tuple[Playback, ...] = ()
+    key: str = field(default_factory=lambda: secrets.token_hex(16))
 
 
-def measured(task: Task) -> Progress:
-    """Yield names and rows of the checks of an FMU that was unpacked.
+def checks_of(task: Task) -> Iterator[Check]:
+    """Yield the checks of an FMU that was unpacked, each to be made before the next one is taken.
 
     Without a model there is no truth, and nothing is compared with it.
     """
+    with Archive(task.path, task.unpacked) as archive:
+        yield from binary_checks(archive, portable=task.portable)
     loaded: list[Fmu] = []
-    yield "binary loads"
-    yield count("binary loads", _load, task.path, task.unpacked, loaded)
+    yield Check("binary loads", partial(_load, task, loaded))
     for fmu in loaded:
-        with fmu:
-            yield from _of_instances(fmu, task)
+        fixed = fixed_step_of(fmu.directory) is not None
+        left_out = (*LEFT_OUT, *LEFT_OUT3) if fixed else ()
+        for check in _of_fmu(fmu, task, loaded):
+            if check.name not in left_out:
+                yield check
 
 
-def _of_instances(fmu: Fmu, task: Task) -> Progress:
-    fixed = fixed_step_of(fmu.directory) is not None
-    left_out = (*LEFT_OUT, *LEFT_OUT3) if fixed else ()
-    made: list[CheckRow] = []
+def _of_fmu(fmu: Fmu, task: Task, loaded: list[Fmu]) -> Iterator[Check]:
+    """Yield the checks of a loaded FMU; they end where it gives no instance."""
     for name, kind in _INTERFACES.items():
-        if name not in left_out:
-            yield name
-            made.append(count(name, _instantiates, fmu, kind))
-            yield made[-1]
-    if not all(row.passed for row in made):
+        yield Check(name, partial(_instantiates, fmu, kind, loaded))
+    if not loaded:
         return
-    yield from _of_calls(fmu, left_out)
-    if task.truth:
-        yield from _of_model(fmu, task.truth, left_out)
-    for playback in task.playbacks:
-        yield playback.name
-        try:
-            yield played_again(fmu, playback)
-        except BREAKDOWNS as error:
-            yield stopped(playback.name, f"the run stopped: {error}")
-
-
-def _of_calls(fmu: Fmu, left_out: Collection[str]) -> Progress:
-    third = fmu.version == 3
-    calls = _CALLS | (_CALLS3 if third else {})
-    figures = _FIGURES | (_FIGURES3 if third else {})
+    for name, listed in _CALLS.items():
+        yield Check(name, partial(listed, fmu))
+    yield Check("directional derivatives", partial(directional_error, fmu), 1e-5)
+    if fmu.version == 3:
+        yield Check("adjoint derivatives", partial(adjoint_error, fmu), 1e-10)
     if INPUT_LINE.name in fmu.references:
-        figures["line of the input"] = (_LINE_LIMIT, input_line_error)
-    for name in (*calls, *figures):
-        if name in left_out:
-            continue
-        yield name
-        yield (
-            count(name, calls[name], fmu) if name in calls else figure(name, *figures[name], fmu)
-        )
+        yield Check("line of the input", partial(input_line_error, fmu), _LINE_LIMIT)
+    if task.truth:
+        yield from _of_model(fmu, task.truth)
+    for playback in task.playbacks:
+        yield Check(playback.name, partial(played_again, fmu, playback))
 
 
-def _of_model(fmu: Fmu, truth: Truth, left_out: Collection[str]) -> Progress:
-    yield "start of a run"
-    yield count("start of a run", wrong_start, fmu, truth)
+def _of_model(fmu: Fmu, truth: Truth) -> Iterator[Check]:
+    yield Check("start of a run", partial(wrong_start, fmu, truth))
     if truth.settled_starts:
-        yield "settled start"
-        yield figure("settled start", _START_LIMIT, settled_start_error, fmu, truth)
-    if "equations" not in left_out:
-        yield "event indicators of the model"
-        yield count("event indicators of the model", wrong_indicators, fmu, truth)
-        yield "equations"
-        yield figure("equations", _EQUATION_LIMIT, equation_error, fmu, truth)
-    try:
-        for run in truth.runs:
-            yield run.name
-            yield compare(fmu, truth, run)
-        problem = truth.problem
-    except BREAKDOWNS as error:
-        problem = str(error)
-    if problem:
-        yield stopped("trajectories", f"the comparison stopped: {problem}")
+        yield Check("settled start", partial(settled_start_error, fmu, truth), _START_LIMIT)
+    yield Check("event indicators of the model", partial(wrong_indicators, fmu, truth))
+    yield Check("equations", partial(equation_error, fmu, truth), _EQUATION_LIMIT)
+    for run in truth.runs:
+        yield Check(run.name, partial(_compared, fmu, truth, run), run.limit)
+    if truth.problem:
+        remark = f"the comparison stopped: {truth.problem}"
+        yield Check("trajectories", partial(stopped, "trajectories", remark))
 
 
-def _load(path: Path, unpacked: Path, loaded: list[Fmu]) -> Iterator[str]:
+def _compared(fmu: Fmu, truth: Truth, run: Run) -> CheckRow:
+    """Return the row of a run: the largest difference over the scale, and which output has it."""
+    names = truth.compared
+    if run.integrated:
+        found = integrate(fmu, run.times, run.inputs, names, tolerance=run.tolerance or run.limit)
+    else:
+        found = co_simulate(
+            fmu, run.times, run.inputs, names, tolerance=run.tolerance, settled=truth.settled
+        )
+    scale = truth.scale if run.scale is None else run.scale
+    error = np.max(np.abs(found - run.expected), axis=0) / scale
+    worst = int(np.argmax(error))
+    largest = float(error[worst])
+    remark = f"largest in {names[worst]}, against the {run.by or truth.by}"
+    return CheckRow(run.name, largest, run.limit, largest <= run.limit, remark)
+
+
+def _load(task: Task, loaded: list[Fmu]) -> Iterator[str]:
     """Append the FMU with its binary; what prevents that is the problem."""
     try:
-        loaded.append(Fmu(path, unpacked))
+        fmu = Fmu(task.path, task.unpacked)
+        for interface in fmu.interfaces():
+            fmu.loaded(interface)
     except InputError as error:
         yield str(error)
-
-
-def _instantiates(fmu: Fmu, interface: int) -> Iterator[str]:
-    instance = fmu.instantiate(interface)
-    if instance is None:
-        yield "there is no instance: description and binary are not of the same export"
     else:
-        instance.free()
+        loaded.append(fmu)
+
+
+def _instantiates(fmu: Fmu, interface: int, loaded: list[Fmu]) -> Iterator[str]:
+    """Make an instance; an FMU that gives none is not among the loaded ones any more."""
+    try:
+        fmu.open(interface).free()
+    except FmuError:
+        loaded.clear()
+        yield "there is no instance: description and binary are not of the same export"
 
 
 _INTERFACES = {
@@ -144,14 +235,4 @@ _CALLS: dict[str, Callable[[Fmu], Iterable[str]]] = {
     "nominal values": wrong_nominals,
     "event indicators": event_indicators,
     "dependencies complete": incomplete_dependencies,
-}
-_CALLS3: dict[str, Callable[[Fmu], Iterable[str]]] = {
-    "intermediate update": intermediate_update,
-    "event mode": event_mode,
-}
-_FIGURES: dict[str, tuple[float, Callable[[Fmu], float]]] = {
-    "directional derivatives": (1e-5, directional_error),
-}
-_FIGURES3: dict[str, tuple[float, Callable[[Fmu], float]]] = {
-    "adjoint derivatives": (1e-10, adjoint_error),
 }

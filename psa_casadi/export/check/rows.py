@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import ParamSpec
 
 from psa_casadi.errors import PsaError
 
@@ -12,17 +11,17 @@ BREAKDOWNS = (
     ValueError,
 )  # fmt: skip
 #: The checks that an FMU with a fixed step has nothing for: no model exchange, whose equations,
-#: indicators and derivatives they need; no parameter to change; no update within a step, no
-#: tolerance; no evidence. Those of FMI 3.0 only come second.
+#: indicators and derivatives they need; no parameter to change; no tolerance; no evidence. Those of
+#: FMI 3.0 only come second.
 LEFT_OUT = (
     "model exchange instantiates", "parameter changes", "nominal values", "event indicators",
     "dependencies complete", "directional derivatives", "event indicators of the model",
     "equations", "model exchange", "co-simulation, default tolerance", "evidence inside",
 )  # fmt: skip
-LEFT_OUT3 = ("intermediate update", "adjoint derivatives")
+LEFT_OUT3 = ("adjoint derivatives",)
+#: The checks that need lief.
+OF_BINARIES = ("functions present", "no other symbols", "binaries in their folders", "GNU libc")
 _LONGEST = 4000
-
-P = ParamSpec("P")
 
 
 @dataclass(frozen=True)
@@ -36,27 +35,35 @@ class CheckRow:
     remark: str
 
 
-def count(
-    name: str, check: Callable[P, Iterable[str]], *args: P.args, **options: P.kwargs
-) -> CheckRow:
-    """Return the row of a check that lists problems; none may be found."""
-    problems: list[str] = []
-    try:
-        problems.extend(check(*args, **options))
-    except BREAKDOWNS as error:
-        problems.append(f"the check stopped: {error}")
-    return CheckRow(name, float(len(problems)), 0.0, not problems, plain("; ".join(problems)))
+@dataclass(frozen=True)
+class Check:
+    """A check that is still to be made: it lists problems, measures a figure, or gives its row.
 
+    No problem may be listed; a figure is at most `limit`, and NaN does not pass.
+    """
 
-def figure(
-    name: str, limit: float, check: Callable[P, float], *args: P.args, **options: P.kwargs
-) -> CheckRow:
-    """Return the row of a check that measures a figure; NaN does not pass."""
-    try:
-        found, remark = check(*args, **options), ""
-    except BREAKDOWNS as error:
-        found, remark = float("nan"), f"the check stopped: {error}"
-    return CheckRow(name, found, limit, found <= limit, plain(remark))
+    name: str
+    run: Callable[[], Iterable[str] | float | CheckRow]
+    limit: float = 0.0
+
+    def row(self) -> CheckRow:
+        """Make the check and return its row."""
+        problems: list[str] = []
+        figure = 0.0
+        try:
+            found = self.run()
+            if isinstance(found, CheckRow):
+                return found
+            if isinstance(found, float):
+                figure = found
+            else:
+                problems.extend(found)
+                figure = float(len(problems))
+        except BREAKDOWNS as error:
+            problems.append(f"the check stopped: {error}")
+            figure = float("nan")
+        passed = not problems and figure <= self.limit
+        return CheckRow(self.name, figure, self.limit, passed, plain("; ".join(problems)))
 
 
 def stopped(name: str, remark: str) -> CheckRow:

@@ -1,5 +1,6 @@
 """What modelDescription.xml claims about an FMU, measured on its binary."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -7,9 +8,7 @@ import numpy.typing as npt
 
 from psa_casadi.export.check.truth import Truth
 from psa_casadi.export.common.variable_table import START_VOLTAGE
-from psa_casadi.export.importer.calls import CO_SIMULATION, MODEL_EXCHANGE, Instance
-from psa_casadi.export.importer.fmu import Fmu
-from psa_casadi.export.importer.instance3 import Instance3
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
 
 FloatArray = npt.NDArray[np.float64]
 _POINTS = 3
@@ -58,6 +57,19 @@ def held_values(instance: Instance) -> list[FloatArray]:
 def sampled_starts(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
     """Return values of the sampled states to start from, within their nominals."""
     return {n: float(fmu.nominals[n] * generator.uniform(-1.0, 1.0)) for n in fmu.sampled()}
+
+
+def wrong_nominals(fmu: Fmu) -> Iterator[str]:
+    """Nominal values are positive; those of the states are the same in description and binary."""
+    for name, nominal in fmu.nominals.items():
+        if not 0.0 < nominal < math.inf:
+            yield f"'{name}' has the nominal value {nominal:g}"
+    states = fmu.states()
+    with fmu.start(MODEL_EXCHANGE) as instance:
+        found = instance.vector("GetNominalsOfContinuousStates", len(states))
+    for name, nominal in zip(states, found, strict=True):
+        if nominal != fmu.nominals[name]:
+            yield f"'{name}' has another nominal value in the binary, {nominal:g}"
 
 
 def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
@@ -128,10 +140,10 @@ def adjoint_error(fmu: Fmu) -> float:
     point = random_point(fmu, generator)
     knowns = [k for k in point if k != "time"]
     size = np.array([fmu.nominals[k] for k in knowns])
-    with fmu.start3(MODEL_EXCHANGE) as instance:
+    with fmu.start(MODEL_EXCHANGE) as instance:
         here = evaluate(instance, point, unknowns)
         worst = transposed_error(instance, unknowns, knowns, size, here)
-    with fmu.start3(CO_SIMULATION) as instance:
+    with fmu.start(CO_SIMULATION) as instance:
         instance.set({n: point[n] for n in fmu.names("input")})
         instance.step(0.0, fmu.step_size)
         through = [] if fmu.sampled() else fmu.states()
@@ -142,7 +154,7 @@ def adjoint_error(fmu: Fmu) -> float:
 
 
 def transposed_error(
-    instance: Instance3, unknowns: list[str], knowns: list[str], size: FloatArray, here: FloatArray
+    instance: Instance, unknowns: list[str], knowns: list[str], size: FloatArray, here: FloatArray
 ) -> float:
     """Return the largest difference of the matrix by rows from the one by columns.
 

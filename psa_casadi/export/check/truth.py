@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from psa_casadi.export.importer.calls import FloatArray
-from psa_casadi.export.importer.masters import Signals
+from psa_casadi.export.importer.masters import FloatArray, Signals
 
 
 @dataclass(frozen=True)

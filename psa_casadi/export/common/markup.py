@@ -1,7 +1,7 @@
-"""What the descriptions of FMI 2.0 and FMI 3.0 have in common, from the variable table."""
+"""What the descriptions of FMI 2.0 and FMI 3.0 have in common, and pages of HTML."""
 
-import math
-from collections.abc import Iterable
+import html
+from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from xml.etree import ElementTree as ET
 
@@ -9,32 +9,8 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.characters import check_text
-from psa_casadi.export.common.variable_table import Variable
 from psa_casadi.model.compose import Model
-from psa_casadi.units import Unit, parse_unit
-
-#: Log categories; the last one is shown only when debug logging is on.
-LOG_CATEGORIES = {
-    "logStatusWarning": "calls that succeeded, but look wrong",
-    "logStatusDiscard": "steps and evaluations that failed and may be retried",
-    "logStatusError": "calls that are not allowed or impossible",
-    "logSolver": "cost of each communication step",
-}
-
-_CONTINUOUS = {"variability": "continuous"}
-
-#: Causality, variability and initial of each kind of variable; the same words in both versions.
-CAUSALITY = {
-    "time": {"causality": "independent", **_CONTINUOUS},
-    "state": {"causality": "local", **_CONTINUOUS, "initial": "exact"},
-    "derivative": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
-    "input": {"causality": "input", **_CONTINUOUS},
-    "output": {"causality": "output", **_CONTINUOUS, "initial": "calculated"},
-    "parameter": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
-    "option": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
-    "indicator": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
-    "sampled": {"causality": "local", "variability": "discrete", "initial": "exact"},
-}
+from psa_casadi.units import Unit
 
 _FORCE_SCALE = {
     "assumed": "The force scale is assumed: only quantities scaled to displacement are identified;"
@@ -107,43 +83,12 @@ def xml_text(root: ET.Element) -> str:
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'
 
 
-def log_categories(root: ET.Element) -> None:
-    """Append the LogCategories."""
-    categories = ET.SubElement(root, "LogCategories")
-    for name, meaning in LOG_CATEGORIES.items():
-        ET.SubElement(categories, "Category", {"name": name, "description": meaning})
-
-
 def default_span(model: Model) -> float:
     """Return how long the default experiment takes [s].
 
     Two digits are given, as the last ones of an eigenvalue differ from machine to machine.
     """
     return float(f"{40.0 * time_scale(model):.2g}")
-
-
-def default_experiment(root: ET.Element, model: Model) -> None:
-    """Append the DefaultExperiment: 40 times what the model needs to settle, in 1000 steps."""
-    span = default_span(model)
-    experiment = {"startTime": "0", "stopTime": number(span), "tolerance": "1e-05"}
-    ET.SubElement(root, "DefaultExperiment", {**experiment, "stepSize": number(span / 1000.0)})
-
-
-def unit_definitions(root: ET.Element, table: Iterable[Variable]) -> None:
-    """Append the UnitDefinitions: each unit in use and each display unit, sorted."""
-    displays: dict[str, set[str]] = {}
-    for variable in table:
-        if variable.unit:
-            shown = displays.setdefault(variable.unit, set())
-            shown |= {variable.display_unit} if variable.display_unit else set()
-    definitions = ET.SubElement(root, "UnitDefinitions")
-    for name in sorted(displays):
-        unit = parse_unit(name)
-        element = ET.SubElement(definitions, "Unit", {"name": name})
-        if all(isinstance(power, int) for power in unit.exponents):  # FMI has no m2.5
-            ET.SubElement(element, "BaseUnit", base_unit(unit))
-        for shown_name in sorted(displays[name]):
-            ET.SubElement(element, "DisplayUnit", _display(unit, shown_name))
 
 
 def base_unit(unit: Unit) -> dict[str, str]:
@@ -156,42 +101,38 @@ def base_unit(unit: Unit) -> dict[str, str]:
     return base
 
 
-def _display(unit: Unit, name: str) -> dict[str, str]:
-    """Return the DisplayUnit: value shown = factor * value + offset."""
-    shown = parse_unit(name)
-    ratio = unit.ratio / shown.ratio
-    attributes = {"name": name, "factor": number(float(ratio))}
-    if unit.offset != shown.offset:
-        attributes["offset"] = number((unit.offset - shown.offset) / shown.factor)
-    return attributes
+_STYLE = """\
+:root { color-scheme: light dark; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+h1 svg { width: 3rem; height: 3rem; vertical-align: middle; margin-right: .6rem; }
+table { border-collapse: collapse; display: block; overflow-x: auto; }
+th, td { text-align: left; vertical-align: top; padding: .25rem .8rem .25rem 0; }
+tr { border-bottom: 1px solid #8884; }
+td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+code { font-size: .95em; }
+p.note { border-left: .25rem solid #e69f00; padding-left: .8rem; }
+"""
 
 
-def type_name(unit: str) -> str | None:
-    """Return the name of the type that variables of a unit have; None for a compound unit."""
-    quantity = parse_unit(unit).quantity if unit else ""
-    return quantity.title().replace(" ", "") if quantity else None
+def page(title: str, parts: Iterable[str], what: str) -> str:
+    """Return a page of parts that are HTML already; empty ones are left out.
+
+    Raises InputError for a character that HTML cannot carry; `what` names the page then.
+    """
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>\n{_STYLE}</style>'
+    body = "\n".join(p for p in parts if p)
+    check_text(body, what)
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
 
 
-def types_in_use(table: Iterable[Variable]) -> dict[str, str]:
-    """Return the unit of each type that variables have, by the type's name, sorted."""
-    units = sorted({v.unit for v in table})
-    return dict(sorted((name, unit) for unit in units if (name := type_name(unit))))
-
-
-def value_attributes(variable: Variable) -> dict[str, str]:
-    """Return the attributes of a Real (FMI 2) or Float64 (FMI 3) that speak of its value."""
-    attributes = {}
-    if variable.unit:
-        attributes["unit"] = variable.unit
-    if declared := type_name(variable.unit):
-        attributes["declaredType"] = declared
-    if variable.display_unit:
-        attributes["displayUnit"] = variable.display_unit
-    for name, bound in zip(("min", "max"), variable.bounds or (), strict=False):
-        if math.isfinite(bound):
-            attributes[name] = number(bound)
-    if variable.nominal is not None:
-        attributes["nominal"] = number(abs(variable.nominal))
-    if variable.start is not None:
-        attributes["start"] = number(variable.start)
-    return attributes
+def table_of(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()
+) -> str:
+    """Return a table of texts, escaped; columns of `numbers` are aligned to the right."""
+    top = "".join(f"<th>{html.escape(h)}</th>" for h in heads)
+    lines = [f"<tr>{top}</tr>"]
+    for row in rows:
+        openings = ['<td class="number">' if i in numbers else "<td>" for i in range(len(row))]
+        cells = [f"{o}{html.escape(c)}</td>" for o, c in zip(openings, row, strict=True)]
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return "<table>\n" + "\n".join(lines) + "\n</table>"

@@ -1,10 +1,22 @@
-"""The parameters of a model as a parameter set that system tools read (SSV).
+"""The parameters of a model as sets that system tools read (SSV): values, and their uncertainty.
+
+The uncertainty is the mean, pairs of sigma points and random samples. A parameter that spans
+decades is spread in its logarithm, as its interval is. With C the covariance in these coordinates
+and L L^T = C (Cholesky), a pair of sigma points is the mean plus and minus one column of L: the
+variance of anything smooth that a model says is the sum, over the pairs, of the squared half
+differences. The samples are the mean plus L z, z standard normal.
 
 Source: SSP 1.0, section 6 (system structure parameter values).
 """
 
+import math
+import random
 from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from xml.etree import ElementTree as ET
+
+import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.export.common.markup import base_unit, generation_tool, number, xml_text
 from psa_casadi.model.compose import Model
@@ -62,3 +74,91 @@ def _units(root: ET.Element, names: Sequence[str]) -> None:
     for name in names:
         unit = ET.SubElement(units, f"{{{_COMMON}}}Unit", {"name": name})
         ET.SubElement(unit, f"{{{_COMMON}}}BaseUnit", base_unit(parse_unit(name)))
+
+
+FloatArray = npt.NDArray[np.float64]
+Sets = Mapping[str, Mapping[str, float]]
+
+#: Random samples unless told otherwise, and the most.
+SAMPLES, MOST_SAMPLES = 20, 999
+#: Draws for one sample until it lies within the bounds; the last one is put on them.
+_DRAWS = 200
+#: Digits of the values: those below differ from machine to machine.
+_DIGITS = 7
+_LARGEST = 500.0
+
+
+def posterior_sets(model: Model, samples: int = SAMPLES) -> Sets:
+    """Return sets of the parameters that were found together, by name; values in SI units.
+
+    `mean`, the pairs `sigma_01_plus`, `sigma_01_minus`, ... and `sample_01`, ... as many as asked
+    for, all within the bounds. Empty for a model without a covariance. The same model gives the
+    same sets.
+    """
+    names = model.evidence.covariance.names if model.evidence else ()
+    if not names:
+        return {}
+    mean = np.array([model.values[n] for n in names])
+    log = np.array([model.parameter(n).log for n in names])
+    factor = _factor(model, mean, log)
+    found = {"mean": dict(zip(names, mean.tolist(), strict=True))}
+    for k, column in enumerate(factor.T, start=1):
+        for side, sign in (("plus", 1.0), ("minus", -1.0)):
+            moved = _moved(mean, log, sign * column)
+            found[f"sigma_{k:02d}_{side}"] = _within(model, names, moved)
+    draws = random.Random(len(names))
+    for k in range(1, samples + 1):
+        found[f"sample_{k:02d}"] = _sample(model, names, mean, log, factor, draws)
+    return found
+
+
+def _factor(model: Model, mean: FloatArray, log: npt.NDArray[np.bool_]) -> FloatArray:
+    """Return L with L L^T = C, C positive semidefinite: a direction without spread is 0."""
+    evidence = model.evidence
+    given = np.array(evidence.covariance.matrix if evidence else (), dtype=float)
+    scale = np.where(log, mean, 1.0)
+    left = given / np.outer(scale, scale)
+    least = 1e-12 * np.diag(left)
+    factor = np.zeros_like(left)
+    for k in range(len(mean)):
+        if left[k, k] > least[k]:
+            factor[k:, k] = left[k:, k] / math.sqrt(left[k, k])
+            left[k:, k:] -= np.outer(factor[k:, k], factor[k:, k])
+    return np.asarray(factor, dtype=float)
+
+
+def _moved(mean: FloatArray, log: npt.NDArray[np.bool_], by: FloatArray) -> FloatArray:
+    factors = np.exp(np.clip(np.where(log, by, 0.0), -_LARGEST, _LARGEST))
+    return np.asarray(np.where(log, mean * factors, mean + by), dtype=float)
+
+
+def _sample(
+    model: Model,
+    names: Sequence[str],
+    mean: FloatArray,
+    log: npt.NDArray[np.bool_],
+    factor: FloatArray,
+    draws: random.Random,
+) -> dict[str, float]:
+    """Return one sample; the draws that leave the bounds do not count."""
+    normal = NormalDist()
+    bounds = np.array([model.parameter(n).bounds for n in names])
+    for _ in range(_DRAWS):
+        z = [normal.inv_cdf(min(max(draws.random(), 1e-16), 1.0 - 1e-16)) for _ in names]
+        moved = _moved(mean, log, factor @ np.array(z))
+        if np.all((bounds[:, 0] <= moved) & (moved <= bounds[:, 1])):
+            break
+    return _within(model, names, moved)
+
+
+def _within(model: Model, names: Sequence[str], values: FloatArray) -> dict[str, float]:
+    """Return values with so many digits, put on the bounds where they leave them.
+
+    What has overflowed to no number at all stays at the mean.
+    """
+    found = {}
+    for name, value in zip(names, values.tolist(), strict=True):
+        low, high = model.parameter(name).bounds
+        digits = model.values[name] if math.isnan(value) else float(f"{value:.{_DIGITS}g}")
+        found[name] = min(max(digits, low), high)
+    return found

@@ -8,8 +8,9 @@ Source: FMI 2.0.5, section 2.3, and FMI 3.0.2, section 2.5.1.2 (documentation/li
 
 from importlib.resources import files
 
-from psa_casadi.errors import PsaError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model
+from psa_casadi.model.structure import Structure
 from psa_casadi.simulation.compiler import sources_directory
 
 #: Entry point of the licence information in both versions of the standard.
@@ -83,3 +84,14 @@ def _notice(header: str) -> str:
     comment = header.replace("\r\n", "\n").partition("/*")[2].partition("*/")[0]
     lines = [line.strip() for line in comment[comment.index("Copyright") :].splitlines()]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def refuse_foreign(structure: Structure, what: str) -> None:
+    """Raise InputError for a model with an FMU in it; `what` it would become, as "an FMU"."""
+    if structure.foreign:
+        (own, *_) = (c for c in structure.components if c.foreign)
+        raise InputError(
+            f"The model has an FMU in it ('{own.name}': {own.source}), which is a binary without"
+            f" equations to write as {what}; add the effects to the model in the tool that made the"
+            " FMU. Here it can be simulated, identified and diagnosed."
+        )

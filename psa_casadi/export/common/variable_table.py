@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.scales import velocity_scale
+from psa_casadi.units import rate_unit
 from psa_casadi.variables import nominal_value
 
 
@@ -123,22 +124,6 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
     ]  # fmt: skip
     _refuse(model, table)
     return tuple(table)
-
-
-def rate_unit(unit: str) -> str:
-    """Return the unit of a quantity's time derivative: m/s for m, m/s2 for m/s, N/(V.s) for N/V."""
-    above, _, below = unit.partition("/")
-    if not below:
-        return f"{above}/s"
-    factors = below.strip("()").split(".")
-    for i, factor in enumerate(factors):
-        match = re.fullmatch(r"s(\d*)", factor)
-        if match:
-            factors[i] = f"s{int(match[1] or 1) + 1}"
-            break
-    else:
-        factors.append("s")
-    return f"{above}/{factors[0]}" if len(factors) == 1 else f"{above}/({'.'.join(factors)})"
 
 
 def _refuse(model: Model, table: list[Variable]) -> None:

@@ -1,15 +1,235 @@
-"""A model as two files of C99 for a controller: a step of fixed length and constant cost."""
+"""A model as two files of C99 for a controller: a step of fixed length and constant cost.
+
+Whether it fits is planned, in how many substeps, and how far it errs.
+"""
 
 import math
 import os
-from dataclasses import dataclass
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from psa_casadi.export.common.foreign import refuse_foreign
-from psa_casadi.export.fixed_step.planning import fixed_step
-from psa_casadi.export.fixed_step.probe import VoltageError
+import numpy as np
+
+from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.errors import InputError
+from psa_casadi.export.common.markup import generation_tool
+from psa_casadi.export.common.publication import code_license, refuse_foreign
+from psa_casadi.export.common.templates import filled
+from psa_casadi.export.fixed_step.code import (
+    CodePlan,
+    check_names,
+    limit_words,
+    names_of,
+    source_code,
+    timed,
+)
+from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
+from psa_casadi.export.fixed_step.probe import (
+    STEPS,
+    VOLTAGES,
+    VoltageError,
+    errors,
+    reach,
+    shown_output,
+)
+from psa_casadi.export.fixed_step.step import step_of
 from psa_casadi.files import atomic_write, make_folder
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.exact.graph import Unprintable
+
+#: Substeps that are tried where none are asked for, and the error that is good enough.
+SUBSTEPS, GOOD = (1, 2, 4, 8), 1e-3
+#: Error beyond which a step is of no use.
+USELESS = 0.1
+#: Two times that differ by less than this share are one.
+_SAME = 1e-9
+_HELD = {"linear": False, "zero": True}
+#: Plans a model's step, or says why it has none.
+Attempt = Callable[[Model], tuple[CodePlan, str] | str]
+
+
+@dataclass(frozen=True, eq=False)
+class FixedStep:
+    """A planned step with its sources by file name, and its measured errors."""
+
+    plan: CodePlan
+    texts: dict[str, str]
+    errors: tuple[VoltageError, ...]
+
+    @property
+    def worst(self) -> VoltageError:
+        """Return the largest error."""
+        return max(self.errors, key=lambda e: e.error)
+
+
+def fixed_step(
+    model: Model,
+    *,
+    name: str,
+    step: float,
+    precision: str = "double",
+    hold: str = "linear",
+    substeps: int | None = None,
+) -> FixedStep:
+    """Return the fixed step of a model: generated, compiled here, and compared.
+
+    Without `substeps` the fewest of `SUBSTEPS` that err by less than `GOOD` are taken, or those
+    that err least.
+
+    Raises InputError for bad arguments, for a model that does not fit, with the effect and the
+    reason, and for a step that is too long; MachineError if the compiler fails.
+    """
+    _check(name, step, precision, hold, substeps)
+    if model.structure.sampled and _HELD[hold]:
+        raise InputError(
+            f"The model '{model.name}' reads its inputs at sample instants; --hold zero is for"
+            " inputs of continuous models: leave it out."
+        )
+    found: list[FixedStep] = []
+    counts = SUBSTEPS if model.structure.states else SUBSTEPS[:1]
+    for count in counts if substeps is None else (substeps,):
+        attempt = partial(
+            _plan_or_reason, name=name, step=step, substeps=count, held=_HELD[hold],
+            precision=PRECISIONS[precision],
+        )  # fmt: skip
+        plan, source = _planned(model, attempt)
+        texts = {f"{name}.h": header_code(plan), f"{name}.c": source}
+        measured = errors(plan, texts)
+        texts[f"{name}.h"] = header_code(plan, measured)
+        found.append(FixedStep(plan, texts, measured))
+        if found[-1].worst.error <= GOOD:
+            break
+    good = [f for f in found if f.worst.error <= GOOD]
+    best = (good or sorted(found, key=lambda f: f.worst.error))[0]
+    if not best.worst.error <= USELESS:
+        raise InputError(_useless(best))
+    return _limited(best)
+
+
+def header_code(plan: CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
+    """Return the header; its comment tells the `errors` that were measured."""
+    model = plan.model
+    return filled(
+        "fixed_step.h",
+        **names_of(plan),
+        model=model,
+        numbers={name: repr(value) for name, value in model.values.items()},
+        errors=errors,
+        steps=STEPS,
+        voltages=VOLTAGES,
+        shown=shown_output(model) if errors else "",
+        limit_words=limit_words(plan.limit),
+        licence="\n".join(code_license().splitlines()),
+        tool=generation_tool(),
+    )
+
+
+def _limited(found: FixedStep) -> FixedStep:
+    """Return a step whose voltage is limited to where it is as good as on the reference ones."""
+    limit = reach(found.plan, found.texts, max(GOOD, found.worst.error))
+    plan = replace(found.plan, limit=limit)
+    texts = (header_code(plan, found.errors), source_code(plan))
+    return FixedStep(plan, dict(zip(found.texts, texts, strict=True)), found.errors)
+
+
+def _useless(best: FixedStep) -> str:
+    plan, worst = best.plan, best.worst
+    cure = "the step is too long for this model: take a shorter one, or more --substeps"
+    if not plan.model.structure.states:
+        cure = f"{plan.precision.name} precision is too coarse for this model: take double"
+    return (
+        f"With a step of {plan.step:g} s in {plan.substeps} substeps the"
+        f" {shown_output(plan.model)} errs by {100 * worst.error:.3g} % of its range on"
+        f" {worst.voltage}; {cure}."
+    )
+
+
+def _check(name: str, step: float, precision: str, hold: str, substeps: int | None) -> None:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+        raise InputError(
+            f"'{name}' cannot name functions in C; use letters, digits, underscores, no digit"
+            " first."
+        )
+    if not (np.isfinite(step) and step > 0.0):
+        raise InputError(f"The step is {step:g} s; give a time above 0, such as 10us.")
+    if precision not in PRECISIONS:
+        raise InputError(f"The precision '{precision}' is not known; choose double or single.")
+    if hold not in _HELD:
+        raise InputError(f"The hold '{hold}' is not known; choose linear or zero.")
+    if substeps is not None and not 1 <= substeps <= 1000:
+        raise InputError(f"The substeps are {substeps}; give a number from 1 to 1000.")
+
+
+def _planned(model: Model, attempt: Attempt) -> tuple[CodePlan, str]:
+    """Return the plan of a step and its source.
+
+    Raises InputError where the model does not fit, with the effect to blame and the reason.
+    """
+    found = attempt(model)
+    if not isinstance(found, str):
+        check_names(found[0])
+        return found
+    own = {c.name for c in (*BASE, *SIMPLIFIED)}
+    without = [c.name for c in model.components if _fits_without(model, c.name, attempt)]
+    blamed = [name for name in without if name not in own]
+    if not blamed:
+        raise InputError(
+            f"The model '{model.name}' has no step of fixed length and constant cost: {found}."
+            " Export an FMU with the adaptive solver."
+        )
+    who = " or ".join(f"'{name}'" for name in blamed)
+    raise InputError(
+        f"The effect {who} does not fit a step of fixed length and constant cost: with it the"
+        f" model is not of the form that is needed ({found}). Leave the effect out, or export an"
+        " FMU with the adaptive solver."
+    )
+
+
+def _plan_or_reason(
+    model: Model, *, name: str, step: float, substeps: int, held: bool, precision: Precision
+) -> tuple[CodePlan, str] | str:
+    if not model.output_names:
+        return "it has no outputs"
+    expression = step_of(model, step / substeps)
+    if isinstance(expression, str):
+        return expression
+    every = _steps_of_a_period(model, step)
+    plan = CodePlan(model, expression, name, step, substeps, held, precision, every)
+    if precision.single and timed(plan):
+        return (
+            "its equations depend on the time itself, which single precision knows to 0.2 ms after"
+            " an hour; double precision does not have this limit"
+        )
+    try:
+        return plan, source_code(plan)
+    except Unprintable as reason:
+        return f"its equations have what the code cannot express, {reason}"
+
+
+def _steps_of_a_period(model: Model, step: float) -> int:
+    """Return how many steps a sample period has; 0 where nothing is sampled."""
+    name = model.structure.period
+    if name is None:
+        return 0
+    period = model.values[name]
+    count = round(period / step)
+    if count < 1 or abs(count * step - period) > _SAME * period:
+        raise InputError(
+            f"The model '{model.name}' is sampled every {period:g} s ({name}), which is no multiple"
+            f" of the step of {step:g} s; give a step of {period / max(count, 1):.12g} s."
+        )
+    return count
+
+
+def _fits_without(model: Model, name: str, attempt: Attempt) -> bool:
+    try:
+        other = model.without([name])
+    except InputError:
+        return False  # others need it
+    return not isinstance(attempt(other), str)
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.export.fixed_step.matrices import FloatArray
-from psa_casadi.export.fixed_step.plan import CodePlan
+from psa_casadi.export.fixed_step.code import CodePlan, probe_code
+from psa_casadi.export.fixed_step.step import FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.stepper import SimulationError, run
@@ -78,7 +78,7 @@ class Probe:
 
     def __init__(self, plan: CodePlan, texts: dict[str, str]) -> None:
         self._plan = plan
-        library = shared_library({**texts, "probe.c": _probe_code(plan)}, (), ("-O2",))
+        library = shared_library({**texts, "probe.c": probe_code(plan)}, (), ("-O2",))
         self._play = library_function(library)
 
     def play(self, u: FloatArray) -> FloatArray:
@@ -147,33 +147,3 @@ def _error(plan: CodePlan, probe: Probe, u: FloatArray) -> float:
     size = float(np.ptp(true)) or float(model.output_nominals()[output])
     worst = float(np.max(np.abs(own - true))) / size
     return worst if np.isfinite(worst) else float("inf")
-
-
-def _probe_code(plan: CodePlan) -> str:
-    name, s, real = plan.name, plan.model.structure, plan.precision.ctype
-    nu = len(s.inputs)
-    given = [f"        input.{q.name} = ({real})u[k * {nu} + {i}];" for i, q in enumerate(s.inputs)]
-    taken = [f"        *y++ = (double)output.{q.name};" for q in s.outputs]
-    return "\n".join(
-        [
-            f'#include "{name}.h"',
-            "#if defined(_WIN32)",
-            "__declspec(dllexport)",
-            "#else",
-            '__attribute__((visibility("default")))',
-            "#endif",
-            "void psa_probe(long steps, const double *u, double *y);",
-            "void psa_probe(long steps, const double *u, double *y) {",
-            f"    {name}_state state;",
-            f"    {name}_input input;",
-            f"    {name}_output output;",
-            f"    {name}_init(&state);",
-            "    for (long k = 1; k < steps; ++k) {",
-            *given,
-            f"        {name}_step(&state, &input, &output);",
-            *taken,
-            "    }",
-            "}",
-            "",
-        ]
-    )

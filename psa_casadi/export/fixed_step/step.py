@@ -1,24 +1,87 @@
 """One step of fixed length as an expression: a model's exact step with nothing left to decide.
 
-The linear part is taken exactly (`matrices`). States along a driver's way (hysteresis) take two
-Rosenbrock steps of fourth order over it, which meet where the driver turns, else in the middle.
-A port's values at start, half and end make a parabola in time. Ports that feed back to what they
-depend on take two Newton steps. So every step costs the same, whatever happens in it.
+The linear part is taken exactly: with L' = M L + g(t) and g = r + s t + q t^2 beside M L(0), the
+change over h is E_1 r + E_2 s + 2 E_3 q, where E_k is the k-fold integral of exp(M t) over the
+step: one exponential of M with three integrators (van Loan, IEEE Trans. Automatic Control 23 (1978)
+395). States along a driver's way (hysteresis) take two Rosenbrock steps of fourth order over it,
+which meet where the driver turns, else in the middle. A port's values at start, half and end make a
+parabola in time. Ports that feed back to what they depend on take two Newton steps. So every step
+costs the same, whatever happens in it.
+
+What does not split into a linear part and states along a way (a hysteresis that acts back on its
+own voltage, a limit of an amplifier, a stop) takes one Rosenbrock step as a whole. It is L-stable,
+so that fast lags settle and jumps of an input stay bounded. A kink inside a step is not looked for:
+the step has order two there, which the comparison at export measures, and substeps make small.
 
 Source: the exact steps of `simulation/exact`, whose choices are made once, at export.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
+import scipy
 
 from psa_casadi.component import Expression
-from psa_casadi.export.fixed_step.matrices import FloatArray, linear_part, responses
-from psa_casadi.export.fixed_step.way import Ends, Leaving, along_the_way, solved
+from psa_casadi.export.fixed_step.way import Ends, Leaving, along_the_way, rosenbrock, solved
 from psa_casadi.model.compose import Model
-from psa_casadi.simulation.exact.split import Split
+from psa_casadi.model.structure import Structure
+from psa_casadi.simulation.exact.dependence import closure
+from psa_casadi.simulation.exact.split import Split, jumps, split_of
+from psa_casadi.variables import Input
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPart:
+    """M (n, n), B (n, nu), c (n,) of L' = M L + B u + c + ports, with values."""
+
+    m: FloatArray
+    b: FloatArray
+    c: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """E_1, E_2 / step and 2 E_3 / step^2 (n, n each) over a part of a step."""
+
+    constant: FloatArray
+    ramp: FloatArray
+    square: FloatArray
+
+
+def linear_part(model: Model, split: Split) -> LinearPart:
+    """Return the linear part of a split with the model's values."""
+    matrices = ca.Function("linear", [split.structure.p], list(split.matrices))
+    m, b, c = (q.full() for q in matrices(model.parameter_vector()))
+    return LinearPart(m, b, c[:, 0])
+
+
+def responses(m: FloatArray, nominal: FloatArray, *, step: float, share: float) -> Responses:
+    """Return the responses at `share` of a `step` [s]; what M does not join is exactly 0.
+
+    `nominal` (n,) are the states' usual sizes, which keep the exponential's numbers alike.
+    """
+    n = len(m)
+    scaled = m * nominal / nominal[:, None]
+    system = np.zeros((4 * n, 4 * n))
+    system[:n, :n] = scaled * step * share
+    for k in range(3):
+        system[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
+    full = scipy.linalg.expm(system)
+    joined = closure(m != 0.0)
+    parts = [
+        np.where(joined, full[:n, k * n : (k + 1) * n] * nominal[:, None] / nominal, 0.0)
+        for k in (1, 2, 3)
+    ]
+    return Responses(
+        parts[0] * step * share, parts[1] * step * share**2, 2.0 * parts[2] * step * share**3
+    )
+
 
 #: Newton steps of ports that feed back.
 _NEWTON = 2
@@ -209,3 +272,56 @@ def _times(matrix: FloatArray, column: Expression) -> Expression:
 
 def _column(matrix: FloatArray, place: int) -> ca.DM:
     return ca.sparsify(ca.DM(np.ascontiguousarray(matrix[:, place])))
+
+
+def step_of(model: Model, step: float) -> StepExpression | str:
+    """Return the step of `step` [s] of a model between its sample instants, or why it has none."""
+    s = model.structure
+    between = _between(s)
+    held = replace(model, structure=between)
+    split = split_of(between)
+    if not isinstance(split, str):
+        found = step_expression(held, split, step)
+    elif between.states and jumps(between):
+        return split
+    else:
+        found = whole_step(held, step)
+    count = s.u.numel()
+    still = found.du[count:, 0]
+
+    def resting(expression: Expression) -> Expression:
+        return ca.substitute(expression, still, ca.SX.zeros(still.numel()))
+
+    return replace(
+        found, u=s.u, du=found.du[:count, 0],
+        change=resting(found.change), port_end=resting(found.port_end),
+    )  # fmt: skip
+
+
+@cache
+def _between(s: Structure) -> Structure:
+    """Return equations whose sampled states are inputs that hold: what is between instants."""
+    if not s.sampled:
+        return s
+    held = tuple(Input(q.name, q.unit, q.description, q.start) for q in s.sampled)
+    none = ca.SX(0, 1)
+    return replace(
+        s, inputs=(*s.inputs, *held), u=ca.vertcat(s.u, s.z),
+        sampled=(), period=None, z=none, next={}, znext=none,
+    )  # fmt: skip
+
+
+def whole_step(model: Model, step: float) -> StepExpression:
+    """Return the step of `step` [s] of a model with its values, whatever its equations are."""
+    s = model.structure
+    n, theta = s.x.numel(), ca.SX.sym("theta")
+    gone, low = ca.SX.sym("gone", n), ca.SX.sym("low", n)
+    du, none = ca.SX.sym("du", s.u.numel()), ca.SX(0, 1)
+    there = [s.time + theta * step, s.x + low + gone, s.u + theta * du]
+    value = ca.substitute(step * with_numbers(model, s.xdot), ca.vertcat(s.time, s.x, s.u),
+                          ca.vertcat(*there))  # fmt: skip
+    _, change = rosenbrock(value, theta, gone) if n else (none, none)
+    return StepExpression(
+        time=s.time, x=s.x, low=low, u=s.u, du=du, port=none,
+        change=change, port_end=none, port_start=none, port_names=(),
+    )  # fmt: skip

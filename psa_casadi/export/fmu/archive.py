@@ -7,21 +7,29 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.common.foreign import refuse_foreign
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
-from psa_casadi.export.common.posterior import SAMPLES
-from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
-from psa_casadi.export.fixed_step.planning import FixedStep, fixed_step
-from psa_casadi.export.fmu.communication_step import held_step
+from psa_casadi.export.common.parameter_sets import SAMPLES
+from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text, refuse_foreign
+from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.fmu.evidence_files import META_DATA, PAGE, EvidenceFiles, evidence_files
-from psa_casadi.export.fmu.fixed import FIXED_ENTRY, fixed_entry, use_of
+from psa_casadi.export.fmu.evidence import (
+    META_DATA,
+    PAGE,
+    EvidenceFiles,
+    evidence_files,
+    with_validity,
+)
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
-from psa_casadi.export.fmu.reference_results import reference_entries
+from psa_casadi.export.fmu.reference_run import held_step, reference_entries
+from psa_casadi.export.fmu.sources import (
+    FACES,
+    FIXED_ENTRY,
+    exported_texts,
+    fixed_entry,
+    use_of,
+)
 from psa_casadi.export.fmu.terminals import terminal_entries
-from psa_casadi.export.fmu.texts import DESCRIPTIONS, exported_texts
-from psa_casadi.export.fmu.validity import with_validity
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, foreign_components
@@ -69,7 +77,7 @@ def export_fmu(
         raise InputError(
             f"'{identifier}' cannot name an FMU; use letters, digits, underscores, no digit first."
         )
-    if fmi not in DESCRIPTIONS:
+    if fmi not in FACES:
         raise InputError(f"FMI {fmi} is not known; choose 2 (FMI 2.0) or 3 (FMI 3.0).")
     targets = chosen_platforms(platforms)
     exported = model if include_sensor else model.plant()

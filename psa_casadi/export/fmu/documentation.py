@@ -7,13 +7,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from psa_casadi.export.common.html_page import page, table_of
 from psa_casadi.export.common.icon import ICONS, drawing_of, svg
-from psa_casadi.export.common.markup import force_scale, generation_tool, time_scale, what_it_is
+from psa_casadi.export.common.markup import (
+    force_scale,
+    generation_tool,
+    page,
+    table_of,
+    time_scale,
+    what_it_is,
+)
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.variable_table import Variable, starts_at_voltage, variable_table
-from psa_casadi.export.fmu.communication_step import SHARE, STEPS_PER_PERIOD, HeldStep
-from psa_casadi.export.fmu.reference_results import FOLDER, NOTES
+from psa_casadi.export.fmu.reference_run import FOLDER, NOTES, SHARE, STEPS_PER_PERIOD, HeldStep
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS, Figure
 from psa_casadi.units import convert

@@ -1,23 +1,38 @@
-"""The C sources of an exported model: hand-written logic, generated functions and data."""
+"""The C sources of an exported model: hand-written logic, generated functions and data.
 
+An FMU with a fixed step has the same sources and description, changed where the step is: parameters
+are constants, as the step is made for their values, and there is no model exchange.
+"""
+
+import hashlib
 import itertools
+import json
 import math
-from collections.abc import Iterable, Sequence
+import re
+import uuid
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Expression
-from psa_casadi.export.common.markup import xml_text
+from psa_casadi.export.common.markup import number, xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
 from psa_casadi.export.common.variable_table import (
+    OPTIONS,
     Variable,
     starts_at_voltage,
     variable_table,
 )
-from psa_casadi.export.fmu.validity import seen_duration, seen_inputs
+from psa_casadi.export.fixed_step.code import bounded, function_code, limit_words
+from psa_casadi.export.fixed_step.export import FixedStep
+from psa_casadi.export.fixed_step.probe import STEPS, shown_output
+from psa_casadi.export.fmu.description import model_description
+from psa_casadi.export.fmu.evidence import seen_duration, seen_inputs
+from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.codegen import c_arguments, c_code, c_slopes, generate_c
 from psa_casadi.simulation.compiler import OPTIMISE, sources_directory
@@ -221,3 +236,154 @@ def _build_description(identifier: str, names: Sequence[str]) -> str:
         ET.SubElement(group, "SourceFile", {"name": name})
     ET.SubElement(configuration, "Library", {"name": "m"})
     return xml_text(root)
+
+
+#: Where an FMU carries the step [s], its substeps and the measured errors by voltage.
+FIXED_ENTRY = "resources/fixed_step.json"
+_HEADER, _SOURCE = "fmi_config.h", "fmi_data.c"
+
+
+def fixed_sources(texts: Mapping[str, str], fixed: FixedStep) -> dict[str, str]:
+    """Return the sources of an FMU with the fixed step in them."""
+    define = f"#define PSA_FIXED_STEP {fixed.plan.step!r}\n"
+    if bounded(fixed.plan):
+        define += f"#define PSA_FIXED_LIMIT {fixed.plan.limit!r}\n"
+    define += "#endif\n"
+    head, end, rest = texts[_HEADER].rpartition("#endif\n")
+    code = function_code(fixed.plan, "psa_fixed_step")
+    return {**texts, _HEADER: head + define + rest if end else "", _SOURCE: texts[_SOURCE] + code}
+
+
+def fixed_description(xml: str, fixed: FixedStep) -> str:
+    """Return the description of an ordinary FMU as that of one with a fixed step."""
+    root = ET.fromstring(xml)
+    step = fixed.plan.step
+    root.set(
+        "description",
+        f"{root.get('description')} Co-simulation by a fixed step of {step:g} s, of which a"
+        f" communication step is a multiple; largest error {fixed.worst.error:.1e} of the range"
+        f" ({fixed.worst.voltage}).",
+    )
+    third = root.get("fmiVersion") == "3.0"
+    exchange, stepping = root.find("ModelExchange"), root.find("CoSimulation")
+    experiment = root.find("DefaultExperiment")
+    if exchange is not None:
+        root.remove(exchange)
+    if stepping is not None and third:
+        for name in ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"):
+            stepping.attrib.pop(name, None)
+        stepping.set("fixedInternalStepSize", number(step))
+    elif stepping is not None:  # FMI 2 has no word for multiples of a step
+        stepping.attrib.pop("canHandleVariableCommunicationStepSize", None)
+    if experiment is not None:
+        steps = max(1, round(float(experiment.get("stepSize", "0")) / step))
+        experiment.set("stepSize", number(steps * step))
+    _constants(root, third=third)
+    return xml_text(root)
+
+
+def fixed_entry(fixed: FixedStep) -> bytes:
+    """Return the text of `FIXED_ENTRY`; errors have two digits, as they have elsewhere."""
+    errors = {e.voltage: float(f"{e.error:.1e}") for e in fixed.errors}
+    content = {"step": fixed.plan.step, "substeps": fixed.plan.substeps, "errors": errors}
+    if bounded(fixed.plan):
+        content["voltage_limit"] = fixed.plan.limit
+    return (json.dumps(content, indent=2) + "\n").encode("utf-8")
+
+
+def use_of(fixed: FixedStep) -> str:
+    """Return what the page of the FMU says of its steps."""
+    found = ", ".join(f"{e.voltage} {e.error:.1e}" for e in fixed.errors)
+    output = shown_output(fixed.plan.model)
+    limited = f" {limit_words(fixed.plan.limit)}".rstrip()
+    line = "held" if fixed.plan.held else "linear"
+    return (
+        f"Co-simulation takes steps of {fixed.plan.step:g} s: the same operations each time,"
+        " without iteration or allocation. A communication step is a multiple of it; another one is"
+        " an error. Parameters are constants, for whose values the step was made. Largest errors of"
+        f" {output} over its range, measured at export on voltages of {STEPS} steps, {line} over"
+        f" each: {found}.{limited}"
+    )
+
+
+def fixed_step_of(directory: Path) -> float | None:
+    """Return the fixed step [s] of an unpacked FMU, None if it has none."""
+    header = directory / "sources" / _HEADER
+    try:
+        text = header.read_text("utf-8")
+        found = re.search(r"^#define PSA_FIXED_STEP (\S+)$", text, re.MULTILINE)
+        return float(found[1]) if found else None
+    except (OSError, ValueError):  # no text, or no number: it is no file of ours
+        return None
+
+
+def _constants(root: ET.Element, *, third: bool) -> None:
+    """Make constants of the parameters, on which nothing depends then."""
+    variables = root.find("ModelVariables")
+    structure = root.find("ModelStructure")
+    if variables is None or structure is None:
+        return
+    gone = set()
+    for place, variable in enumerate(variables, start=1):
+        if third:
+            variable.attrib.pop("intermediateUpdate", None)
+        if variable.get("causality") == "parameter" and variable.get("name") not in OPTIONS:
+            variable.set("causality", "local")
+            variable.set("variability", "constant")
+            variable.set("initial", "exact")
+            gone.add(str(variable.get("valueReference")) if third else str(place))
+    for indicator in structure.findall("EventIndicator"):
+        structure.remove(indicator)
+    for unknown in structure.iter():
+        if "dependencies" not in unknown.attrib:
+            continue
+        known = unknown.attrib["dependencies"].split()
+        kinds = unknown.attrib.get("dependenciesKind", "").split()
+        kept = [k for k, name in enumerate(known) if name not in gone]
+        unknown.set("dependencies", " ".join(known[k] for k in kept))
+        if kinds:
+            unknown.set("dependenciesKind", " ".join(kinds[k] for k in kept))
+
+
+def exported_texts(
+    model: Model,
+    identifier: str,
+    fmi: int = 2,
+    fixed: FixedStep | None = None,
+    given: Mapping[str, str] | None = None,
+) -> tuple[str, dict[str, str], str]:
+    """Return token, sources by file name, and description of an export.
+
+    The token (GUID) is a hash of the description and the sources that were made with an empty one.
+    `fixed` is the step of an FMU with a fixed step, `given` are sources that are taken as they are.
+    """
+
+    def sources(token: str) -> dict[str, str]:
+        texts = source_files(model, identifier, token, fmi)
+        return (fixed_sources(texts, fixed) if fixed else texts) | dict(given or {})
+
+    bare = sources("")
+    names = compiled_files(bare)
+    plain = model_description(model, identifier, "", names, fmi)
+    digest = hashlib.sha256(plain.encode("utf-8"))
+    for name, text in sorted(bare.items()):
+        digest.update(name.encode("utf-8") + b"\0" + text.encode("utf-8") + b"\0")
+    token = "{" + str(uuid.UUID(bytes=digest.digest()[:16])) + "}"
+    xml = model_description(model, identifier, token, names, fmi)
+    return token, sources(token), fixed_description(xml, fixed) if fixed else xml
+
+
+def write_sources(
+    model: Model, directory: Path, *, name: str | None = None, fmi: int = 2
+) -> list[Path]:
+    """Write all sources of a model's FMU to a folder and return the paths, sorted.
+
+    The folder is made if it does not exist. The sources compile alone; its README.txt has the line.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    written = []
+    _, texts, _ = exported_texts(model, name or model.name, fmi)
+    for file_name, text in sorted(texts.items()):
+        atomic_write(directory / file_name, text)
+        written.append(directory / file_name)
+    return written

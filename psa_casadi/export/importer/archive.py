@@ -1,7 +1,15 @@
-"""The files of an FMU of either version, extracted, and what its description says."""
+"""The files of an FMU of either version, unpacked, and what its description says.
+
+FMUs and SSPs come from anywhere: an archive is looked through before anything of it is written.
+"""
 
 import math
 import re
+import stat
+import struct
+import zipfile
+import zlib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,22 +17,91 @@ from typing import Any, Self
 
 import fmpy
 
-from psa_casadi.errors import InputError
-from psa_casadi.export.importer import fmi2_functions, fmi3_functions
-from psa_casadi.export.importer.unpack import unpack
+from psa_casadi.errors import InputError, Problems
 from psa_casadi.scratch import temporary_folder
 
-#: The functions of each version of the standard, without their prefix.
-FUNCTIONS = {2: fmi2_functions.FUNCTIONS, 3: fmi3_functions.FUNCTIONS}
+#: Most entries of an archive, and most bytes of all of them.
+MOST_ENTRIES, MOST_BYTES = 10_000, 1 << 30
+#: How often larger than packed an archive may be, once larger than this.
+MOST_GROWTH, SMALL_BYTES = 100, 8 << 20
 #: Longest text that is read as a whole [bytes], and which these are.
 LONGEST_TEXT = 64 << 20
 _TEXTS = ("modelDescription.xml", "resources/model.json")
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
-_LIBRARY = re.compile(r".*\.(so|dll|dylib)")
+#: What the standard library raises on a damaged archive.
+_DAMAGE = (
+    zipfile.BadZipFile, zlib.error, struct.error, EOFError, ArithmeticError, LookupError,
+    MemoryError, OSError, RuntimeError, ValueError,
+)  # fmt: skip
+
+
+def archive_problems(path: Path) -> dict[str, tuple[str, ...]]:
+    """Return why a zip archive must not be unpacked, by the row of the check; nothing is written.
+
+    Where names or sizes are wrong the content is not looked at. Raises nothing for any content.
+    """
+    names, size, damage = Problems(), Problems(), Problems()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            for sentence in _wrong_names(entries):
+                names.add(sentence)
+            for sentence in _wrong_sizes(entries, path.stat().st_size):
+                size.add(sentence)
+            if not names.sentences() and not size.sentences() and (bad := archive.testzip()):
+                damage.add(f"{bad!a} is damaged")
+    except _DAMAGE as error:
+        damage.add(f"the archive is damaged ({' '.join(ascii(str(error))[1:-1].split())})")
+    found = {"archive names": names, "archive size": size, "archive intact": damage}
+    return {row: problems.sentences() for row, problems in found.items()}
+
+
+def _wrong_names(entries: list[zipfile.ZipInfo]) -> Iterator[str]:
+    """Yield entries that are no plain files at a place of their own inside the folder."""
+    for entry in entries:
+        name, mode = entry.orig_filename, entry.external_attr >> 16
+        shown = ascii(name[:80])
+        if name.startswith("/") or "\\" in name or ":" in name or ".." in name.split("/"):
+            yield f"{shown} leads outside the archive's folder"
+        if not name.isprintable():
+            yield f"{shown} has control characters"
+        if stat.S_IFMT(mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
+            yield f"{shown} is a link or a device"
+        if entry.flag_bits & 0x1:
+            yield f"{shown} is encrypted"
+    for place, count in Counter(e.filename.removesuffix("/").casefold() for e in entries).items():
+        if count > 1:
+            yield f"{place[:80]!a} stands for {count} entries on some file systems"
+
+
+def _wrong_sizes(entries: list[zipfile.ZipInfo], packed: int) -> Iterator[str]:
+    """Yield what would fill the disk or the memory."""
+    if len(entries) > MOST_ENTRIES:
+        yield f"it has {len(entries)} entries, more than {MOST_ENTRIES}"
+    total = sum(e.file_size for e in entries)
+    if total > MOST_BYTES:
+        yield f"unpacked it has {total} bytes, more than {MOST_BYTES}"
+    if total > max(SMALL_BYTES, MOST_GROWTH * packed):
+        yield f"unpacked it is {total / packed:.0f} times as large, more than {MOST_GROWTH} times"
+
+
+def unpack(path: Path, folder: Path) -> None:
+    """Unpack a zip archive into an empty folder.
+
+    Raises InputError, before anything is written, if the archive has any of `archive_problems`.
+    """
+    problems = [p for found in archive_problems(path).values() for p in found]
+    if problems:
+        raise InputError(f"{path}: {'; '.join(problems)}.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            archive.extractall(folder)
+    except _DAMAGE as error:
+        raise InputError(f"{path}: cannot be unpacked ({str(error)!a}).") from error
 
 
 class Archive:
-    """An extracted FMU; a context manager that removes the extracted files.
+    """An unpacked FMU; a context manager that removes the files.
 
     One that is unpacked already, in the folder `unpacked`, is left there.
 
@@ -41,7 +118,6 @@ class Archive:
         self._held = ExitStack()
         try:
             self.directory = unpacked or self._unpacked()
-            self._require_readable()
             self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
             self._read()
         except Exception as error:  # fmpy raises it for any damage
@@ -53,19 +129,15 @@ class Archive:
 
     def _unpacked(self) -> Path:
         """Return a temporary folder with the files of the archive."""
-        place = self._held.enter_context(temporary_folder())
-        unpack(self.path, place)
-        return place
-
-    def _require_readable(self) -> None:
-        """Raise InputError if a text is so long that what is read of it would fill the memory."""
+        folder = self._held.enter_context(temporary_folder())
+        unpack(self.path, folder)
         for name in _TEXTS:
-            place = self.directory / name
-            if place.is_file() and place.stat().st_size > LONGEST_TEXT:
+            if (folder / name).is_file() and (folder / name).stat().st_size > LONGEST_TEXT:
                 raise InputError(
                     f"{self.path}: {name} has more than {LONGEST_TEXT >> 20} MiB and is not read;"
                     " export the FMU again."
                 )
+        return folder
 
     def _read(self) -> None:
         """Read what the description says first; raises InputError if it is of no known kind."""
@@ -83,18 +155,14 @@ class Archive:
                 f"{self.path}: its model identifier {self.identifier!a} is no name in C; export it"
                 " again."
             )
-        self.references = {v.name: int(v.valueReference) for v in self.description.modelVariables}
-        self.nominals = {
-            v.name: 1.0 if v.nominal is None else float(v.nominal)
-            for v in self.description.modelVariables
-        }
-        self.bounds = {
-            v.name: (
-                -math.inf if v.min is None else float(v.min),
-                math.inf if v.max is None else float(v.max),
-            )
-            for v in self.description.modelVariables
-        }
+        self.references: dict[str, int] = {}
+        self.nominals: dict[str, float] = {}
+        self.bounds: dict[str, tuple[float, float]] = {}
+        for v in self.description.modelVariables:
+            self.references[v.name] = int(v.valueReference)
+            self.nominals[v.name] = 1.0 if v.nominal is None else float(v.nominal)
+            low = -math.inf if v.min is None else float(v.min)
+            self.bounds[v.name] = (low, math.inf if v.max is None else float(v.max))
         experiment = self.description.defaultExperiment
         self.step_size = float(getattr(experiment, "stepSize", None) or 1e-3)
         self._states = [str(u.variable.derivative.name) for u in self.description.derivatives]
@@ -111,31 +179,17 @@ class Archive:
         return tuple(kind for kind, announced in said if announced is not None)
 
     @property
-    def resources(self) -> Path:
-        """The folder of the FMU's own files, absolute; it need not exist."""
-        return self.directory.absolute() / "resources"
-
-    @property
-    def prefix(self) -> str:
-        """What the names of all C functions start with."""
-        return f"fmi{self.version}"
-
-    @property
     def token(self) -> str:
         """The GUID (FMI 2.0) or instantiation token (FMI 3.0)."""
         return str(self.description.guid)
 
-    def tunable(self) -> list[str]:
-        """Return the names of the parameters that may be set between steps."""
-        return [v.name for v in self.description.modelVariables if v.variability == "tunable"]
-
-    def constants(self) -> list[str]:
-        """Return the names of the constants."""
-        return [v.name for v in self.description.modelVariables if v.variability == "constant"]
-
     def names(self, causality: str) -> list[str]:
         """Return the names of the variables of one causality, in the order of the description."""
         return [v.name for v in self.description.modelVariables if v.causality == causality]
+
+    def varying(self, variability: str) -> list[str]:
+        """Return the names of the variables of one variability: tunable, constant, ..."""
+        return [v.name for v in self.description.modelVariables if v.variability == variability]
 
     def states(self) -> list[str]:
         """Return the names of the continuous states, in the order of the state vector."""
@@ -143,14 +197,12 @@ class Archive:
 
     def sampled(self) -> list[str]:
         """Return the names of the sampled states: local variables that are discrete."""
-        variables = self.description.modelVariables
-        found = (v for v in variables if v.causality == "local" and v.variability == "discrete")
-        return [v.name for v in found]
+        local = set(self.names("local"))
+        return [name for name in self.varying("discrete") if name in local]
 
     def indicators(self) -> list[str]:
         """Return the names of the variables that repeat the event indicators, in their order."""
-        names = (v.name for v in self.description.modelVariables)
-        return [n for n in names if n.startswith("switch.")]
+        return [name for name in self.references if name.startswith("switch.")]
 
     def indicator_count(self) -> int:
         """Return how many event indicators the description announces."""
@@ -161,7 +213,7 @@ class Archive:
     def binaries(self) -> Iterator[Path]:
         """Yield the paths of the libraries for all platforms, sorted."""
         for path in sorted((self.directory / "binaries").rglob("*")):
-            if path.is_file() and _LIBRARY.fullmatch(path.name):
+            if path.is_file() and path.suffix in (".so", ".dll", ".dylib"):
                 yield path
 
     def host_binary(self) -> Path | None:

@@ -1,59 +1,96 @@
-"""An FMU with its binary loaded: what `check_fmu` and the small importers drive.
+"""An FMU with its binary loaded, and instances of it; the classes of fmpy call its functions.
 
-The version of FMI shows in the class of the instances only: every status visible, nothing hidden.
+Here is what fmpy lacks: variables by name, errors that hold what the FMU said, statuses as numbers,
+and many instances of a library that is loaded once.
 """
 
-from collections.abc import Mapping
-from typing import Any, cast
+import ctypes
+from collections.abc import Mapping, Sequence
+from contextlib import chdir
+from copy import copy
+from ctypes import c_double, c_uint
+from pathlib import Path
+from typing import Any, Self
 
-from psa_casadi.export.importer.calls import (
-    CO_SIMULATION,
-    DISCARD,
-    ERROR,
-    MODEL_EXCHANGE,
-    OK,
-    WARNING,
-    FloatArray,
-    FmuError,
-    Instance,
-)
-from psa_casadi.export.importer.instance2 import Callbacks, Instance2
-from psa_casadi.export.importer.instance3 import Instance3
-from psa_casadi.export.importer.library import Library
+import numpy as np
+import numpy.typing as npt
+from fmpy import fmi1, fmi2, fmi3
 
-__all__ = [
-    "CO_SIMULATION", "DISCARD", "ERROR", "MODEL_EXCHANGE", "OK", "WARNING", "Callbacks",
-    "FloatArray", "Fmu", "FmuError", "Instance", "Instance2", "Instance3",
-]  # fmt: skip
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.export.importer.archive import Archive
+
+FloatArray = npt.NDArray[np.float64]
+
+MODEL_EXCHANGE, CO_SIMULATION = 0, 1
+OK, WARNING, DISCARD, ERROR = 0, 1, 2, 3
+
+_CLASSES = {
+    (2, MODEL_EXCHANGE): fmi2.FMU2Model, (2, CO_SIMULATION): fmi2.FMU2Slave,
+    (3, MODEL_EXCHANGE): fmi3.FMU3Model, (3, CO_SIMULATION): fmi3.FMU3Slave,
+}  # fmt: skip
 
 
-class Fmu(Library):
-    """An FMU that gives instances; a context manager that removes the extracted files."""
+class FmuError(PsaError):
+    """A call of an FMU failed that should succeed; `status` is what it returned."""
 
-    def instance(self, interface: int, **changes: Any) -> Instance:
-        """Return what the FMU answers; `component` is None if it refuses."""
-        return (Instance2 if self.version == 2 else Instance3)(self, interface, **changes)
+    def __init__(self, message: str, status: int = ERROR) -> None:
+        super().__init__(message)
+        self.status = status
 
-    def instantiate(self, interface: int, **changes: Any) -> Instance | None:
-        """Return an instance, or None if the FMU refuses; `changes` are token, name, logger."""
-        instance = self.instance(interface, **changes)
-        return instance if instance.component else None
 
-    def open(self, interface: int, **changes: Any) -> Instance:
-        """Return an instance; raises FmuError if the FMU refuses."""
-        instance = self.instance(interface, **changes)
-        if not instance.component:
-            said = instance.messages or "no message"
-            raise FmuError(f"the FMU gives no instance: {said}")
-        return instance
+class Fmu(Archive):
+    """An FMU that gives instances; a context manager that removes the unpacked files.
+
+    Its binary is loaded when the first instance is made. Raises InputError if the file is no FMU.
+    """
+
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        super().__init__(path, unpacked)
+        self._loaded: dict[int, Any] = {}
+
+    @property
+    def library(self) -> ctypes.CDLL:
+        """The binary, loaded."""
+        loaded: ctypes.CDLL = self.loaded(self.interfaces()[-1]).dll
+        return loaded
+
+    def loaded(self, interface: int) -> Any:
+        """Return fmpy's object with the functions of an interface, without an instance.
+
+        Raises InputError if the FMU has no binary for this machine, or one that cannot be loaded.
+        """
+        if interface not in self._loaded:
+            self._loaded[interface] = self._load(interface)
+        return self._loaded[interface]
+
+    def _load(self, interface: int) -> Any:
+        binary = self.host_binary()
+        if binary is None:
+            raise InputError(
+                f"{self.path}: has no binary for this machine; export it for this platform."
+            )
+        try:
+            with chdir("."):  # fmpy does not leave the folder of a library that does not load
+                return _CLASSES[self.version, interface](
+                    guid=self.token, modelIdentifier=self.identifier, instanceName="psa_casadi",
+                    unzipDirectory=str(self.directory.absolute()), libraryPath=str(binary),
+                )  # fmt: skip
+        except Exception as error:  # fmpy raises it for any fault
+            raise InputError(
+                f"{self.path}: its binary cannot be loaded ({error}); export it here."
+            ) from error
+
+    def open(self, interface: int, **options: Any) -> "Instance":
+        """Return an instance; raises FmuError if the FMU refuses, InputError as `loaded`."""
+        return Instance(self, interface, **options)
 
     def start(
         self, interface: int, *, tolerance: float | None = None,
         values: Mapping[str, float] | None = None, start_time: float = 0.0,
-        stop_time: float | None = None, **changes: Any,
-    ) -> Instance:  # fmt: skip
+        stop_time: float | None = None, **options: Any,
+    ) -> "Instance":  # fmt: skip
         """Return an instance that is initialised with start values; in step or continuous mode."""
-        instance = self.open(interface, **changes)
+        instance = self.open(interface, **options)
         instance.setup(
             tolerance=tolerance, start_time=start_time, stop_time=stop_time, values=values
         )
@@ -61,8 +98,171 @@ class Fmu(Library):
             instance.require("EnterContinuousTimeMode")
         return instance
 
-    def start3(self, interface: int, **changes: Any) -> Instance3:
-        """Return an initialised instance of an FMI 3.0 FMU, with what only that version has."""
-        if self.version != 3:
-            raise FmuError(f"{self.path}: is of FMI {self.version}, not of FMI 3.")
-        return cast(Instance3, self.start(interface, **changes))
+
+class Instance:
+    """One instance; `messages` holds what it logged. A context manager that frees it.
+
+    `fmi` is fmpy's object, `options` are those of its `instantiate`. All methods but `call` raise
+    FmuError unless the FMU succeeds.
+    """
+
+    def __init__(self, fmu: Fmu, interface: int, **options: Any) -> None:
+        self.fmu, self.interface = fmu, interface
+        self.messages: list[str] = []
+        #: Time of the next time event that the last update in event mode announced.
+        self.next_event_time: float | None = None
+        self.fmi = copy(fmu.loaded(interface))
+        self.fmi._call = self._call
+        two = fmu.version == 2
+        self.derivatives_function = "GetDerivatives" if two else "GetContinuousStateDerivatives"
+        if two:
+            memory = fmi2.defaultCallbacks.allocateMemory, fmi2.defaultCallbacks.freeMemory
+            callbacks = fmi2.fmi2CallbackFunctions(fmi2.fmi2CallbackLoggerTYPE(self._log), *memory)
+            options = {"callbacks": callbacks, **options}
+        else:
+            options = {"logMessage": self._log, **options}
+        try:
+            self.fmi.instantiate(**options)
+        except Exception as error:  # fmpy's only one
+            said = self.messages or "no message"
+            raise FmuError(f"the FMU gives no instance: {said}") from error
+
+    def _log(self, *arguments: Any) -> None:
+        self.messages.append((arguments[-1] or b"").decode(errors="replace"))
+
+    def _call(self, function: str, *arguments: Any) -> Any:
+        """Call a function in the place of fmpy's method of this name."""
+        try:
+            return type(self.fmi)._call(self.fmi, function, *arguments)
+        except fmi1.FMICallException as error:
+            said = self.messages[-1] if self.messages else "no message"
+            text = f"{function} returned status {error.status}: {said}"
+            raise FmuError(text, error.status) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.free()
+
+    def free(self) -> None:
+        """Free the instance; harmless when called twice."""
+        if self.fmi.component:
+            self.require("FreeInstance")
+            self.fmi.component = None
+
+    def call(self, function: str, *arguments: Any) -> int:
+        """Call a function, named without prefix, and return its status."""
+        try:
+            return int(self.require(function, *arguments))
+        except FmuError as error:
+            return error.status
+
+    def require(self, function: str, *arguments: Any) -> Any:
+        """Call a function, named without prefix; raises FmuError unless it succeeds."""
+        called = getattr(self.fmi, f"fmi{self.fmu.version}{function}")
+        return called(self.fmi.component, *arguments)
+
+    def setup(
+        self, *, tolerance: float | None = None, start_time: float = 0.0,
+        stop_time: float | None = None, values: Mapping[str, float] | None = None,
+    ) -> None:  # fmt: skip
+        """Initialise: set values, enter and leave initialization mode."""
+        experiment = {"tolerance": tolerance, "startTime": start_time, "stopTime": stop_time}
+        if self.fmu.version == 2:
+            self.fmi.setupExperiment(**experiment)
+            experiment = {}
+        self.set(values or {})
+        self.fmi.enterInitializationMode(**experiment)
+        self.fmi.exitInitializationMode()
+
+    def references(self, names: Sequence[str]) -> Any:
+        """Return the value references of names as a C array."""
+        return (c_uint * len(names))(*(self.fmu.references[n] for n in names))
+
+    def get(self, names: Sequence[str]) -> FloatArray:
+        """Return the values of variables."""
+        read = self.fmi.getReal if self.fmu.version == 2 else self.fmi.getFloat64
+        return np.array(read(self.references(names)))
+
+    def set(self, values: Mapping[str, float]) -> None:
+        """Set variables."""
+        write = self.fmi.setReal if self.fmu.version == 2 else self.fmi.setFloat64
+        write(self.references(list(values)), list(values.values()))
+
+    def step(self, point: float, size: float) -> None:
+        """Do one communication step."""
+        self.fmi.doStep(point, size)
+
+    def set_rates(self, rates: Mapping[str, float], order: int = 1) -> None:
+        """Set the time derivatives of inputs for the next communication step (FMI 2.0 only)."""
+        names = self.references(list(rates))
+        self.fmi.setRealInputDerivatives(names, [order] * len(rates), list(rates.values()))
+
+    def output_rates(self, names: Sequence[str], order: int = 1) -> FloatArray:
+        """Return the time derivatives of outputs at the end of the last communication step."""
+        two = self.fmu.version == 2
+        read = self.fmi.getRealOutputDerivatives if two else self.fmi.getOutputDerivatives
+        return np.array(read(self.references(names), [order] * len(names)))
+
+    def update_discrete_states(self) -> list[bool]:
+        """Update in event mode; return whether to repeat, end, look at nominals, states, time.
+
+        The time is then in `next_event_time`, which is None without one.
+        """
+        two = self.fmu.version == 2
+        *flags, time = (self.fmi.newDiscreteStates if two else self.fmi.updateDiscreteStates)()
+        self.next_event_time = time if flags[4] else None
+        return [bool(flag) for flag in flags]
+
+    def completed_integrator_step(self) -> tuple[bool, bool]:
+        """Tell that the importer's step ended; return whether to enter event mode, and to end."""
+        event, end = self.fmi.completedIntegratorStep()
+        return event, end
+
+    def vector(self, function: str, count: int) -> FloatArray:
+        """Return a vector that a function of model exchange fills."""
+        values = (c_double * count)()
+        self.require(function, values, count)
+        return np.array(values)
+
+    def derivatives(self, time: float, x: FloatArray, inputs: Mapping[str, float]) -> FloatArray:
+        """Return x' at a time, state vector and inputs (model exchange, continuous-time mode)."""
+        self.fmi.setTime(float(time))
+        self.fmi.setContinuousStates((c_double * len(x))(*x), len(x))
+        self.set(inputs)
+        return self.vector(self.derivatives_function, len(x))
+
+    def directional(
+        self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float] | FloatArray
+    ) -> FloatArray:
+        """Return the derivative of unknowns along a change of knowns."""
+        names = self.references(unknowns), self.references(knowns)
+        return np.array(self.fmi.getDirectionalDerivative(*names, list(seed)))
+
+    def adjoint(
+        self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float] | FloatArray
+    ) -> FloatArray:
+        """Return the gradient with respect to knowns of a weighted sum of unknowns (FMI 3.0)."""
+        names = self.references(unknowns), self.references(knowns)
+        return np.array(self.fmi.getAdjointDerivative(*names, list(seed), len(knowns)))
+
+    def save(self) -> Any:
+        """Return a snapshot of the instance's state; release it with `drop`."""
+        return self.fmi.getFMUState()
+
+    def restore(self, snapshot: Any) -> None:
+        """Set the instance to a snapshot."""
+        self.fmi.setFMUState(snapshot)
+
+    def drop(self, snapshot: Any) -> None:
+        """Release a snapshot."""
+        self.fmi.freeFMUState(snapshot)
+
+    def serialize(self, snapshot: Any) -> bytes:
+        """Return a snapshot as bytes."""
+        return bytes(self.fmi.serializeFMUState(snapshot))
+
+    def deserialize(self, data: bytes) -> Any:
+        """Return the snapshot that bytes hold; release it with `drop`."""
+        return self.fmi.deserializeFMUState(data)

@@ -1,30 +1,220 @@
 """A model-exchange FMU as a model: simulated, identified and diagnosed like any other."""
 
+import math
 import os
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.errors import InputError, PsaError
-from psa_casadi.export.importer.fmu_variables import (
-    Free,
-    Read,
-    plain_name,
-    read_variables,
-)
+from psa_casadi.component import BALANCES, Component, Equations, Expression, Symbols
+from psa_casadi.errors import InputError, Problems, PsaError
+from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.imported import (
     Imported,
+    Selected,
     digest_of,
     imported_of,
     opened,
-    states_of,
 )
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.variables import nominal_value
+from psa_casadi.units import parse_unit
+from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
+
+#: What `free` may be: names, or names with bounds or whole declarations.
+Free = Sequence[str] | Mapping[str, tuple[float, float] | Parameter]
+#: A range whose ends differ by this factor is searched on a logarithmic scale.
+_DECADE = 10.0
+_REALS = ("Real", "Float64")
+
+
+@dataclass(frozen=True)
+class Read:
+    """What a model has of an FMU: the FMU's variables, and their declarations in the same order."""
+
+    selected: Selected
+    states: tuple[State, ...]
+    inputs: tuple[Input, ...]
+    outputs: tuple[Output, ...]
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all variables of the model."""
+        return [
+            *(q.name for q in self.states),
+            *(i.name for i in self.inputs),
+            *(o.name for o in self.outputs),
+            *(p.name for p in self.parameters),
+        ]
+
+
+def read_variables(fmu: Fmu, free: Free | None, values: Mapping[str, float]) -> Read:
+    """Return the variables of an FMU; see `fmu_model`. Raises InputError with every mistake."""
+    problems = Problems()
+    _refuse_unfit(fmu, problems)
+    problems.raise_if_any()
+    table = {v.name: v for v in fmu.description.modelVariables}
+    for name in [n for n in values if n not in table or table[n].causality != "parameter"]:
+        problems.add(f"`values` has '{name}', which is no parameter of {fmu.path.name}.")
+    inputs = [v for v in table.values() if v.causality == "input"]
+    outputs = [v for v in table.values() if v.causality == "output" and v.type in _REALS]
+    wanted = _free(fmu, free, table, problems)
+    problems.raise_if_any()
+    parameters = [_parameter(table[n], given, values, problems) for n, given in wanted.items()]
+    problems.raise_if_any()
+    states = [table[n] for n in fmu.states()]
+    taken = [v.name for v in (*inputs, *outputs)]
+    read = Read(
+        selected=Selected(
+            states=tuple(v.name for v in states),
+            rates=tuple(str(u.variable.name) for u in fmu.description.derivatives),
+            inputs=tuple(v.name for v in inputs),
+            outputs=tuple(v.name for v in outputs),
+            parameters=tuple(wanted),
+            fixed=tuple((n, float(v)) for n, v in values.items() if n not in wanted),
+        ),
+        states=tuple(
+            State(_name(v.name, taken, "_state"), _unit(v), _words(v), fmu.nominals[v.name])
+            for v in states
+        ),
+        inputs=tuple(
+            Input(_name(v.name), _unit(v), _words(v), _number(v.start), fmu.nominals[v.name])
+            for v in inputs
+        ),
+        outputs=tuple(
+            Output(plain_name(v.name), _unit(v), _words(v), fmu.nominals[v.name]) for v in outputs
+        ),
+        parameters=tuple(parameters),
+    )
+    _refuse_twice(read.names, problems)
+    problems.raise_if_any()
+    return read
+
+
+def _refuse_unfit(fmu: Fmu, problems: Problems) -> None:
+    """Note why an FMU is no ordinary differential equation x' = f(t, x, u, p)."""
+    exchange, name = fmu.description.modelExchange, fmu.path.name
+    if exchange is None:
+        problems.add(
+            f"{name} has no model exchange: its equations cannot be asked for. Export it for model"
+            " exchange from the tool that made it."
+        )
+        return
+    if exchange.modelIdentifier != fmu.identifier:
+        problems.add(
+            f"{name} has one binary for each interface; export it for model exchange only."
+        )
+    if exchange.canBeInstantiatedOnlyOncePerProcess:
+        problems.add(
+            f"{name} gives one instance for each process; derivatives by parameters need several."
+        )
+    if fmu.indicator_count():
+        problems.add(
+            f"{name} has {fmu.indicator_count()} event indicators: it switches at events, over"
+            " which no derivative leads. Export it with smooth equations, without events."
+        )
+    for v in fmu.description.modelVariables:
+        if v.causality == "input" and (v.type not in _REALS or v.dimensions):
+            problems.add(f"{name}: the input '{v.name}' is no real number but {v.type}.")
+        elif v.causality == "output" and v.dimensions:
+            problems.add(f"{name}: the output '{v.name}' is an array; give one output for each.")
+
+
+def _free(
+    fmu: Fmu, free: Free | None, table: Mapping[str, Any], problems: Problems
+) -> dict[str, tuple[float, float] | Parameter]:
+    """Return the parameters to identify with their bounds: those given, else the FMU's."""
+    own = {v.name for v in table.values() if v.causality == "parameter" and v.type in _REALS}
+    bounded = {n for n in own if math.isfinite(math.hypot(*fmu.bounds[n]))}
+    if free is None:
+        if not bounded:
+            problems.add(
+                f"No parameter of {fmu.path.name} has a least and a greatest value; name those to"
+                f" identify with bounds, free={{name: (low, high)}}; it has {sorted(own)}."
+            )
+        return {n: fmu.bounds[n] for n in table if n in bounded}
+    given = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
+    found: dict[str, tuple[float, float] | Parameter] = {}
+    for name, bounds in given.items():
+        if name not in own:
+            problems.add(
+                f"`free` has '{name}', which is no real parameter of {fmu.path.name}; it has"
+                f" {sorted(own)}."
+            )
+        elif bounds is None and name not in bounded:
+            problems.add(
+                f"'{name}' has no bounds in {fmu.path.name}; give {{'{name}': (low, high)}}."
+            )
+        else:
+            found[name] = fmu.bounds[name] if bounds is None else bounds
+    return found
+
+
+def _parameter(
+    variable: Any,
+    given: tuple[float, float] | Parameter,
+    values: Mapping[str, float],
+    problems: Problems,
+) -> Parameter:
+    if isinstance(given, Parameter):
+        return given
+    low, high = (float(b) for b in given)
+    value = float(values.get(variable.name, _number(variable.start)))
+    if not low <= value <= high or low == high:
+        problems.add(
+            f"'{variable.name}' is {value:g} in the FMU, outside [{low:g}, {high:g}]; give wider"
+            " bounds, or another value in `values`."
+        )
+    log = low > 0 and high >= _DECADE * low
+    scale = None if value else 0.1 * (high - low)
+    return Parameter(
+        _name(variable.name), value, _unit(variable), (low, high), _words(variable),
+        log=log, scale=scale,
+    )  # fmt: skip
+
+
+def plain_name(name: str) -> str:
+    """Return a name as an identifier: `body.phi[1]` is `body_phi_1`."""
+    plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "variable"
+    return f"_{plain}" if plain[0].isdigit() else plain
+
+
+def _name(name: str, taken: Iterable[str] = (), suffix: str = "_of_fmu") -> str:
+    """Return the name of a symbol: no output's, no sum's of this package, not time."""
+    plain = plain_name(name)
+    if name in taken:
+        return plain + suffix
+    return plain + "_of_fmu" if plain == "time" or plain in BALANCES else plain
+
+
+def _unit(variable: Any) -> str:
+    """Return the unit, "1" where this package does not know it or it is no SI unit."""
+    said = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
+    try:
+        unit = parse_unit(said)
+    except InputError:
+        return "1"
+    return said if unit.ratio == 1 and not unit.offset else "1"
+
+
+def _words(variable: Any) -> str:
+    return str(variable.description or variable.name)
+
+
+def _number(start: Any) -> float:
+    return float(start) if start not in (None, "") else 0.0
+
+
+def _refuse_twice(names: Iterable[str], problems: Problems) -> None:
+    every = list(names)
+    for name in sorted({n for n in every if every.count(n) > 1}):
+        problems.add(f"Two variables of the FMU become '{name}' here; rename one in its model.")
+
 
 #: Points at which it is looked whether a rate is another state, and nothing else.
 _POINTS, _SEED = 4, 0
@@ -95,7 +285,7 @@ def _starts(imported: Imported, read: Read) -> list[float]:
     }
     try:
         with imported.initialised(values) as instance:
-            return [float(x) for x in states_of(instance, len(read.states))]
+            return list(instance.vector("GetContinuousStates", len(read.states)))
     except PsaError as error:
         raise InputError(
             f"{imported.fmu.path}: cannot be initialised ({error}); check `values`."

@@ -11,23 +11,18 @@ import atexit
 import ctypes
 import hashlib
 from collections.abc import Mapping, Sequence
-from ctypes import c_double, c_int, c_size_t, c_uint, c_void_p
+from ctypes import c_double, c_int, c_uint, c_void_p
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
-import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Foreign
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.export.importer.calls import FmuError, Instance
-from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu
+from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError, Instance
 from psa_casadi.simulation.compiler import shared_library
-
-FloatArray = npt.NDArray[np.float64]
 
 _PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))
 #: As often an FMU may ask for another update of its discrete states after initialization.
@@ -153,7 +148,7 @@ class Imported:
                 old.free()
             return None
         self.instances[slot, place] = found
-        return found.component
+        return int(found.fmi.component)
 
     def _addresses(self) -> tuple[int, int]:
         value, slope = self.library[self.name], self.library[f"fwd1_{self.name}"]
@@ -179,7 +174,7 @@ class Imported:
         if self.fmu.description.modelExchange.providesDirectionalDerivative:
             own.append((f"slope{version}", "GetDirectionalDerivative"))
         called = {
-            field: ctypes.cast(getattr(library, self.fmu.prefix + name), c_void_p)
+            field: ctypes.cast(getattr(library, f"fmi{version}{name}"), c_void_p)
             for field, name in own
         }
         arrays = {k: ctypes.cast(a, c_void_p) for k, a in self._kept.items()}
@@ -188,13 +183,6 @@ class Imported:
 
 def _address(function: Any) -> int:
     return ctypes.cast(function, c_void_p).value or 0
-
-
-def states_of(instance: Instance, count: int) -> FloatArray:
-    """Return the continuous states (nx,) of an instance that has just been initialised."""
-    values = (c_double * count)()
-    instance.require("GetContinuousStates", values, c_size_t(count))
-    return np.array(values)
 
 
 def digest_of(file: Path) -> str:

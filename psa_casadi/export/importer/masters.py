@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     MODEL_EXCHANGE,
@@ -16,6 +17,9 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
+from psa_casadi.model.compose import Model
+from psa_casadi.scratch import temporary_folder
+from psa_casadi.simulation.start import start_state
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -70,7 +74,7 @@ def communicate(
     for k, (begin, end) in enumerate(pairwise(times)):
         size = float(end - begin)
         instance.set(dict(zip(names, samples[k], strict=True)))
-        if rates and instance.has_input_rates and not inputs.held:
+        if rates and instance.fmu.version == 2 and not inputs.held:
             slope = (samples[k + 1] - samples[k]) / size
             instance.set_rates(dict(zip(names, slope, strict=True)))
         instance.step(float(begin), size)
@@ -160,3 +164,24 @@ def _solved(
     if not solution.success:
         raise FmuError(f"model exchange stopped after {span[0]:g} s: {solution.message}")
     return list(zip(solution.t, solution.y.T, strict=True))
+
+
+def played_on_fmu(
+    model: Model, time: FloatArray, voltage: FloatArray, *, tolerance: float = 1e-7
+) -> FloatArray:
+    """Export a stack as an FMU, play a voltage (n,) [V] on it, return the displacement (n,) [m].
+
+    The FMU starts in the state that rests at the first voltage and is stepped from sample to
+    sample, the voltage linear in between. Raises PsaError if the FMU cannot be made or run.
+    """
+    u = [i.start for i in model.structure.inputs]
+    u[model.input_names.index("voltage")] = float(voltage[0])
+    start = dict(zip(model.state_names, start_state(model, u).x.tolist(), strict=True))
+    with temporary_folder() as folder:
+        path = export_fmu(model, folder / "stack.fmu", name="stack")
+        with Fmu(path) as fmu:
+            inputs = Signals(("voltage",), time, voltage[:, None])
+            found = co_simulate(
+                fmu, time, inputs, ["displacement"], tolerance=tolerance, values=start
+            )
+    return np.asarray(found[:, 0])

@@ -2,133 +2,116 @@
 
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from psa_casadi.export.common.icon import drawing_of
-from psa_casadi.export.modelica.equations import ModelEquations, Variable, model_equations
-from psa_casadi.export.modelica.sampling import when_lines
-from psa_casadi.export.modelica.words import comment, modifier, number, string, unit_text
+from psa_casadi.export.common.templates import filled
+from psa_casadi.export.modelica.equations import (
+    ModelEquations,
+    Variable,
+    model_equations,
+    when_lines,
+)
+from psa_casadi.export.modelica.expression import comment, modifier, number, string, unit_text
 from psa_casadi.model.compose import Model
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 
 _WIDTH = 100
+#: What a connector stands for, and those of its signals that it determines.
+CONNECTORS = {
+    "pins": (("voltage", "current"), ("voltage",)),
+    "output": (("displacement", "load_force"), ("load_force",)),
+    "tip": (
+        ("tip_position", "tip_velocity", "reaction_force"),
+        ("tip_position", "tip_velocity"),
+    ),
+}
+#: Names of the connectors.
+IDENTIFIERS = ("pin_p", "pin_n", "flange_a", "flange_b")
 
 
-@dataclass(frozen=True)
-class Ports:
-    """What a class has in place of plain inputs: connectors and the equations that tie them.
+def class_text(
+    model: Model, name: str, description: str, annotation: str, connectors: Collection[str] = ()
+) -> str:
+    """Return the text of a model class; its icon is a stack's or a plain one.
 
-    `inputs` are the model's inputs that the connectors determine, `fixed` the parameters that
-    cannot be changed.
+    With `connectors` these stand in the place of inputs and outputs, and the gain of the reaction
+    is fixed. Raises InputError for values that are not finite and for what Modelica cannot write.
     """
+    s = model.structure
+    equations = model_equations(model, IDENTIFIERS if connectors else ())
+    names = equations.names
+    given = {n for c in connectors for n in CONNECTORS[c][1]}
+    shown = "Real" if connectors else "output Real"
 
-    identifiers: tuple[str, ...] = ()
-    declarations: tuple[str, ...] = ()
-    equations: tuple[str, ...] = ()
-    inputs: frozenset[str] = frozenset()
-    fixed: frozenset[str] = frozenset()
+    def declared(its: Iterable[Input | Output], prefix: str) -> list[str]:
+        return [_declaration(model, it, names[it.name], prefix) for it in its]
 
-
-def class_lines(
-    model: Model, name: str, description: str, annotation: str, ports: Ports | None = None
-) -> list[str]:
-    """Return the lines of a model class; its icon is a stack's or a plain one.
-
-    Raises InputError for values that are not finite and for what Modelica cannot write.
-    """
-    ports = ports or Ports()
-    equations = model_equations(model, ports.identifiers)
-    lines = [f"  extends Icons.{drawing_of(model).capitalize()};", *ports.declarations]
-    lines += [*_signals(model, equations, ports), *_components(model, equations, ports)]
-    hidden = _protected(model, equations, ports)
-    lines += ["protected", *hidden] if hidden else []
-    lines += ["equation", *_equation_lines(model, equations), *ports.equations]
-    lines.append(f"  annotation({annotation});")
-    return [f"model {name} {string(description)}", *lines, f"end {name};"]
-
-
-def _signals(model: Model, equations: ModelEquations, ports: Ports) -> list[str]:
-    structure, names = model.structure, equations.names
-    lines = [
-        _input(model, i, names[i.name]) for i in structure.inputs if i.name not in ports.inputs
-    ]
-    prefix = "output Real" if not ports.declarations else "Real"
-    return lines + [_output(model, o, names[o.name], prefix) for o in structure.outputs]
+    public = {names[o.name] for o in s.outputs}
+    hidden = [v for v in (*equations.balances, *equations.parts) if v.name not in public]
+    return filled(
+        "class.mo",
+        name=name,
+        description=description,
+        annotation=annotation,
+        connectors=connectors,
+        gained="G" in model.parameter_names,
+        drawing=drawing_of(model),
+        declarations=[
+            *declared((i for i in s.inputs if i.name not in given), "input Real"),
+            *declared(s.outputs, shown),
+            *_components(model, names, fixed=("reciprocal_gain",) if connectors else ()),
+        ],
+        hidden=[
+            *declared((i for i in s.inputs if i.name in given), "Real"),
+            *(_variable(v) for v in hidden),
+            *(_variable(v, "discrete Real") for v in equations.sampled_parts),
+        ],
+        equations=_equation_lines(model, equations),
+    )
 
 
-def _input(model: Model, it: Input, name: str, prefix: str = "input Real") -> str:
-    start = number(it.start, f"The start of input '{it.name}'")
-    nominal = _nominal(model, it)
-    attributes = (*_units(it), ("start", start), ("nominal", nominal))
-    return f"  {prefix} {name}{modifier(attributes)} {string(it.description)};"
+def _components(model: Model, names: Mapping[str, str], fixed: Collection[str]) -> list[str]:
+    """Return parameters, states and sampled states under a comment that names their component."""
+    lines: list[str] = []
+    states = {s.name: s for s in model.structure.states}
+    for component in model.components:
+        own: list[tuple[Parameter | State, str]] = [
+            (p, "final parameter Real" if p.name in fixed else "parameter Real")
+            for p in component.parameters
+        ]
+        own += [(states[s.name], "Real") for s in component.states]
+        own += [(s, "discrete Real") for s in component.sampled]
+        if own:
+            lines.append("  " + comment(f"{component.name}: {component.description}"))
+            lines += [_declaration(model, it, names[it.name], prefix) for it, prefix in own]
+    return lines
 
 
-def _output(model: Model, it: Output, name: str, prefix: str) -> str:
-    attributes = (*_units(it), ("nominal", _nominal(model, it)))
-    return f"  {prefix} {name}{modifier(attributes)} {string(it.description)};"
-
-
-def _units(it: Input | Output | Parameter | State) -> tuple[tuple[str, str | None], ...]:
+def _declaration(
+    model: Model, it: Input | Output | Parameter | State, name: str, prefix: str
+) -> str:
     shown = string(unit_text(it.display_unit)) if it.display_unit else None
-    return ("unit", string(unit_text(it.unit))), ("displayUnit", shown)
-
-
-def _nominal(model: Model, it: Input | Output | State) -> str:
-    return size_text(nominal_value(it.nominal, model.values), it.name)
+    stated, value = {"unit": string(unit_text(it.unit)), "displayUnit": shown}, ""
+    if isinstance(it, Parameter):
+        for end, bound in zip(("min", "max"), it.bounds, strict=True):
+            if not math.isinf(bound):
+                stated[end] = number(bound, f"A bound of '{it.name}'")
+        value = " = " + number(model.values[it.name], f"Parameter '{it.name}'")
+    else:
+        if not isinstance(it, Output):
+            kind = "input" if isinstance(it, Input) else "state"
+            stated["start"] = number(it.start, f"The start of {kind} '{it.name}'")
+        if isinstance(it, State):
+            stated["fixed"] = "true"
+        stated["nominal"] = size_text(nominal_value(it.nominal, model.values), it.name)
+    return f"  {prefix} {name}{modifier(stated.items())}{value} {string(it.description)};"
 
 
 def size_text(size: float, name: str) -> str:
     """Return the usual size of a variable with three digits."""
     number(size, f"The usual size of '{name}'")
     return repr(float(f"{abs(size):.3g}"))
-
-
-def _components(model: Model, equations: ModelEquations, ports: Ports) -> list[str]:
-    """Return parameters, states and sampled states under a comment that names their component."""
-    lines = []
-    names, states = equations.names, {s.name: s for s in model.structure.states}
-    for component in model.components:
-        own = [_parameter(model, p, names[p.name], ports) for p in component.parameters]
-        own += [_state(model, states[s.name], names[s.name]) for s in component.states]
-        own += [_state(model, s, names[s.name], "discrete Real") for s in component.sampled]
-        if own:
-            lines += ["  " + comment(f"{component.name}: {component.description}"), *own]
-    return lines
-
-
-def _parameter(model: Model, it: Parameter, name: str, ports: Ports) -> str:
-    low, high = (
-        number(bound, f"A bound of '{it.name}'") if not math.isinf(bound) else None
-        for bound in it.bounds
-    )
-    attributes = (*_units(it), ("min", low), ("max", high))
-    value = number(model.values[it.name], f"Parameter '{it.name}'")
-    prefix = "final parameter Real" if it.name in ports.fixed else "parameter Real"
-    return f"  {prefix} {name}{modifier(attributes)} = {value} {string(it.description)};"
-
-
-def _state(model: Model, it: State, name: str, prefix: str = "Real") -> str:
-    start = number(it.start, f"The start of state '{it.name}'")
-    attributes = (
-        *_units(it),
-        ("start", start),
-        ("fixed", "true"),
-        ("nominal", _nominal(model, it)),
-    )
-    return f"  {prefix} {name}{modifier(attributes)} {string(it.description)};"
-
-
-def _protected(model: Model, equations: ModelEquations, ports: Ports) -> list[str]:
-    lines = [
-        _input(model, i, equations.names[i.name], "Real")
-        for i in model.structure.inputs
-        if i.name in ports.inputs
-    ]
-    public = {equations.names[o.name] for o in model.structure.outputs}
-    hidden = [v for v in (*equations.balances, *equations.parts) if v.name not in public]
-    lines += [_variable(v) for v in hidden]
-    return lines + [_variable(v, "discrete Real") for v in equations.sampled_parts]
 
 
 def _variable(it: Variable, prefix: str = "Real") -> str:

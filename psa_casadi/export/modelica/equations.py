@@ -1,19 +1,151 @@
-"""The equations of a model as Modelica text: its balances, named parts, derivatives, outputs."""
+"""The equations of a model as Modelica text: its balances, named parts, derivatives, outputs.
+
+Sampled states are discrete variables, and one when-clause gives their values.
+
+Source: Modelica Language Specification 3.6, sections 3.7.5 (`sample`, `pre`) and 8.3.5 (when).
+"""
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.export.modelica.expression import Graph
-from psa_casadi.export.modelica.parts import Part, known_parts
-from psa_casadi.export.modelica.printer import Printer
-from psa_casadi.export.modelica.sampling import before, following, is_before
-from psa_casadi.export.modelica.words import Identifiers
+from psa_casadi.export.modelica.expression import Graph, Identifiers, Printer, comment
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
+from psa_casadi.scales import static_stiffness, stroke
+from psa_casadi.shapes import direction, magnitude_power, rate_magnitude, signed_power
+
+
+@dataclass(frozen=True)
+class Part:
+    """A named expression: what it is called, its unit, its meaning, and how it is made."""
+
+    name: str
+    unit: str
+    description: str
+    expression: Callable[[Symbols], Expression]
+
+
+def _elastic(s: Symbols) -> Expression:
+    return s.c_P * s.v_y + s.k_P * s.y
+
+
+def _pull(s: Symbols) -> Expression:
+    return s.c_B * (s.v_x - s.v_y) + s.k_B * (s.x - s.y)
+
+
+def _ratio(s: Symbols) -> Expression:
+    return s.f_H / s.h_ref
+
+
+def _stiffness(s: Symbols) -> Expression:
+    """Only a stack has a stroke; the k of another model may be anything."""
+    stroke(s)  # raises AttributeError in a model that is no stack
+    return static_stiffness(s)
+
+
+PARTS: tuple[Part, ...] = (
+    Part("voltage_direction", "1", "smooth sign of the voltage rate", direction),
+    Part("voltage_speed", "V/s", "magnitude of the voltage rate", rate_magnitude),
+    Part("hysteresis_ratio", "1", "hysteresis force over its reference", _ratio),
+    Part(
+        "hysteresis_bend",
+        "1",
+        "magnitude of the ratio to the power n",
+        lambda s: magnitude_power(_ratio(s), s.n),
+    ),
+    Part(
+        "hysteresis_signed_bend",
+        "1",
+        "the same with the sign of the ratio",
+        lambda s: signed_power(_ratio(s), s.n),
+    ),
+    Part("static_stiffness", "N/m", "static stiffness of the stack", _stiffness),
+    Part("stroke", "m", "linear free stroke at rated voltage", stroke),
+    Part("elastic_force", "N", "force of the wafers' spring and damper", _elastic),
+    Part("bonding_force", "N", "force of the bonding layers' spring and damper", _pull),
+    Part("contact_force", "N", "force of the contact on the stage", lambda s: (
+        s.k_c * (s.tip_position - s.x_f) + s.c_c * (s.tip_velocity - s.v_f)
+    )),
+)  # fmt: skip
+
+
+def known_parts(symbols: Symbols) -> list[tuple[Part, Expression]]:
+    """Return the parts whose symbols the model has, with their expressions."""
+    found = []
+    for part in PARTS:
+        try:
+            found.append((part, part.expression(symbols)))
+        except AttributeError:
+            continue
+    return found
+
+
+def before(name: str) -> str:
+    """Return the name of the symbol that stands for a sampled state before an instant."""
+    return f"pre({name})"
+
+
+def is_before(name: str) -> bool:
+    """Whether a symbol stands for a sampled state before an instant."""
+    return name.startswith("pre(")
+
+
+def following(structure: Structure) -> dict[str, Expression]:
+    """Return each sampled state's value after an instant, those before it as symbols `pre(z)`.
+
+    A balance that depends on a sampled state is written out, because its variable has the values
+    after the instant.
+    """
+    moving = _moving_balances(structure)
+    symbols = [structure.symbols[name] for name in moving]
+    terms = [structure.balances[name] for name in moving]
+    earlier = ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(before(s.name)) for s in structure.sampled))
+    found = {}
+    for state in structure.sampled:
+        expression = ca.SX(structure.next[state.name])
+        while any(ca.depends_on(expression, s) for s in symbols):
+            expression = ca.substitute([expression], symbols, terms)[0]
+        found[state.name] = ca.substitute([expression], [structure.z], [earlier])[0]
+    return found
+
+
+def _moving_balances(structure: Structure) -> list[str]:
+    """Return the balances that depend on a sampled state, through others too."""
+    moving: list[str] = []
+    while True:
+        reached = [structure.z, *(structure.symbols[name] for name in moving)]
+        more = [
+            name
+            for name, terms in structure.balances.items()
+            if name not in moving and ca.depends_on(terms, ca.vertcat(*reached))
+        ]
+        if not more:
+            return moving
+        moving += more
+
+
+def when_lines(
+    model: Model,
+    period: str,
+    parts: Iterable[Sequence[str]],
+    equations: Mapping[str, Sequence[str]],
+) -> list[str]:
+    """Return the when-clause of the instants of a period.
+
+    `equations` are the lines of each sampled state's equation, `parts` those of what they share.
+    """
+    lines = [f"  when sample(0, {period}) then"]
+    lines += [f"  {line}" for part in parts for line in part]
+    for component in model.components:
+        if component.sampled:
+            lines.append("    " + comment(f"{component.name}: {component.source.rstrip('.')}"))
+            lines += [f"  {line}" for s in component.sampled for line in equations[s.name]]
+    return [*lines, "  end when;"]
+
 
 #: A repeated expression of this many operations and symbols, or more, gets a variable.
 _WORTH_A_NAME = 8

@@ -9,13 +9,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
-from psa_casadi.export.ssp.layout import OUTSIDE, Layout, Port, Wire, arrange
-from psa_casadi.export.ssp.parameters import parameter_files
+from psa_casadi.export.ssp.drawing import (
+    OUTSIDE,
+    Layout,
+    Port,
+    Wire,
+    arrange,
+    save_wiring,
+    wiring_picture,
+)
 from psa_casadi.export.ssp.steps import master_step
-from psa_casadi.export.ssp.structure import WiredParts, structure_description
-from psa_casadi.export.ssp.wiring_picture import save_wiring, wiring_svg
+from psa_casadi.export.ssp.structure import WiredParts, parameter_files, structure_description
 from psa_casadi.files import atomic_path
-from psa_casadi.model.system.system import System
+from psa_casadi.model.system import System
 from psa_casadi.scratch import temporary_folder
 from psa_casadi.variables import Publication
 
@@ -52,7 +58,7 @@ def export_ssp(
         wiring, layout, bindings, stop_time, master_step(wiring, stop_time)
     )
     entries["SystemStructure.ssd"] = description.encode("utf-8")
-    entries[PICTURE_ENTRY] = wiring_svg(wiring, layout).encode("utf-8")
+    entries[PICTURE_ENTRY] = wiring_picture(wiring, layout, "svg")
     with temporary_folder() as folder:
         for name, model in wiring.parts.items():
             fmu = export_fmu(

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.export.ssp.layout import OUTSIDE
+from psa_casadi.export.ssp.drawing import OUTSIDE
 from psa_casadi.export.ssp.structure import WiredParts
 from psa_casadi.model.compose import Model
 

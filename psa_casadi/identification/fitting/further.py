@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.components import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
+from psa_casadi.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.identification.fitting.prediction import trace_record, traced_by_theta
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment
-from psa_casadi.shown import Note
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.ways import Way
 from psa_casadi.units import FloatArray
@@ -85,14 +85,17 @@ class Further:
         """What is left of the column, and what is odd about it."""
         unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
         named = "" if unit == "1" else f" {unit}"
-        return (Note("column", (self.column, self.rms, named, share)), *self.turned)
+        return (
+            note("column", column=self.column, rms=self.rms, unit=named, share=share),
+            *self.turned,
+        )
 
     @property
     def turned(self) -> tuple[Note, ...]:
         """Say so where a column falls while what it shows rises."""
         if COLUMNS[self.column].scale is not None or self.factors[0] >= 0.0:
             return ()
-        return (Note("turned_column", (self.column,)),)
+        return (note("turned_column", column=self.column),)
 
     @property
     def rms(self) -> float:

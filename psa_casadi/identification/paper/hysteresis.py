@@ -14,8 +14,8 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.identification.paper.linear import Loop
-from psa_casadi.records.quality.noise import high_frequency_noise
-from psa_casadi.shown import Note
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.units import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -80,7 +80,7 @@ def rates_of(loop: Loop, k: float) -> Rates:
     inner = np.zeros(len(u), dtype=np.bool_)
     for branch in branches:
         inner[branch] = True
-    notes = (Note("rough_velocity", (loop.name, 100.0 * _QUIET * excess)),)
+    notes = (note("rough_velocity", loop=loop.name, share=100.0 * _QUIET * excess),)
     return Rates(
         loop.name, k, u, u_rate, x - k * u, x_rate, inner, branches,
         notes if excess > _TOO_MUCH else (),
@@ -175,7 +175,7 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
         line.sign * float(np.exp(line.mean_log - n * line.mean_log_h)) for line in (rising, falling)
     )
     if falling.sign < 0.0:
-        notes.append(Note("lagging_loop"))
+        notes.append(note("lagging_loop"))
     bends = Bends(n, 0.5 * (total - difference), 0.5 * (total + difference))
     return HysteresisPart(A, delta, bends, tuple(notes))
 
@@ -257,10 +257,10 @@ def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> 
 def _lost(line: _Line | None, branch: str, what: str) -> list[Note]:
     """Note where (31) or (34) had no samples, or logarithms of numbers of the wrong sign."""
     if line is None:
-        return [Note("no_samples", (branch, what))]
-    notes = [Note("negative_rising")] if branch == "rising" and line.sign < 0.0 else []
+        return [note("no_samples", branch=branch, what=what)]
+    notes = [note("negative_rising")] if branch == "rising" and line.sign < 0.0 else []
     if line.lost > _FEW:
-        notes.append(Note("wrong_sign", (100.0 * line.lost, branch, what)))
+        notes.append(note("wrong_sign", lost=100.0 * line.lost, branch=branch, what=what))
     return notes
 
 
@@ -270,7 +270,7 @@ def _no_crossing(rates: Sequence[Rates]) -> Note:
         for name, sign in (("rising", 1.0), ("falling", -1.0))
         if not any(_crossing(r, b) for r in rates for b in r.branches if r.sign(b) == sign)
     ]
-    return Note("no_crossing", (missing,))
+    return note("no_crossing", branches=missing)
 
 
 def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[Note]:
@@ -278,10 +278,10 @@ def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[Note]:
     notes = []
     scatter = float(np.std(slopes) / max(abs(float(np.mean(slopes))), 1e-300))
     if scatter > _SCATTER:
-        notes.append(Note("scatter", (100.0 * scatter,)))
+        notes.append(note("scatter", share=100.0 * scatter))
     widest = max(rates, key=lambda r: float(np.ptp(r.u)))
     top = int(np.argmax(np.abs(widest.u)))
     share = abs(float(widest.h[top])) / float(np.max(np.abs(widest.h)))
     if share < _CLOSED:
-        notes.append(Note("secant", (widest.name, 100.0 * share)))
+        notes.append(note("secant", loop=widest.name, share=100.0 * share))
     return notes

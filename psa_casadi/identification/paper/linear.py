@@ -9,9 +9,9 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
-from psa_casadi.shown import Note
 from psa_casadi.units import FloatArray
 
 #: How far the voltage may stray from its two levels, and how long the rise may take of the hold.
@@ -171,7 +171,7 @@ def linear_part(step: Step) -> LinearPart:
     notes = _dependence(step, found)
     wrong = [name for name, value in zip(COEFFICIENTS, found, strict=True) if not value > 0.0]
     if wrong:
-        notes.append(Note("signs", (wrong,)))
+        notes.append(note("signs", names=wrong))
     return LinearPart(dict(zip(COEFFICIENTS, found.tolist(), strict=True)), tuple(notes))
 
 
@@ -226,7 +226,15 @@ def _dependence(step: Step, found: FloatArray) -> list[Note]:
     if change[worst] <= _STEADY:
         return []
     reasons = _reasons(step) or [("short", 0.0)]
-    return [Note("window", (step.name, COEFFICIENTS[worst], change[worst], reasons))]
+    return [
+        note(
+            "window",
+            name=step.name,
+            coefficient=COEFFICIENTS[worst],
+            change=change[worst],
+            reasons=reasons,
+        )
+    ]
 
 
 def _reasons(step: Step) -> list[tuple[str, float]]:
@@ -280,11 +288,11 @@ def mechanics_of(
     """
     denominator = [coefficients[name] for name in reversed(COEFFICIENTS[:5])]
     if not np.all(np.isfinite(denominator)) or denominator[0] == 0.0:
-        return _delay_alone(coefficients), (Note("no_a_5"),)
+        return _delay_alone(coefficients), (note("no_a_5"),)
     roots = np.roots([*denominator, 1.0]).astype(np.complex128)
     if np.any(roots.real >= 0.0):
         count = int(np.sum(roots.real >= 0.0))
-        return _delay_alone(coefficients), (Note("growing_poles", (count,)),)
+        return _delay_alone(coefficients), (note("growing_poles", count=count),)
     b_1 = coefficients["b_1"]
 
     def distance(f: Factors) -> tuple[float, float]:
@@ -301,7 +309,7 @@ def mechanics_of(
     }
     if distance(best)[0] <= _ZERO_AGREES:
         return values, ()
-    return values, (Note("other_zero", (b_1, _zero(best, k_P, k_B), k_P / k_B)),)
+    return values, (note("other_zero", b_1=b_1, nearest=_zero(best, k_P, k_B), ratio=k_P / k_B),)
 
 
 def readings(roots: npt.NDArray[np.complex128]) -> Iterator[Factors]:

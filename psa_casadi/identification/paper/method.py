@@ -28,9 +28,9 @@ from psa_casadi.identification.paper.linear import (
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
-from psa_casadi.shown import Note, sentences
 
 #: The paper's loops are slower than this [Hz], and their lag should stay below this angle [rad].
 _SLOW, _QUASI_STATIC = 1.0, 0.01
@@ -38,23 +38,23 @@ _SLOW, _QUASI_STATIC = 1.0, 0.01
 
 def conditions(step: Step | None, loops: Sequence[Loop], linear: LinearPart | None) -> list[Note]:
     """Note what the records lack: a step, a loop, loops that are slow, from 0 V, without gaps."""
-    notes = [Note("no_step", (bool(loops),))] if step is None else []
-    notes += [] if loops else [Note("no_loop")]
+    notes = [note("no_step", loops=bool(loops))] if step is None else []
+    notes += [] if loops else [note("no_loop")]
     notes += linear.notes if linear else ()
     if not loops:
         return notes
     frequency = loops[0].frequency
     if frequency > 1.001 * _SLOW:
-        notes.append(Note("fast_loops", (frequency,)))
+        notes.append(note("fast_loops", frequency=frequency))
     if linear is not None:
         delay = linear.coefficients["a_1"] - linear.coefficients["b_1"]
         angle = 2.0 * np.pi * frequency * delay
         if angle > _QUASI_STATIC:
-            notes.append(Note("lagging_step", (1e3 * delay, angle, frequency)))
+            notes.append(note("lagging_step", delay=1e3 * delay, angle=angle, frequency=frequency))
     away = [o.name for o in loops if abs(o.first_volts) > 0.02 * float(np.ptp(o.voltage))]
     gaps = [f"{loop.name} ({loop.missing})" for loop in loops if loop.missing]
-    notes += [Note("not_from_rest", (away,))] if away else []
-    notes += [Note("bridged", (gaps,))] if gaps else []
+    notes += [note("not_from_rest", names=away)] if away else []
+    notes += [note("bridged", names=gaps)] if gaps else []
     return notes
 
 
@@ -117,7 +117,17 @@ def _inside(model: Model, wanted: Mapping[str, float]) -> tuple[dict[str, float]
             kept[name] = float(np.clip(value, low, high))
         if not within:
             instead = kept.get(name, model.values[name])
-            refused.append(Note("out_of_range", (name, value, p.unit, low, high, instead)))
+            refused.append(
+                note(
+                    "out_of_range",
+                    name=name,
+                    value=value,
+                    unit=p.unit,
+                    low=low,
+                    high=high,
+                    instead=instead,
+                )
+            )
     return kept, refused
 
 
@@ -147,7 +157,7 @@ class PaperIdentification:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What failed or is doubtful, in words."""
-        return sentences(self.notes)
+        return texts(self.notes)
 
 
 def paper_method(
@@ -202,10 +212,10 @@ def identify_by_paper(
     except PsaError:
         usual = paper.model.with_values(ordinary_values(paper.model, records))
         best = fit(usual, experiments, [], sigma=sigma)
-        doubts, found = (*doubts, Note("runs_away")), ()
+        doubts, found = (*doubts, note("runs_away")), ()
     nothing = determinacy(best, experiments)
     model = with_provenance(best.model, nothing, records, stiffness is not None)
-    notes = (*model.provenance.notes, Note("paper", (found,)).sentence)
+    notes = (*model.provenance.notes, str(note("paper", names=found)))
     provenance = replace(model.provenance, notes=notes)
     return Identification(
         model=replace(model, provenance=provenance),

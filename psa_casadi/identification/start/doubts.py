@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.checks import FEWEST_SAMPLES
-from psa_casadi.records.record import Record
-from psa_casadi.records.turns import reversals
+from psa_casadi.records.drive import reversals
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.units import FloatArray
 
 #: Numbers whose squares would overflow.

@@ -24,7 +24,7 @@ from psa_casadi.identification.start.linear_response import (
     respond,
 )
 from psa_casadi.records.drive import turns
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 

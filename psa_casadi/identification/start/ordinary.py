@@ -20,7 +20,8 @@ from typing import Literal
 
 import numpy as np
 
-from psa_casadi.components import BASE, BOUC_WEN, MEMORY_SPECTRUM
+from psa_casadi.components import BASE
+from psa_casadi.components.stack import BOUC_WEN, MEMORY_SPECTRUM
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.start.doubts import (
@@ -30,9 +31,9 @@ from psa_casadi.identification.start.doubts import (
     stray,
 )
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.notes import note, texts
+from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
-from psa_casadi.shown import Note, sentences
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval
 
@@ -100,10 +101,12 @@ class Capacitance:
 
     def sentence(self, value: float) -> str:
         """What the current says, in words; `value` [F] is that of the model."""
-        ends = (1e6 * self.interval.low, 1e6 * self.interval.high)
-        of = (self.source, 1e6 * self.value, *ends, 100 * self.explained)
-        kept = () if self.is_that_of(value) else (Note("capacitance_kept", (1e6 * value,)),)
-        return " ".join(sentences((Note("capacitance", of), *kept)))
+        found = note(
+            "capacitance", source=self.source, value=1e6 * self.value, low=1e6 * self.interval.low,
+            high=1e6 * self.interval.high, share=100 * self.explained,
+        )  # fmt: skip
+        kept = () if self.is_that_of(value) else (note("capacitance_kept", value=1e6 * value),)
+        return " ".join(texts((found, *kept)))
 
 
 def capacitance_of(records: Sequence[Record]) -> Capacitance | None:

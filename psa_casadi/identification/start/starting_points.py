@@ -49,7 +49,7 @@ from psa_casadi.identification.start.linear_response import (
 from psa_casadi.identification.start.ordinary import has_loop, loop_starts
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
-from psa_casadi.records.quality.noise import high_frequency_noise
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 

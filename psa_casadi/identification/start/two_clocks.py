@@ -25,9 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.identification.start.linear_response import orthonormal, plays
-from psa_casadi.records.quality.filtering import filtered
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
-from psa_casadi.shown import Note
 from psa_casadi.units import FloatArray
 
 #: Beats that a record may hold; phases that are tried, and how much finer than 1/T the rates.
@@ -209,18 +209,21 @@ class TwoClocks:
 
     def sentence(self, record: Record) -> str:
         """Say what was found in the record."""
-        return f"{self._note(record).sentence}."
+        return str(self.note(record))
 
-    def _note(self, record: Record) -> Note:
+    def note(self, record: Record, code: str = "two_clocks") -> Note:
+        """Return what was found in the record."""
         scale, unit = (1e9, "nm") if record.displacement_unit == "m" else (1.0, "counts")
         off = scale * float(np.sqrt(np.nanmean(self.moved**2)))
         way = "falls" if self.falling else "grows"
-        of = (record.name, way, 1e3 * self.height, self.period, off, unit)
-        return Note("two_clocks", of)
+        return note(
+            code, record=record.name, way=way, height=1e3 * self.height, period=self.period,
+            off=off, unit=unit,
+        )  # fmt: skip
 
 
-def on_one_clock(record: Record) -> tuple[Record, tuple[str, ...]]:
-    """Return the record with its readings on one clock, and a sentence where they were on two.
+def on_one_clock(record: Record) -> tuple[Record, tuple[Note, ...]]:
+    """Return the record with its readings on one clock, and a note where they were on two.
 
     Name, `source` and `sha256` are kept: the correction repeats from the file.
     """
@@ -228,7 +231,7 @@ def on_one_clock(record: Record) -> tuple[Record, tuple[str, ...]]:
     if found is None:
         return record, ()
     undone = replace(found.undone(record), source=record.source, sha256=record.sha256)
-    return undone, (f"{found.sentence(record)[:-1]}{Note('clocks_undone').sentence}",)
+    return undone, (found.note(record, "clocks_undone"),)
 
 
 def two_clocks(record: Record) -> TwoClocks | None:

@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from psa_casadi.errors import InputError
-from psa_casadi.records.read.names import unit_named
+from psa_casadi.records.read.columns import unit_named
 from psa_casadi.units import to_si
 
 _END = "***End_of_Header***"

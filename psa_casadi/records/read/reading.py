@@ -6,28 +6,202 @@ content.
 """
 
 import hashlib
+import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeGuard, cast
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.files import atomic_write
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.column_map import ALL, TABLE, columns_of, parse_columns
-from psa_casadi.records.read.columns import ColumnMap, Source
-from psa_casadi.records.read.convert import Request
-from psa_casadi.records.read.join import joined, parts_of
-from psa_casadi.records.read.samples import Outcome, samples_of
-from psa_casadi.records.read.table import Columns
-from psa_casadi.records.read.table import Table as FileTable
+from psa_casadi.records.read.choose import rises
+from psa_casadi.records.read.columns import (
+    ALL,
+    COLUMNS,
+    SI_UNITS,
+    TABLE,
+    ColumnMap,
+    Source,
+    columns_of,
+    parse_columns,
+    stated_unit,
+)
+from psa_casadi.records.read.formats import Series, array_tables
+from psa_casadi.records.read.samples import Outcome, Request, samples_of
+from psa_casadi.records.read.table import (
+    Cells,
+    Columns,
+    Table,
+    decimal_sign,
+    is_stamp,
+    numbers_in,
+    seconds_of,
+)
 from psa_casadi.records.read.text import label_of
-from psa_casadi.records.record import Record
-from psa_casadi.units import parse_unit, to_si
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
+from psa_casadi.units import FloatArray, parse_unit, to_si
+
+
+def parts_of(path: str) -> list[str]:
+    """Return the files that "a.csv+b.csv" names; the path itself where it is one file."""
+    parts = path.split("+")
+    return parts if not Path(path).exists() and all(Path(p).is_file() for p in parts) else [path]
+
+
+def joined(
+    files: Sequence[tuple[str, Sequence[Table], str]], request: Request, *, alone: bool = False
+) -> tuple[Outcome, str]:
+    """Return the samples of files that hold the channels of one record, and a hash of them all.
+
+    Each file is given by its path, its tables and its SHA-256. The clock is that of the first;
+    where another differs, its channels are interpolated at those instants that both have, and a
+    note says so. A channel's name that several files have gets the file's in front. `alone` refuses
+    files of several channels.
+
+    Raises:
+        InputError: a file is no table of a time and channels.
+    """
+    held = [(path, *_channels(path, tables)) for path, tables, _ in files]
+    clocks = _clocks([(path, cells, unit) for path, cells, unit, _ in held])
+    channels, resampled = [], []
+    for (path, _, _, own), time in zip(held, clocks, strict=True):
+        if alone and len(own) != 1:
+            raise InputError(f"{path}: holds {len(own)} channels beside the time, expected one.")
+        channels += [(path, name, unit, time, values) for name, unit, values in own]
+    first = clocks[0]
+    shared = (first >= max(t[0] for t in clocks)) & (first <= min(t[-1] for t in clocks))
+    if shared.sum() < FEWEST_SAMPLES:
+        raise InputError(
+            f"{files[0][0]}: its clock and that of {files[1][0]} have no instants in common (begin:"
+            f" {clocks[0][0]:.9g} and {clocks[1][0]:.9g} s); let both begin with the record."
+        )
+    names = [name for _, name, *_ in channels]
+    found = [Series("time", int(shared.sum()), lambda: first[shared], "s")]
+    for path, name, unit, time, values in channels:
+        label = f"{Path(path).stem}.{name}" if names.count(name) > 1 else name
+        same = np.array_equal(time, first)
+        resampled += [] if same else [Path(path).name]
+        kept = (values if same else np.interp(first, time, values))[shared]
+        found.append(Series(label, kept.size, partial(np.asarray, kept), unit))
+    together = "+".join(path for path, *_ in files)
+    outcome = samples_of(together, array_tables(together, found)[:1], request)
+    if outcome.samples is not None:
+        notes = [f"the channels of {len(files)} files are one record."]
+        if resampled:
+            notes.append(
+                f"{', '.join(resampled)} has another clock: it is interpolated at the instants of"
+                f" {Path(files[0][0]).name}."
+            )
+        outcome.samples = replace(outcome.samples, notes=(*outcome.samples.notes, *notes))
+    digest = hashlib.sha256("".join(sha for *_, sha in files).encode()).hexdigest()
+    return outcome, digest
+
+
+def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
+    """Return the times of files, each given by path, cells and unit, on one clock [s].
+
+    Dates and clock times are counted from the first of all files together.
+    """
+    texts = [[str(cell) for cell in cells] for _, cells, _ in times]
+    are_stamps = [is_stamp(own[0]) for own in texts]
+    together = seconds_of([cell for own in texts for cell in own]) if all(are_stamps) else None
+    if together is not None:
+        return np.split(together, np.cumsum([len(own) for own in texts])[:-1])
+    if any(are_stamps):
+        named = ", ".join(path for path, *_ in times)
+        raise InputError(f"{named}: some have dates or clock times, others numbers; give all one.")
+    return [to_si(_numbers(cells), unit) for _, cells, unit in times]
+
+
+def _channels(
+    path: str, tables: Sequence[Table]
+) -> tuple[Cells, str, list[tuple[str, str | None, FloatArray]]]:
+    """Return the times of a file with their unit, and its channels: name, unit, values."""
+    table = tables[0] if tables else None
+    at = next((k for k in range(len(table.header)) if rises(table, k)), None) if table else None
+    if table is None or at is None:
+        raise InputError(f"{path}: holds no time, which files to be joined need.")
+    problems = Problems()
+    columns = table.load(range(len(table.header)), None, problems)
+    problems.raise_if_any()
+    units = [stated_unit(text) for text in table.header]
+    numbers = {k: _numbers(cells) for k, cells in enumerate(columns.cells) if k != at}
+    own = [
+        (table.labels[k], units[k], values)
+        for k, values in numbers.items()
+        if np.isfinite(values).any()
+    ]
+    return columns.cells[at], units[at] or "s", own
+
+
+def _numbers(cells: Cells) -> FloatArray:
+    if isinstance(cells, np.ndarray):
+        return cells.astype(np.float64)
+    return numbers_in(cells, decimal_sign(cells), "").values
+
+
+_NAME = re.compile(r"[a-z]\w*(?:\.\w+)* \[(?P<unit>[^\[\]]+)\]", re.IGNORECASE)
+
+
+def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, ArrayLike]) -> None:
+    """Write a record, or columns, to a CSV file, whole or not at all.
+
+    A record is written in SI units. The keys of columns are the header, `name [unit]` each; the
+    values, shape (n,), are written in that unit as the shortest decimal number that reads back as
+    the same float. nan becomes an empty cell.
+
+    Raises:
+        InputError: a key is not `name [unit]`, a unit is unknown, the columns differ in length or
+            there are none, or the file cannot be written.
+    """
+    named = _columns_of(columns) if isinstance(columns, Record) else columns
+    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in named.items()}
+    problems = Problems()
+    if not arrays:
+        problems.add(f"{path}: there are no columns to write; give at least one.")
+    shape = next(iter(arrays.values())).shape if arrays else (0,)
+    for name, array in arrays.items():
+        _check_name(name, problems)
+        if array.ndim != 1 or array.shape != shape:
+            problems.add(
+                f"column '{name}' has shape {array.shape}, the first has {shape}; give every "
+                f"column one value for each instant."
+            )
+    problems.raise_if_any()
+    cells = [map(_cell, array.tolist()) for array in arrays.values()]
+    lines = [",".join(arrays), *map(",".join, zip(*cells, strict=True)), ""]
+    atomic_write(path, "\n".join(lines))
+
+
+def _columns_of(record: Record) -> dict[str, ArrayLike]:
+    units = {**SI_UNITS, "displacement": record.displacement_unit, "displacement_2": "m"}
+    columns = {name: getattr(record, name) for name in COLUMNS}
+    return {f"{name} [{units[name]}]": v for name, v in columns.items() if v is not None}
+
+
+def _check_name(name: str, problems: Problems) -> None:
+    match = _NAME.fullmatch(name)
+    if match is None:
+        problems.add(f"the column name '{name}' is not of the form 'name [unit]'; correct it.")
+        return
+    try:
+        parse_unit(match["unit"])
+    except InputError as error:
+        problems.add(f"column '{name}': {error}")
+
+
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else repr(value)
+
 
 AnyPath = str | os.PathLike[str]
 
@@ -45,9 +219,9 @@ class Frame(Protocol):
         ...
 
 
-Table = Frame | Mapping[str, npt.ArrayLike]
+TableLike = Frame | Mapping[str, npt.ArrayLike]
 #: What stands for one record wherever records are asked for.
-OneRecord = Record | AnyPath | Table
+OneRecord = Record | AnyPath | TableLike
 #: What stands for the records of one device.
 Records = OneRecord | Iterable[OneRecord]
 
@@ -126,7 +300,7 @@ def read_records(
 
 
 def record_from(
-    table: Table,
+    table: TableLike,
     *,
     name: str = "record",
     need_displacement: bool = True,
@@ -154,7 +328,7 @@ def record_from(
     return _record(name, outcome, digest.hexdigest(), source="")
 
 
-def _table_of(table: Table, name: str) -> FileTable:
+def _table_of(table: TableLike, name: str) -> Table:
     """Return a table in memory as the tables of files are."""
     own = list(table if isinstance(table, Mapping) else table.columns)
 
@@ -165,7 +339,7 @@ def _table_of(table: Table, name: str) -> FileTable:
 
     header = [str(text) for text in own]
     labels = [label_of(text) for text in header]
-    return FileTable(name, "", header, labels, f"{name}: column names", "row", load)
+    return Table(name, "", header, labels, f"{name}: column names", "row", load)
 
 
 def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
@@ -265,7 +439,7 @@ def _is_one(given: Records) -> TypeGuard[OneRecord]:
     return isinstance(given, Record | str | os.PathLike) or _is_table(given)
 
 
-def _is_table(given: object) -> TypeGuard[Table]:
+def _is_table(given: object) -> TypeGuard[TableLike]:
     return isinstance(given, Mapping) or hasattr(given, "columns")
 
 

@@ -1,15 +1,23 @@
 """What every file is read to: tables of named columns, whose cells are numbers or text."""
 
-from collections.abc import Callable, Sequence
+import calendar
+import math
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import date
+from decimal import Decimal
+from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.errors import Problems
-from psa_casadi.records.read.column_map import MARKS
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.read.columns import MARKS, unit_named
+from psa_casadi.records.record import FEWEST_SAMPLES
+from psa_casadi.units import FloatArray, parse_unit, to_si
 
 #: The cells of one column: numbers or instants (n,), or texts.
 Cells = NDArray[Any] | Sequence[str]
@@ -67,3 +75,270 @@ def parts_of_file(tables: Sequence[Table]) -> dict[str, Table]:
     parts = tables[1:] if tables[0].sizes and len(tables) > 1 else tables
     names = [t.name if t.name and not MARKS.search(t.name) else "" for t in parts]
     return {name or str(k): t for k, (name, t) in enumerate(zip(names, parts, strict=True), 1)}
+
+
+#: What instruments and programs write where there is no reading, in lower case: Keysight's OVLD and
+#: OL, PicoScope's infinity, Keyence's -FFFFFFF, MATLAB's and Excel's words, runs of one mark.
+_MISSING = re.compile(
+    r"""[+-]?(nan|n/?a|n\.a\.|\#n/?a|null|none|nil|missing|invalid|error|err|bad|no\ ?data|
+        out\ of\ range|over|ovr|ovf|ovld|ovrng|overflow|overload|overrange|over\ range|under|
+        underflow|underrange|o\.?l\.?|∞|infinity|f{4,}|1\.\#(inf|qnan|snan|ind)(00)?|\#(value!|div/0!|num!|null!|name\?))|
+        [-+.*?_~\#–—]+""",
+    re.I | re.X,
+)
+#: What SCPI instruments send for an overload and for no number.
+_SCPI = (9.9e37, 9.91e37)
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?", re.I)
+_FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d+$)")
+_GROUPS = re.compile(
+    r"[+-]?[1-9]\d{0,2}(?P<mark>[ ,.'’\u00a0\u202f])\d{3}(?:(?P=mark)\d{3})*(?=\D|$)"
+)
+_WITH_UNIT = re.compile(r"(?P<number>[+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*(?P<unit>[^\d\s.,].*)")
+SWAPPED = str.maketrans(".,", ",.")
+
+
+@dataclass
+class Parsed:
+    """Numbers of one column, nan where there is none; which cells are no numbers or no reading."""
+
+    values: FloatArray
+    wrong: NDArray[np.bool_]
+    missing: int
+
+
+def is_number(text: str) -> bool:
+    """Whether a text is a number as it may stand in a table, or an empty cell's word."""
+    text = text.strip().strip('"').strip()
+    return bool(
+        _NUMBER.fullmatch(_FORTRAN.sub("e", text)) or text.lower() in ("nan", "inf", "-inf")
+    )
+
+
+def is_missing(text: str) -> bool:
+    """Whether a text stands for a reading that is not there."""
+    return not text.strip() or _MISSING.fullmatch(text.strip()) is not None
+
+
+def unit_in(cells: Sequence[str]) -> str | None:
+    """Return the unit that stands in the first cell that is a number with a unit, else None."""
+    for cell in cells[:50]:
+        if (match := _WITH_UNIT.fullmatch(cell.strip())) and not _FORTRAN.search(cell):
+            return unit_named(match["unit"], common=False)
+        if not is_missing(cell):
+            return None
+    return None
+
+
+def decimal_sign(cells: Iterable[str]) -> str:
+    """Return the decimal sign of cells: of the first that has one sign only, not between groups.
+
+    Of two signs in one cell the last is the decimal one.
+    """
+    for cell in cells:
+        bare = cell.strip()
+        point, comma = bare.rfind("."), bare.rfind(",")
+        if point >= 0 and comma >= 0:
+            return "." if point > comma else ","
+        if max(point, comma) >= 0 and is_number(bare):
+            return "." if point >= 0 else ","
+    return "."
+
+
+def without_overload(values: FloatArray) -> Parsed:
+    """Return numbers as a column, nan where an instrument sent that there is no reading."""
+    over = np.isin(np.abs(values), _SCPI)
+    values = np.where(over, math.nan, values) if over.any() else values
+    return Parsed(values, np.zeros(values.size, np.bool_), int(np.isnan(values).sum()))
+
+
+def numbers_in(cells: Sequence[str], point: str, unit: str) -> Parsed:
+    """Return the numbers in texts with a decimal `point`; a cell's own unit is turned to `unit`."""
+    plain = cells if point == "." else [c.translate(SWAPPED) for c in cells]
+    try:
+        values = np.array(list(map(float, plain)))
+    except ValueError:
+        values = np.zeros(0)
+    if values.size == len(cells) and "_" not in "".join(cells):
+        return without_overload(values)
+    known = {cell: _number(cell, point, unit) for cell in set(cells)}
+    found = [known[cell] for cell in cells]
+    parsed = without_overload(np.array([math.nan if v is None else v for v in found]))
+    wrong = np.array([v is None for v in found], dtype=np.bool_)
+    return Parsed(parsed.values, wrong, parsed.missing - int(wrong.sum()))
+
+
+def _number(cell: str, point: str, unit: str) -> float | None:
+    """Return the number of a cell, nan where it says that there is none, else None."""
+    text = _FORTRAN.sub("e", cell.strip())
+    if is_missing(text):
+        return math.nan
+    if (groups := _GROUPS.match(text)) and groups["mark"] != point:
+        text = groups[0].replace(groups["mark"], "") + text[groups.end() :]
+    plain = text.translate(SWAPPED) if point == "," else text
+    try:
+        return None if "_" in text else float(plain)
+    except ValueError:
+        match = _WITH_UNIT.fullmatch(text)
+    own = unit_named(match["unit"], common=False) if match else None
+    value = _number(match["number"], point, unit) if match and own else None
+    return None if value is None or own is None else _in_unit(value, own, unit)
+
+
+def _in_unit(value: float, own: str, unit: str) -> float | None:
+    """Return a cell's number in the unit of its column."""
+    try:
+        one, other = parse_unit(own), parse_unit(unit)
+    except InputError:
+        return None
+    if one.dimension != other.dimension:
+        return None
+    return value if one == other else value * float(one.ratio / other.ratio)
+
+
+_DAY = 86400.0
+_MONTHS = {name.lower(): k for k, name in enumerate(calendar.month_abbr) if name} | {
+    "mär": 3, "mai": 5, "okt": 10, "dez": 12,
+}  # fmt: skip
+_STAMP = re.compile(
+    r"""(?:(?P<a>\d{1,4})[-./\ ](?P<b>\d{1,2}|[^\W\d_]{3,9})\.?[-./\ ](?P<c>\d{1,4}),?
+        (?:[T\s;]+|$))?
+        (?:(?P<h>\d{1,2}):(?P<m>\d{2})(?::(?P<s>\d{2}))?(?:[.,:](?P<f>\d+))?)?\s*
+        (?P<half>[AaPp]\.?[Mm]\.?)?\s*(?:(?P<zone>[+-]\d{2}:?\d{2})|Z|UTC|GMT|CES?T|[A-Z]{3,4})?""",
+    re.X,
+)
+#: Times beyond this keep less than 15 ns in a float of seconds.
+_LARGE = 1e8
+#: The powers of ten of which 1e9 to 4e9 (the years 2001 to 2096) count the seconds since 1970.
+_EPOCHS = {"s": 0, "ms": 3, "us": 6, "ns": 9}
+
+
+def is_stamp(cell: str) -> bool:
+    """Whether a text is a date, a clock time or both."""
+    found = _STAMP.fullmatch(cell.strip().strip('"'))
+    return found is not None and (found["h"] is not None or found["a"] is not None)
+
+
+def unit_of_times(times: FloatArray) -> str | None:
+    """Return the unit that the size of the first times tells, None where it tells none.
+
+    They are counted from 1970; or they are days since the year 0, as MATLAB counts them: seconds of
+    that size would be samples of 500 kHz after nine days.
+    """
+    if times.size < 2 or not np.isfinite(times).all():
+        return None
+    for unit, power in _EPOCHS.items():
+        if 1e9 <= times[0] / 10**power < 4e9:
+            return unit
+    step = float(np.median(np.diff(times)))
+    return "d" if 7.2e5 <= times[0] < 7.7e5 and 0.0 < step < 2e-6 else None
+
+
+def seconds_of(cells: Sequence[str]) -> FloatArray | None:
+    """Return dates and clock times as seconds from the first (n,); None where a cell is neither.
+
+    Of 3/4/2024 the day is what makes the record the shorter one; a clock that goes back by more
+    than half a day has passed midnight.
+    """
+    found = [_STAMP.fullmatch(cell.strip().strip('"')) for cell in cells]
+    if not found or any(m is None or (m["h"] is None and m["a"] is None) for m in found):
+        return None
+    stamps = [m for m in found if m is not None]
+    clock = _since_first([_clock(m) for m in stamps])
+    if stamps[0]["a"] is None:
+        back = np.diff(clock, prepend=clock[0])
+        return clock + _DAY * np.cumsum((back < -0.5 * _DAY).astype(float))
+    days = [d for first in (True, False) if (d := _days(stamps, day_first=first)) is not None]
+    whole = [clock + _DAY * d for d in days]
+    return min(whole, key=lambda t: (bool((np.diff(t) < 0.0).any()), np.ptp(t)), default=None)
+
+
+def _clock(stamp: re.Match[str]) -> Fraction:
+    """Return the time of day [s]; with two numbers and a fraction these are minutes and seconds."""
+    h, m, s = (int(stamp[k] or 0) for k in "hms")
+    if stamp["s"] is None and stamp["f"] is not None:
+        h, m, s = 0, h, m
+    if stamp["half"]:
+        h = h % 12 + 12 * (stamp["half"][0] in "pP")
+    zone = (stamp["zone"] or "+0000").replace(":", "")
+    shift = int(zone[0] + "1") * (60 * int(zone[1:3]) + int(zone[3:5]))
+    digits = stamp["f"] or "0"
+    return 3600 * h + 60 * (m - shift) + s + Fraction(int(digits), 10 ** len(digits))
+
+
+def _since_first(times: Sequence[Fraction]) -> FloatArray:
+    return np.array([float(t - times[0]) for t in times])
+
+
+def _days(stamps: Sequence[re.Match[str]], *, day_first: bool) -> FloatArray | None:
+    """Return the days from the first date, None where there is no such date."""
+    known: dict[tuple[str, str, str], int] = {}
+    try:
+        for key in {(m["a"], m["b"], m["c"]) for m in stamps}:
+            a, b, c = key
+            month = None if b.isdecimal() else _MONTHS[b[:3].lower()]
+            if len(a) == 4:
+                year, middle, last = int(a), month or int(b), int(c)
+                known[key] = date(year, middle, last).toordinal()
+            else:
+                year = int(c) + 2000 * (len(c) < 3)
+                day, middle = (int(a), month or int(b)) if day_first or month else (int(b), int(a))
+                known[key] = date(year, middle, day).toordinal()
+    except (ValueError, KeyError):
+        return None
+    days = np.array([float(known[m["a"], m["b"], m["c"]]) for m in stamps])
+    return np.asarray(days - days[0])
+
+
+def as_times(cells: Cells, unit: str) -> FloatArray | None:
+    """Return instants, clock times and large numbers as times from the first, in a unit.
+
+    A float would lose the last digits of large numbers. None for all others.
+    """
+    if not isinstance(cells, np.ndarray):
+        stamps = seconds_of(cells)
+        return _large(cells) if stamps is None else stamps / float(to_si(1.0, unit))
+    if cells.dtype.kind in "mM":
+        since = (cells - cells[:1]).astype("timedelta64[ns]").astype(np.int64)
+        return np.asarray(since / 1e9 / float(to_si(1.0, unit)))
+    if cells.dtype.kind in "iu" or (
+        np.abs(cells[:1]).max(initial=0.0) > _LARGE and np.isfinite(cells).all()
+    ):
+        return np.asarray((cells - cells[:1]).astype(np.float64))
+    return None
+
+
+def _large(cells: Sequence[str]) -> FloatArray | None:
+    texts = [c.strip().strip('"').replace(",", ".") for c in cells]
+    try:
+        if not texts or abs(float(texts[0])) <= _LARGE:
+            return None
+        exact = [Decimal(text) for text in texts]
+        return np.array([float(one - exact[0]) for one in exact])
+    except (ValueError, ArithmeticError):
+        return None
+
+
+def evened(time: FloatArray) -> tuple[FloatArray, float] | None:
+    """Return an even time and its step for one that was written with too few digits, else None.
+
+    It repeats and never goes back; an even time between its first and last instants, rounded to its
+    steps, is the same.
+    """
+    steps = np.diff(time)
+    if time.size < FEWEST_SAMPLES or (steps < 0.0).any() or not (steps == 0.0).any():
+        return None
+    if not (steps > 0.0).any():
+        return None
+    quantum = float(steps[steps > 0.0].min())
+    k = np.arange(time.size)
+    step = float(np.polyfit(k, time - time[0], 1)[0])
+    for even in (*(float(f"{step:.{digits}g}") for digits in range(1, 7)), step):
+        if 0.0 < even <= 0.9 * quantum and np.ptp(time - even * k) <= 1.01 * quantum:
+            return time[0] + even * k, even
+    return None
+
+
+def starts_of(time: FloatArray) -> NDArray[np.int64]:
+    """Return the indices at which the time begins anew, the first sample among them."""
+    with np.errstate(invalid="ignore"):
+        return np.flatnonzero(np.r_[True, np.diff(time) < 0.0])

@@ -2,21 +2,11 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from psa_casadi.diagnosis.budget import Budget
-from psa_casadi.diagnosis.held_out.errors import Errors, Gain
-from psa_casadi.diagnosis.result import (
-    BlindSpot,
-    Candidate,
-    Cause,
-    Decision,
-    NextExperiment,
-    Remaining,
-    Verdict,
-    unnamed_causes,
-)
+from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
+from psa_casadi.diagnosis.result import Candidate, Cause, Verdict, unnamed_causes
 from psa_casadi.shown import Lined
 
 
@@ -62,6 +52,62 @@ class OtherModel:
     rms_ratio: float
     plant_differs_m: float
     plant_differs_percent: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a further column decided: what is named with it and without it, and in words.
+
+    An `output` is fitted, with `noise` and held-out errors `base_rms` and `extended_rms` in its SI
+    `unit`; an `input` drives the model, and has none. `named` and `named_without` hold the named
+    sets with their probabilities, `ruled_out` what is only in the latter; `evidence` is what the
+    column adds to ln of the Bayes factor of the extended model over the base.
+    """
+
+    column: str
+    role: Literal["output", "input"]
+    unit: str
+    noise: float | None
+    base_rms: float | None
+    extended_rms: float | None
+    named: Mapping[str, float]
+    named_without: Mapping[str, float]
+    ruled_out: tuple[str, ...]
+    evidence: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class BlindSpot:
+    """An effect of practical size that the records could not have shown."""
+
+    effect: str
+    smallest_detectable_gain: float
+    unit: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """What is left: whether it is noise, and where it is not."""
+
+    white: bool
+    p_value: float
+    where: str
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """The experiment that would distinguish the rivals.
+
+    `voltage_csv` is the file with the voltage to play, where one was written; `chance` is for each
+    rival the probability that it is then named if it is the cause.
+    """
+
+    voltage_csv: str | None
+    separates: tuple[str, ...]
+    why: str
+    chance: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

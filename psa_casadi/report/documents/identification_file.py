@@ -9,7 +9,7 @@ import numpy as np
 from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.records.record import Record
-from psa_casadi.report.words.grades import Degree, grade
+from psa_casadi.report.words.fit_words import Degree, grade
 from psa_casadi.version import __version__
 
 FORMAT: Literal["psa_casadi.identification/1"] = "psa_casadi.identification/1"

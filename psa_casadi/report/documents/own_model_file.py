@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from psa_casadi.any_model.budget import OdeBudget
-from psa_casadi.any_model.result import OutputError, PortCause
-from psa_casadi.diagnosis.result import Candidate, Remaining, Verdict
-from psa_casadi.report.documents.diagnosis_file import RecordUsed, Told
+from psa_casadi.any_model.result import OdeBudget, OutputError, PortCause
+from psa_casadi.diagnosis.result import Candidate, Verdict
+from psa_casadi.report.documents.diagnosis_file import RecordUsed, Remaining, Told
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,8 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.patch_plot import patch_plot
-from psa_casadi.report.words.budget_words import budget_table, patch_text
-from psa_casadi.report.words.phrases import scale_of
-from psa_casadi.report.words.verdict_words import added
+from psa_casadi.report.words.phrases import added, scale_of
+from psa_casadi.report.words.verdict_words import budget_table, patch_text
 
 
 def add_budget(page: Document, d: Diagnosis) -> None:

@@ -1,16 +1,17 @@
 """The part of a page that says why a cause was named: evidence, signature beside the data."""
 
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
-from psa_casadi.diagnosis.residual.misfit import Misfit
-from psa_casadi.diagnosis.residual.signature import Signature, signature
+from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.result import Cause, Diagnosis
+from psa_casadi.diagnosis.signature import Signature, signature
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.misfit_part import data_view, drawn
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.finding_plots import evidence_plot
 from psa_casadi.report.plots.signature_figure import size_sentence
 from psa_casadi.report.plots.view_plots import signature_plot, view_named
-from psa_casadi.report.words.phrases import either, percent, plain
+from psa_casadi.report.words.misfit_words import AXES
+from psa_casadi.report.words.phrases import either, lowered, percent, plain
 from psa_casadi.report.words.verdict_words import alternative_sentence, cause_size
 
 #: Causes whose signatures are drawn.
@@ -87,7 +88,7 @@ def _signature(page: Document, d: Diagnosis, cause: Cause) -> None:
     note = size_sentence(seen)
     if seen.telling.name == "holds":
         note += " Counted from the beginning of the hold, in the direction of the last change."
-    title = f"{seen.telling.title[0].lower()}{seen.telling.title[1:]}"
+    title = lowered(AXES[seen.telling.name].title)
     caption = f"{plain(effect.name).capitalize()}, simulated: {title}"
     pictures = [Picture(caption, signature_plot(seen), note)]
     data = _of_the_data(d, seen)
@@ -108,9 +109,8 @@ def _of_the_data(d: Diagnosis, seen: Signature) -> Picture | None:
     if not strongest:
         return None
     other = data_view(d, *strongest[0])
-    note = (
-        f"No record has {seen.telling.title.lower()} to compare; this is the view that shows most."
-    )
+    title = AXES[name].title.lower()
+    note = f"No record has {title} to compare; this is the view that shows most."
     return Picture(other.caption, other.plot, note) if other is not None else None
 
 

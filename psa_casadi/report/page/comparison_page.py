@@ -10,7 +10,8 @@ from psa_casadi.population.population import Difference, differences
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.device_plots import budget_plot, difference_plot, error_plots
-from psa_casadi.report.words.comparison_words import (
+from psa_casadi.report.words.phrases import number, one_unit
+from psa_casadi.report.words.population_words import (
     budget_table,
     causes_text,
     difference_sentence,
@@ -19,7 +20,6 @@ from psa_casadi.report.words.comparison_words import (
     file_table,
     verdict_table,
 )
-from psa_casadi.report.words.phrases import number, one_unit
 from psa_casadi.report.words.verdict_words import VERDICTS
 
 #: More devices than this are a population.

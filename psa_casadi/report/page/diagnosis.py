@@ -17,15 +17,14 @@ from psa_casadi.report.page.parameter_part import add_parameters
 from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.words.phrases import (
+    added,
     handy_scale,
-    in_page_unit,
     listing,
     one_unit,
     rest_sentence,
     scale_of,
 )
-from psa_casadi.report.words.residuals import residual_figures
-from psa_casadi.report.words.series import Series, most_telling, series_of
+from psa_casadi.report.words.series import Series, most_telling, residual_figures, series_of
 from psa_casadi.report.words.tables import (
     blind_table,
     candidate_table,
@@ -36,7 +35,6 @@ from psa_casadi.report.words.tables import (
 from psa_casadi.report.words.verdict_words import (
     OWN_VOLTAGES,
     VERDICTS,
-    added,
     gain_sentence,
     verdict_sentence,
 )
@@ -163,6 +161,6 @@ def _details(page: Document, d: Diagnosis, series: Sequence[Series], origin: str
         page.paragraph(note, "note")
     if d.noise:
         page.section("Noise")
-        page.bullets(in_page_unit(n.sentence) for n in d.noise)
+        page.bullets(n.sentence for n in d.noise)
     page.section("Records")
     page.table(record_table(d.experiments, origin))

@@ -19,15 +19,23 @@ from psa_casadi.report.plots.finding_plots import correlation_plot, determinacy_
 from psa_casadi.report.plots.profile_plot import profile_plot
 from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.report.words.fit_words import (
+    Grade,
     determined_sentence,
     error_bar_note,
     error_sentence,
+    grades,
+    named,
     pairs_sentence,
+    strong_pairs,
 )
-from psa_casadi.report.words.grades import Grade, grades, named, strong_pairs
 from psa_casadi.report.words.phrases import Scale, number, one_unit
-from psa_casadi.report.words.residuals import ResidualFigures, residual_figures
-from psa_casadi.report.words.series import Series, most_telling, series_of_fit
+from psa_casadi.report.words.series import (
+    ResidualFigures,
+    Series,
+    most_telling,
+    residual_figures,
+    series_of_fit,
+)
 from psa_casadi.report.words.tables import (
     fit_error_table,
     record_table,

@@ -12,7 +12,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.report.page.packed import packed
-from psa_casadi.report.words.grades import determined
+from psa_casadi.report.words.fit_words import determined
 from psa_casadi.report.words.phrases import plain, shown_in
 from psa_casadi.simulation.ways import output_of
 from psa_casadi.units import convert

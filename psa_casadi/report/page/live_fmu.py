@@ -8,15 +8,13 @@ from dataclasses import replace
 from typing import Any
 
 from psa_casadi.errors import InputError
-from psa_casadi.export.common.html_page import page
-from psa_casadi.export.common.markup import default_span, describe
+from psa_casadi.export.common.markup import default_span, describe, page
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import equations
-from psa_casadi.export.fmu.sources import switch_scales
+from psa_casadi.export.fmu.sources import exported_texts, switch_scales
 from psa_casadi.export.fmu.terminals import terminal_entries
-from psa_casadi.export.fmu.texts import exported_texts
 from psa_casadi.model.compose import Model
 from psa_casadi.report.page.packed import packed
 from psa_casadi.variables import Provenance

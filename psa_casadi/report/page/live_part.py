@@ -9,16 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.export.web.module import begun_module
+from psa_casadi.export.web import begun_module
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.live_data import doubles, live_data, singles
-from psa_casadi.report.words.phrases import handy_scale, length_scale
+from psa_casadi.report.words.phrases import added, handy_scale, length_scale
 from psa_casadi.report.words.series import Series, spans, time_scale
-from psa_casadi.report.words.verdict_words import added
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
 

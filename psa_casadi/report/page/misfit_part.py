@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psa_casadi.diagnosis.residual.misfit import WORTH_SAYING, Misfit
+from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.page.document import Document
 from psa_casadi.report.page.packed import Picture
 from psa_casadi.report.plots.view_plots import spectrum_view_plot, view_named, view_plot
-from psa_casadi.report.words.phrases import in_page_unit, length_scale, number, percent, weight
+from psa_casadi.report.words.misfit_words import AXES, weight
+from psa_casadi.report.words.phrases import added, length_scale, lowered, number, percent
 from psa_casadi.report.words.tables import Table
-from psa_casadi.report.words.verdict_words import added
 
 #: Views that say much the same: one of each family is drawn.
 _FAMILIES = {
@@ -86,7 +86,7 @@ def data_view(d: Diagnosis, m: Misfit, name: str) -> Picture | None:
         return None
     plot = view_plot(before, view_named(after, name) if after else None, counts=counts)
     share = f", {percent(before.share)} of the excess" if before.significant else ""
-    return Picture(f"{m.record}: {before.title[0].lower()}{before.title[1:]}{share}", plot)
+    return Picture(f"{m.record}: {lowered(AXES[before.name].title)}{share}", plot)
 
 
 def in_counts(d: Diagnosis, m: Misfit) -> bool:
@@ -119,7 +119,7 @@ def split_table(before: Misfit, after: Misfit | None, *, counts: bool) -> Table:
 def _sentences(page: Document, misfits: Sequence[Misfit]) -> None:
     order = sorted(misfits, key=lambda m: -weight(m))
     for m in order[:_RECORDS]:
-        page.bullets(map(in_page_unit, m.sentences[:_SENTENCES]))
+        page.bullets(m.sentences[:_SENTENCES])
     if len(order) > _RECORDS:
         page.paragraph(
             f"These are the {_RECORDS} of {len(order)} records with the largest error over their"

@@ -16,21 +16,21 @@ from psa_casadi.report.page.record_part import add_records, add_worst
 from psa_casadi.report.page.remedy_part import add_what_now
 from psa_casadi.report.plots.patch_plot import free_plot
 from psa_casadi.report.words.fit_words import whiteness_sentence
-from psa_casadi.report.words.own_series import own_fit_series, own_series
 from psa_casadi.report.words.own_words import (
     own_budget_table,
     own_error_table,
     own_fit_sentence,
+    own_fit_series,
     own_fit_table,
     own_record_table,
+    own_series,
     own_verdict_sentence,
     with_its_unit,
 )
-from psa_casadi.report.words.phrases import percent, plain, rest_sentence
-from psa_casadi.report.words.residuals import residual_figures
-from psa_casadi.report.words.series import Series, most_telling
+from psa_casadi.report.words.phrases import added, percent, plain, rest_sentence
+from psa_casadi.report.words.series import Series, most_telling, residual_figures
 from psa_casadi.report.words.tables import candidate_table, parameter_table, record_table
-from psa_casadi.report.words.verdict_words import VERDICTS, added
+from psa_casadi.report.words.verdict_words import VERDICTS
 
 #: Outputs whose errors are drawn as bars, series whose residual is told at once, effects with bars.
 _DRAWN, _TOLD, _BARS = 4, 4, 16

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.report.page.document import Document
-from psa_casadi.report.words.grades import determined
+from psa_casadi.report.words.fit_words import determined
 from psa_casadi.report.words.tables import parameter_table
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.web.module import web_module
+from psa_casadi.export.web import web_module
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS, stack_model

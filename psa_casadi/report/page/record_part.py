@@ -16,8 +16,7 @@ from psa_casadi.report.plots.residual_plots import (
 )
 from psa_casadi.report.words.fit_words import residual_sentence
 from psa_casadi.report.words.phrases import listing
-from psa_casadi.report.words.residuals import ResidualFigures
-from psa_casadi.report.words.series import Series, most_telling
+from psa_casadi.report.words.series import ResidualFigures, Series, most_telling
 
 #: Samples of all records that may be drawn together: with all their curves about 0.5 MB of text.
 _MOST_POINTS = 13_000

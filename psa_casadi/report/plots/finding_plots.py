@@ -16,7 +16,7 @@ from psa_casadi.report.plots.theme import (
     Plot,
     styled,
 )
-from psa_casadi.report.words.grades import DEGREES, WEAK_ERROR, Degree, Grade
+from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
 from psa_casadi.report.words.phrases import number, percent, plain, probability_text
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, NOISE_COLOUR, bar_colour
 

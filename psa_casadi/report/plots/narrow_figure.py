@@ -5,7 +5,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.report.words.phrases import in_brackets, listing, plain, scale_of
+from psa_casadi.report.words.phrases import added, in_brackets, listing, plain, scale_of
 from psa_casadi.report.words.series import (
     BASE_COLOUR,
     EXTENDED_COLOUR,
@@ -16,7 +16,7 @@ from psa_casadi.report.words.series import (
     series_of,
     telling_window,
 )
-from psa_casadi.report.words.verdict_words import VERDICTS, added
+from psa_casadi.report.words.verdict_words import VERDICTS
 
 #: 720 x 880 points: at half of that, the width of a phone, letters are still large enough.
 _SIZE_INCHES, _DPI, _FONT = (3.6, 4.4), 200, 9.0

@@ -16,7 +16,7 @@ from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.record import Record
 from psa_casadi.report.plots.figure import draw_residual, draw_time, style
 from psa_casadi.report.plots.posterior_figure import draw_parameter
-from psa_casadi.report.words.own_series import own_fit_series, own_series
+from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.phrases import handy_scale, in_brackets, prefixed_scale
 from psa_casadi.report.words.series import (
     EXTENDED_COLOUR,

@@ -4,7 +4,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from psa_casadi.any_model.result import FreeFunction
-from psa_casadi.diagnosis.corrections.patch import Patch
+from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.report.plots.theme import Plot, styled
 from psa_casadi.report.words.phrases import in_brackets, length_scale, prefixed_scale

@@ -8,14 +8,6 @@ from plotly.subplots import make_subplots
 
 from psa_casadi.report.plots.theme import INK, Plot, logarithmic, styled
 from psa_casadi.report.words.phrases import in_brackets
-from psa_casadi.report.words.residuals import (
-    autocorrelation,
-    distribution,
-    noise_density,
-    shown_lines,
-    spectrum,
-    white_band,
-)
 from psa_casadi.report.words.series import (
     HELD_OUT_COLOUR,
     MEASURED_COLOUR,
@@ -23,10 +15,16 @@ from psa_casadi.report.words.series import (
     FloatArray,
     IndexArray,
     Series,
+    autocorrelation,
     compact,
+    distribution,
     kept,
+    noise_density,
+    shown_lines,
     spans,
+    spectrum,
     telling_window,
+    white_band,
 )
 
 #: Points of a part of a record, measured samples shown one by one, and of a spectrum.

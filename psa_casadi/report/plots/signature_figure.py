@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.residual.signature import Signature
+from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.files import atomic_path
+from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.phrases import Scale, length_scale, number, percent, plain, with_unit
 from psa_casadi.report.words.series import EXTENDED_COLOUR, MEASURED_COLOUR, NOISE_COLOUR
 
@@ -53,7 +54,8 @@ def clock(duration: float) -> Scale:
 
 def telling_label(seen: Signature) -> str:
     """Return the label of the telling coordinate with its unit."""
-    return f"{seen.telling.x_label} [{'µm' if seen.telling.x_unit == 'm' else seen.telling.x_unit}]"
+    unit = "µm" if seen.telling.x_unit == "m" else seen.telling.x_unit
+    return f"{AXES[seen.telling.name].label} [{unit}]"
 
 
 def along(seen: Signature) -> float:
@@ -106,7 +108,7 @@ def _told(axes: Axes, seen: Signature, scale: Scale) -> None:
     else:
         axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.legend(fontsize=_FONT - 1, framealpha=0.85)
-    title = f"{view.title}: explains {percent(view.share)} of it"
+    title = f"{AXES[view.name].title}: explains {percent(view.share)} of it"
     _style(axes, title, telling_label(seen), f"difference [{scale.unit}]")
 
 

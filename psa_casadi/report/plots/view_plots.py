@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from psa_casadi.diagnosis.residual.misfit import Misfit
-from psa_casadi.diagnosis.residual.signature import Signature
-from psa_casadi.diagnosis.residual.spectrum import Spectrum
-from psa_casadi.diagnosis.residual.views import View
+from psa_casadi.diagnosis.misfit import Misfit, Spectrum
+from psa_casadi.diagnosis.signature import Signature
+from psa_casadi.diagnosis.views import View
 from psa_casadi.report.plots.theme import INK, Plot, logarithmic, styled
+from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.phrases import Scale, length_scale
 from psa_casadi.report.words.series import (
     BASE_COLOUR,
@@ -32,9 +32,8 @@ def view_named(m: Misfit, name: str) -> View | None:
 
 def label_of(view: View) -> tuple[str, float]:
     """Return the label of a view's coordinate, and what the coordinate is multiplied by for it."""
-    if view.x_unit == "m":
-        return f"{view.x_label} [µm]", 1e6
-    return f"{view.x_label} [{view.x_unit}]", 1.0
+    unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
+    return f"{AXES[view.name].label} [{unit}]", factor
 
 
 def is_logarithmic(name: str) -> bool:

@@ -14,7 +14,6 @@ from psa_casadi.identification.advice import Advice, Plan
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.report.words.phrases import listing
-from psa_casadi.shown import Note
 from psa_casadi.units import convert
 
 
@@ -53,42 +52,42 @@ _DELAY_ALONE = (
     ". tau = a_1 - b_1 alone is taken, masses and dampings keep ordinary values; use --method"
     " prediction-error, or a longer, quieter step."
 )
+_TWO_CLOCKS = (
+    "{record}: voltage and displacement were sampled by two clocks: the delay between them {way}"
+    " evenly by {height:.3g} ms and jumps back every {period:.3g} s, which moves the readings by"
+    " {off:.2g} {unit} rms"
+)
 #: Sentences by the codes of notes; their figures are put in where the braces stand.
-_NOTES: Mapping[str, str | Callable[..., str]] = {
+IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
     "interrupted": "The search was interrupted; this is the best fit so far, and its values are not"
     " final.",
-    "cut_off": "The fit was cut off before it converged; its values are not final.",
     "not_unique": lambda names: (
         f"Two starts led to equally good fits that differ in {_quoted(names)}: these records cannot"
         " tell which is right."
     ),
-    "one_start": "Of {} starts only one led to this minimum; it is the best found, and may not be"
-    " the best there is.",
-    "on_bound": "'{}' sits on a bound of its range; its interval means nothing.",
     "undetermined": lambda names: (
         f"{_quoted(names)} {'is' if len(names) == 1 else 'are'} not determined by these records."
     ),
-    "missed": "Record '{}' is missed by {:.2g} times its noise: the model lacks something there;"
-    " `psa diagnose` looks for the cause.",
-    "form": "hysteresis: {}, which leaves {:.3g} nm rms; {} would leave {:.3g} nm.",
+    "missed": "Record '{record}' is missed by {times:.2g} times its noise: the model lacks"
+    " something there; `psa diagnose` looks for the cause.",
+    "form": "hysteresis: {better}, which leaves {left:.3g} nm rms; {other} would leave"
+    " {other_left:.3g} nm.",
     "force_assumed": "Force scale assumed: voltage and displacement determine the displacement"
     " only. Forces, masses and stiffnesses are right in proportion, not in size; give a stiffness"
     " to fix them.",
-    "averaged": "{}: {} samples are averaged in blocks of {}, which loses nothing of voltage or"
-    " displacement beyond a tenth of the noise.",
-    "still_column": "{} is left out: it never changes.",
-    "stray_current": "{} is left out: it does not follow the voltage as a capacitance's does"
+    "averaged": "{record}: {samples} samples are averaged in blocks of {block}, which loses"
+    " nothing of voltage or displacement beyond a tenth of the noise.",
+    "still_column": "{column} is left out: it never changes.",
+    "stray_current": "{column} is left out: it does not follow the voltage as a capacitance's does"
     " (another sign or unit, a limited current, uneven time steps).",
-    "column": "{0}: fitted beside the displacement; {1:.3g}{2} rms of it are missed, {3:.2g} % of"
-    " its own rms.",
-    "turned_column": "{} falls where the model's rises: its sign is probably turned.",
-    "capacitance": "The measured {} tells C_p = {:.4g} uF ({:.4g} to {:.4g}; times the amplifier's"
-    " gain, if the voltage is its input): it explains {:.1f} % of it.",
-    "capacitance_kept": "The model keeps the {:.4g} uF given.",
-    "two_clocks": "{}: voltage and displacement were sampled by two clocks: the delay between them"
-    " {} evenly by {:.3g} ms and jumps back every {:.3g} s, which moves the readings by {:.2g} {}"
-    " rms",
-    "clocks_undone": "; that was undone. Better read both from one device.",
+    "column": "{column}: fitted beside the displacement; {rms:.3g}{unit} rms of it are missed,"
+    " {share:.2g} % of its own rms.",
+    "turned_column": "{column} falls where the model's rises: its sign is probably turned.",
+    "capacitance": "The measured {source} tells C_p = {value:.4g} uF ({low:.4g} to {high:.4g};"
+    " times the amplifier's gain, if the voltage is its input): it explains {share:.1f} % of it.",
+    "capacitance_kept": "The model keeps the {value:.4g} uF given.",
+    "two_clocks": f"{_TWO_CLOCKS}.",
+    "clocks_undone": f"{_TWO_CLOCKS}; that was undone. Better read both from one device.",
     "paper": lambda names: (
         "Identified by the paper's method (Yang and Zhu 2015, section 3), which gives no"
         f" intervals. It found {', '.join(names) or 'nothing'}; all other parameters have ordinary"
@@ -102,10 +101,11 @@ _NOTES: Mapping[str, str | Callable[..., str]] = {
     "no_loop": "No record is a loop (a voltage that goes up and down at even intervals), so A,"
     " delta, n, beta and gamma cannot be found by this method: the model has no loop (f_H = 0)."
     " Give two periods of a slow sine or triangle from rest at 0 V.",
-    "fast_loops": "The slowest loops have {:.3g} Hz; the paper asks for less than 1 Hz, so that"
-    " mechanics and lag do not widen the loop. Give slower loops.",
-    "lagging_step": "The step lags by {:.3g} ms, {:.2g} rad of the loops at {:.3g} Hz, which the"
-    " method counts as hysteresis: A, delta, n, beta and gamma are off. Give slower loops.",
+    "fast_loops": "The slowest loops have {frequency:.3g} Hz; the paper asks for less than 1 Hz,"
+    " so that mechanics and lag do not widen the loop. Give slower loops.",
+    "lagging_step": "The step lags by {delay:.3g} ms, {angle:.2g} rad of the loops at"
+    " {frequency:.3g} Hz, which the method counts as hysteresis: A, delta, n, beta and gamma are"
+    " off. Give slower loops.",
     "not_from_rest": lambda names: (
         f"{_quoted(names)} do not begin at 0 V, though the method needs h = 0 at the start; their"
         " first sample is taken for rest. Give loops from rest at 0 V."
@@ -114,8 +114,8 @@ _NOTES: Mapping[str, str | Callable[..., str]] = {
         f"Missing samples were bridged by straight lines in {_quoted(names)}; derivatives there are"
         " not measured."
     ),
-    "out_of_range": "{} = {:.3g} {} is outside of its range, {:g} to {:g}; {:.3g} stands in the"
-    " model, and the rest does not belong to it.",
+    "out_of_range": "{name} = {value:.3g} {unit} is outside of its range, {low:g} to {high:g};"
+    " {instead:.3g} stands in the model, and the rest does not belong to it.",
     "runs_away": "The model with these values cannot be simulated on the records (with A, beta and"
     " gamma like these the hysteresis grows without bound, or masses and dampings are out of"
     " proportion), so its loop, lags and masses were set back to ordinary values; use --method"
@@ -132,37 +132,37 @@ _NOTES: Mapping[str, str | Callable[..., str]] = {
         " quieter step may help."
     ),
     "no_a_5": f"{_NO_STACK}a_5 is zero or not finite{_DELAY_ALONE}",
-    "growing_poles": f"{_NO_STACK}{{}} of its 5 poles do not decay{_DELAY_ALONE}",
-    "other_zero": "b_1 = {:.3g} s, but the poles allow {:.3g} s at the nearest with the assumed"
-    " k_P/k_B = {:.3g}: b_1 or this ratio is wrong, and the first microseconds of a step will be"
-    " off.",
-    "rough_velocity": "The noise of loop '{}' does not allow a good velocity: over the longest"
-    " window it is {:.1f} % of the mean speed. A, delta, n, beta and gamma rest on it; give slower"
-    " or less noisy loops.",
-    "no_samples": "No samples with h = x - k u above zero are left on the {} branches, so {} has no"
-    " equation, and the model has no loop (f_H = 0). Likely cause: k is wrong or the loops did not"
-    " begin at rest at 0 V; give loops that do.",
+    "growing_poles": f"{_NO_STACK}{{count}} of its 5 poles do not decay{_DELAY_ALONE}",
+    "other_zero": "b_1 = {b_1:.3g} s, but the poles allow {nearest:.3g} s at the nearest with the"
+    " assumed k_P/k_B = {ratio:.3g}: b_1 or this ratio is wrong, and the first microseconds of a"
+    " step will be off.",
+    "rough_velocity": "The noise of loop '{loop}' does not allow a good velocity: over the longest"
+    " window it is {share:.1f} % of the mean speed. A, delta, n, beta and gamma rest on it; give"
+    " slower or less noisy loops.",
+    "no_samples": "No samples with h = x - k u above zero are left on the {branch} branches, so"
+    " {what} has no equation, and the model has no loop (f_H = 0). Likely cause: k is wrong or the"
+    " loops did not begin at rest at 0 V; give loops that do.",
     "negative_rising": "The logarithms of (31) are of negative numbers on the rising branches, so"
     " beta + gamma > 0 does not hold; the logarithms of the opposite numbers are taken.",
-    "wrong_sign": "{:.0f} % of the logarithms on the {} branches ({}) are of numbers of the wrong"
-    " sign and were left out, which biases the rest. Likely cause: noise, or a k that is wrong;"
-    " give slower loops or another step.",
+    "wrong_sign": "{lost:.0f} % of the logarithms on the {branch} branches ({what}) are of numbers"
+    " of the wrong sign and were left out, which biases the rest. Likely cause: noise, or a k that"
+    " is wrong; give slower loops or another step.",
     "no_crossing": lambda branches: (
         f"x = k u is not met on {_branches(branches)} of the loops, so A and delta cannot be read"
         " at zero crossings, and n, beta and gamma rest on them: the model has no loop (f_H = 0)."
         " Likely cause: k contains a part of the hysteresis (it is the secant of the step), or the"
         " loops did not begin at rest at 0 V; give two periods or more from rest."
     ),
-    "scatter": "A scatters by {:.0f} % between the loops' periods, which it should not: the loops"
-    " are not those of eq. (8) with this k.",
-    "secant": "At its tip the loop '{}' meets the line x = k u (h there is {:.0f} % of its largest"
-    " value): k, read from a step, holds what the hysteresis adds at that voltage, and the paper"
-    " takes it for the linear part alone. k, A, delta and all that rest on them are off.",
+    "scatter": "A scatters by {share:.0f} % between the loops' periods, which it should not: the"
+    " loops are not those of eq. (8) with this k.",
+    "secant": "At its tip the loop '{loop}' meets the line x = k u (h there is {share:.0f} % of"
+    " its largest value): k, read from a step, holds what the hysteresis adds at that voltage, and"
+    " the paper takes it for the linear part alone. k, A, delta and all that rest on them are off.",
     "lagging_loop": "The logarithm of (34) is of negative numbers: gamma > beta does not hold, as"
     " it cannot for a loop that lags. The logarithm of (beta - gamma) h^n was taken instead, which"
     " is the same equation.",
-    "diverged": "{} of {} transitions diverged: a part of the posterior may be missing. Draw more"
-    " with another seed, or hold what is open (--free).",
+    "diverged": "{count} of {transitions} transitions diverged: a part of the posterior may be"
+    " missing. Draw more with another seed, or hold what is open (--free).",
     "chains_disagree": lambda names, limit: (
         f"The chains disagree about {_quoted(names)} (r-hat above {limit}); take more draws"
         " (--draws, --tune)."
@@ -172,26 +172,20 @@ _NOTES: Mapping[str, str | Callable[..., str]] = {
         " are rough; take more draws (--draws)."
     ),
     "start_cut_off": "The fit that the chains start from was cut off before it converged.",
-    "coloured": "Residuals of '{}' are correlated: {:.3g} samples count as one, and the model lacks"
-    " something there; `psa diagnose` looks for the cause.",
+    "coloured": "Residuals of '{record}' are correlated: {worth:.3g} samples count as one, and the"
+    " model lacks something there; `psa diagnose` looks for the cause.",
     "of_the_prior": lambda names: (
         f"The records hardly tell {_quoted(names)}: the posterior is that of the prior."
     ),
-    "prior_fails": "{} of {} draws of the prior cannot be simulated; they are left out of the"
-    " prior's groups.",
+    "prior_fails": "{count} of {draws} draws of the prior cannot be simulated; they are left out"
+    " of the prior's groups.",
 }
 
 
 @singledispatch
 def sentence_of(result: Any) -> str:
-    """Return a note, a combination or an advice as a sentence."""
+    """Return a combination or an advice as a sentence."""
     raise TypeError(f"{type(result).__name__} has no sentence")
-
-
-@sentence_of.register
-def _note(note: Note) -> str:
-    words = _NOTES[note.code]
-    return words.format(*note.of) if isinstance(words, str) else words(*note.of)
 
 
 @sentence_of.register

@@ -1,14 +1,12 @@
 """Numbers and findings in words: the sentences that every report shares."""
 
 import math
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from psa_casadi.diagnosis.residual.misfit import Misfit
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
@@ -16,11 +14,14 @@ from psa_casadi.records.split import Experiment
 if TYPE_CHECKING:  # which take long to load
     from psa_casadi.any_model.result import OdeDiagnosis
 
-#: A length in a sentence.
-_LENGTH = re.compile(r"(?P<number>[+-]?\d[\d.]*(?:e[+-]?\d+)?) (?P<unit>mm|um|nm)\b")
-_METRES = {"mm": 1e-3, "um": 1e-6, "nm": 1e-9}
 #: A length in a sentence stays in its own unit where the page's would give a larger number.
 _LARGEST = 1000.0
+#: Units of quantities in sentences, the largest first, and the least value that each is for.
+_IN_SENTENCES: dict[str, tuple[tuple[str, float], ...]] = {
+    "m": (("mm", 1e-3), ("µm", 1e-6), ("nm", 1e-9)),
+    "s": (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)),
+}
+_LEAST = 0.1
 
 #: Units that take prefixes, and these, the largest first.
 _PREFIXED = frozenset(("m", "s", "V", "A", "N", "Pa", "Hz", "C", "W", "J", "rad"))
@@ -92,10 +93,15 @@ def in_brackets(what: str, unit: str) -> str:
     return f"{what} [{unit}]" if unit not in ("", "1") else what
 
 
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, with an exponent only where it helps."""
+def number(value: float, digits: int = 3, *, trim: bool = False) -> str:
+    """Return a number with so many significant digits, with an exponent only where it helps.
+
+    With `trim` it ends in no zeros behind its point.
+    """
     if not math.isfinite(value):
         return "not finite"
+    if trim:
+        return f"{float(f'{value:.{digits - 1}e}'):g}"
     if value == 0:
         return "0"
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
@@ -110,34 +116,32 @@ def percent(share: float) -> str:
     return f"{100.0 * share:.0f} %"
 
 
-def in_page_unit(sentence: str) -> str:
-    """Return a sentence with its errors in the unit of the page, and "µm" for "um"."""
+def quantity(value: float, unit: str = "1") -> str:
+    """Return a value in SI units with two digits, such as "0.12 µm"; of a page, in its unit."""
+    sizes = _IN_SENTENCES.get(unit, ((unit, 1.0),))
+    if value == 0 and unit == "m":
+        sizes = sizes[1:2]
+    name, size = next((u for u in sizes if abs(value) >= _LEAST * u[1]), sizes[-1])
     page = _PAGE.get()
-
-    def shown(length: re.Match[str]) -> str:
-        unit = length["unit"].replace("u", "µ")
-        if page is None or page.unit in ("counts", unit):
-            return f"{length['number']} {unit}"
-        value = page.factor * _METRES[length["unit"]] * float(length["number"])
-        if abs(value) >= _LARGEST:
-            return f"{length['number']} {unit}"
-        sign = "+" if length["number"].startswith("+") else ""
-        return f"{sign}{float(f'{value:.1e}'):g} {page.unit}"
-
-    return _LENGTH.sub(shown, sentence)
+    in_page = unit == "m" and page is not None and page.unit != "counts"
+    if in_page and page is not None and abs(page.factor * value) < _LARGEST:
+        name, size = page.unit, 1.0 / page.factor
+    return with_unit(number(value / size, 2, trim=True), name)
 
 
-def strongest_sentence(misfits: Sequence[Misfit]) -> str:
-    """Return the sentence that says most of what is wrong, "" if nothing is above the noise."""
-    told = [m for m in misfits if len(m.sentences) > 1]
-    if told:
-        return in_page_unit(max(told, key=weight).sentences[1])
-    return ""
+def signed(value: float, unit: str) -> str:
+    """Return a quantity with its sign, also where it is above zero."""
+    return f"{'+' if value > 0 else ''}{quantity(value, unit)}"
 
 
-def weight(m: Misfit) -> float:
-    """Return the excess over the noise, by which records are compared."""
-    return m.excess * (m.rms / m.floor.level if m.floor.level > 0 else 1.0)
+def raised(text: str) -> str:
+    """Return a text that begins with a capital."""
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+def lowered(text: str) -> str:
+    """Return a text that begins without a capital."""
+    return f"{text[:1].lower()}{text[1:]}"
 
 
 def probability_text(probability: float) -> str:
@@ -214,7 +218,7 @@ def either(effects: Sequence[str]) -> str:
 
 def with_unit(text: str, unit: str) -> str:
     """Return a number's text with its unit; "1" is no unit to a reader."""
-    return text if unit == "1" else f"{text} {unit}"
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 def shown_in(model: Model, name: str) -> tuple[str, str]:
@@ -229,3 +233,8 @@ def interval_text(low: float, high: float) -> str:
         return "not determined"
     digits = next((d for d in (3, 4, 5) if number(low, d) != number(high, d)), 6)
     return f"{number(low, digits)} to {number(high, digits)}"
+
+
+def added(d: "Diagnosis | OdeDiagnosis") -> bool:
+    """Say whether the extended model differs from the base."""
+    return bool(d.causes or (isinstance(d, Diagnosis) and d.kept))

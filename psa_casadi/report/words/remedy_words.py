@@ -2,31 +2,205 @@
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
 from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.report.words.phrases import (
+    Scale,
+    added,
     handy_scale,
+    interval_text,
     listing,
     number,
     percent,
     plain,
+    prefixed_scale,
     scale_of,
     shown_in,
     with_unit,
 )
-from psa_casadi.report.words.remedies import DO, RECORDS
-from psa_casadi.report.words.size_words import Length, size_text
-from psa_casadi.report.words.verdict_words import added, within
+from psa_casadi.report.words.verdict_words import within
 from psa_casadi.units import convert
+
+_FEED_FORWARD = "correct the voltage by the extended model (feed-forward)"
+
+#: What can be done. Those below the line are the kinds of effects of a model of one's own.
+DO: Mapping[str, str] = {
+    "extended_model": "Use the extended model in the place of the base",
+    "wait_or_feed_forward": (
+        f"Wait until it has died out, close a loop around a position sensor, or {_FEED_FORWARD}"
+    ),
+    "undo_hysteresis": (
+        f"Approach every position from the same side, {_FEED_FORWARD} or by a hysteresis"
+        " compensator, drive the charge instead of the voltage, or close a loop"
+    ),
+    "undo_curve": f"Use less of the range, {_FEED_FORWARD}, or close a loop",
+    "control_charge": (
+        "Give the amplifier the current that the larger capacitance takes, or drive the charge"
+    ),
+    "avoid_resonance": (
+        "Keep the drive below that frequency (longer edges, a notch filter), or stiffen or damp"
+        " what rings"
+    ),
+    "undo_load_curve": (
+        "Find what the output works against (guide, disc spring, contact) and make it linear, or"
+        f" {_FEED_FORWARD}"
+    ),
+    "preload": (
+        "Preload or clamp the joint so that it keeps its contact, or stay on one side of where it"
+        " is lost"
+    ),
+    "cool": f"Drive slower or less far, let it rest between fast runs, cool it, or {_FEED_FORWARD}",
+    "identify_again": "Identify the gain again from time to time, or close a loop",
+    "more_current": "Use longer edges, or an amplifier that delivers more current",
+    "stay_below_level": "Stay below the level, or use an amplifier that puts out more voltage",
+    "better_drive": "Drive slower, use an amplifier with more bandwidth, or let the model lead",
+    "measure_voltage": (
+        "Record the voltage at the stack in the place of the command, calibrate the amplifier, or"
+        f" {_FEED_FORWARD}"
+    ),
+    "hold_charge": (
+        "Give the charge drive a longer time constant, control the voltage in slow motion, or close"
+        " a loop"
+    ),
+    "align_clocks": (
+        "Shift the reading's time by the delay, or sample both channels by one clock; in a loop the"
+        " delay costs phase"
+    ),
+    "faster_sensor": "Give the sensor more bandwidth, or take the lag off the reading",
+    "calibrate_sensor": "Calibrate the sensor against a better one, and correct its reading",
+    "zero_again": "Let the sensor warm up, and take its zero before and after every run",
+    "shield": (
+        "Shield and ground the sensor's cable, average over whole periods, or filter that frequency"
+    ),
+    "steady_surroundings": (
+        "Keep the temperature steady, start when the set-up has warmed up, or record the"
+        " temperature and correct by it"
+    ),
+    # a model of one's own
+    "lag": "Drive slower, use a faster device there, or keep the lag in the model",
+    "delay": "Shift the time of that signal, sample by one clock, or keep the delay in the model",
+    "bend": "Calibrate that signal and correct it by the curve, or keep the curve in the model",
+    "saturation": "Stay below the level, or use a device there that reaches further",
+    "dead_zone": "Jump over the zone when the sign changes, or make up the play or the threshold",
+    "zero": "Take the zero before every run",
+    "drift": "Let the sensor warm up, and take its zero before and after every run",
+    "constant": "Look for a weight, a leak or the offset of an input, and put it into the equation",
+    "loss": "Put the further loss into the equation, or look for what rubs, leaks or cools",
+    "friction": "Lubricate or preload what rubs, overcome it by the input, or keep it in the model",
+    "drag": "Put the quadratic loss into the equation",
+    "curve": "Put the law into the equation in the place of a constant stiffness or conductance",
+    "stop": "Stay clear of the stop, or keep it in the model",
+    "hysteresis": "Approach from the same side, correct by the extended model, or close a loop",
+}
+
+#: The record that shows an effect, by the test that measures it.
+RECORDS: Mapping[str, str] = {
+    "hold": "a step to the highest voltage, held for ten minutes",
+    "reversal": "slow loops of three amplitudes, nested",
+    "range": "slow loops over the whole range, again with another load or sensor",
+    "slew": "the same loop at three rates, the fastest in use among them",
+    "resonance": "a sweep or a multisine that passes the resonance, well sampled",
+    "record": "a long record with rests, and with the temperature beside it",
+}
+
+
+#: Returns the scale of a length [m].
+Length = Callable[[float], Scale]
+
+
+def size_text(sizes: Sequence[Size], length: Length) -> str:
+    """Return what the tests of one effect give, as a sentence without its full stop."""
+    if not sizes:
+        return ""
+    largest = max(abs(s.value) for s in sizes)
+    return _TEXTS[sizes[0].test](sizes, lambda _: length(largest))  # one unit in a sentence
+
+
+def _amount(size: Size, length: Length) -> str:
+    """Return a figure with its interval, without its sign."""
+    value = abs(size.value)
+    in_metres = size.unit == "m" and size.output == "displacement"
+    scale = (
+        length(value) if in_metres or size.unit == "counts" else prefixed_scale(value, size.unit)
+    )
+    if size.interval is None:
+        return scale.text(value)
+    ends = sorted(scale.factor * abs(v) for v in size.interval)
+    return f"{scale.text(value)} ({interval_text(*ends)})"
+
+
+def _voltages(size: Size) -> str:
+    low, high = size.voltages or (0.0, 0.0)
+    return f"{low:.3g} to {high:.3g} V"
+
+
+def _hold(sizes: Sequence[Size], length: Length) -> str:
+    _, high = sizes[0].voltages or (0.0, 0.0)
+    way = "falls back" if sizes[0].value < 0 else "goes on"
+    each = [f"{_amount(s, length)} in {_time(s.at)}" for s in sizes]
+    text = f"after a step to {high:.3g} V the displacement {way} by {listing(each)}"
+    beyond = [_time(s.at) for s in sizes if s.beyond_records]
+    if not beyond:
+        return text
+    return f"{text}; {listing(beyond)} {'lies' if len(beyond) == 1 else 'lie'} beyond these records"
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:g} s" if seconds < 60.0 else f"{seconds / 60.0:g} min"
+
+
+def _reversal(sizes: Sequence[Size], length: Length) -> str:
+    return (
+        f"in loops of {_voltages(sizes[0])} it sets the ways up and down apart by up to"
+        f" {_amount(sizes[0], length)}"
+    )
+
+
+def _range(sizes: Sequence[Size], length: Length) -> str:
+    bent, top = sizes
+    way = "adds" if top.value > 0 else "takes"
+    return (
+        f"over {_voltages(bent)} it {way} {_amount(top, length)} at the top, and bends the curve by"
+        f" up to {_amount(bent, length)} beside zero and sensitivity"
+    )
+
+
+def _slew(sizes: Sequence[Size], length: Length) -> str:
+    rate = prefixed_scale(sizes[0].at, "V").text(sizes[0].at)
+    return f"at the fastest slew, {rate}/s, it amounts to {_amount(sizes[0], length)}"
+
+
+def _resonance(sizes: Sequence[Size], length: Length) -> str:
+    where = listing([number(s.at) for s in sizes])
+    times = listing([_amount(s, length) for s in sizes])
+    return f"at {where} Hz it makes the displacement {times} times as large"
+
+
+def _record(sizes: Sequence[Size], length: Length) -> str:
+    rows = {s.output: _amount(s, length) for s in sizes if s.test == "record"}
+    rms = next((f", {_amount(s, length)} rms" for s in sizes if s.test == "rms"), "")
+    each = listing([f"the {plain(name)} by up to {text}" for name, text in rows.items()])
+    return f"within a record of {number(sizes[0].at)} s it moves {each}{rms}"
+
+
+_TEXTS: dict[str, Callable[[Sequence[Size], Length], str]] = {
+    "hold": _hold,
+    "reversal": _reversal,
+    "range": _range,
+    "slew": _slew,
+    "resonance": _resonance,
+    "record": _record,
+}
+
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.
 _FILES = ("model.json", "extended.json")

@@ -15,9 +15,10 @@ from psa_casadi.identification.search import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.grades import grade
+from psa_casadi.report.words.fit_words import grade
 from psa_casadi.report.words.phrases import (
     Scale,
+    added,
     interval_text,
     number,
     plain,
@@ -26,14 +27,14 @@ from psa_casadi.report.words.phrases import (
     shown_in,
     with_unit,
 )
-from psa_casadi.report.words.residuals import ResidualFigures
-from psa_casadi.report.words.verdict_words import added
+from psa_casadi.simulation.timings import Stage
 from psa_casadi.units import convert
 
-if TYPE_CHECKING:  # which take long to load
+if TYPE_CHECKING:
     from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.any_model.runs import Run
     from psa_casadi.export.check.check import CheckReport, CheckRow
+    from psa_casadi.report.words.series import ResidualFigures
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ def column_table(d: Diagnosis) -> Table:
     return _table(("column", "used as", "unit", *head), rows)
 
 
-def fit_error_table(rows: Sequence[tuple[str, ResidualFigures]], scale: Scale) -> Table:
+def fit_error_table(rows: "Sequence[tuple[str, ResidualFigures]]", scale: Scale) -> Table:
     """Return what the model leaves of every record, beside the record's noise level."""
     lines = []
     for name, f in rows:
@@ -272,3 +273,26 @@ def check_table(report: "CheckReport") -> Table:
 def _found(row: "CheckRow") -> str:
     """Return the figure of a check; where none is allowed it counts problems."""
     return str(int(row.figure)) if row.limit == 0 and row.figure >= 0 else number(row.figure)
+
+
+def timings_table(stages: Sequence[Stage]) -> Table:
+    """Return time, processor time of all threads with its share, and simulations of every stage.
+
+    Behind the simulations stands how many of them were with sensitivities.
+    """
+    total = Stage(
+        "total",
+        sum(s.wall for s in stages),
+        sum(s.processor for s in stages),
+        sum(s.runs for s in stages),
+        sum(s.differentiated for s in stages),
+    )
+    rows = [_row(s, total.processor) for s in (*stages, total)]
+    head = ("stage", "time", "processor", "share", "simulations", "with sensitivities")
+    return Table(head, tuple(rows))
+
+
+def _row(s: Stage, total: float) -> tuple[str, ...]:
+    share = f"{100.0 * s.processor / total:.0f} %" if total > 0 else ""
+    runs = (str(s.runs), str(s.differentiated)) if s.runs else ("", "")
+    return (s.name, f"{s.wall:.2f} s", f"{s.processor:.2f} s", share, *runs)

@@ -1,6 +1,5 @@
 """The results as plain text for a terminal."""
 
-import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -8,18 +7,22 @@ from typing import TYPE_CHECKING
 
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.held_out.errors import Errors
-from psa_casadi.diagnosis.remedy.size import Size
+from psa_casadi.diagnosis.held_out import Errors
+from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.budget_words import budget_sentence
+from psa_casadi.report.words.misfit_words import strongest
+from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
     Scale,
+    added,
     listing,
     number,
     percent,
@@ -27,26 +30,25 @@ from psa_casadi.report.words.phrases import (
     probability_text,
     rest_sentence,
     scale_of,
-    strongest_sentence,
+    shown_in,
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
-from psa_casadi.report.words.tables import blindest, effect_parameter_table, parameter_table
+from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
 from psa_casadi.report.words.verdict_words import (
     VERDICTS,
-    added,
     alternative_sentence,
+    budget_sentence,
     cause_size,
     column_sentence,
     verdict_sentence,
 )
+from psa_casadi.units import convert
 
-if TYPE_CHECKING:  # which take long to load
+if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport
 
+
 _LABEL = 10
-#: Where the first sentence of a note ends; how a sentence on a view ends.
-_FIRST = re.compile(r"(?<=\.) ")
-_EXPLAINS = re.compile(r"; this(?: view)? explains (\d+ %) of the excess(?=\.)")
 
 
 def story(
@@ -79,8 +81,8 @@ def story(
 def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
     lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
-    wrong = _EXPLAINS.sub(r" (\1 of the excess)", strongest_sentence(d.misfit))
-    lines += [("wrong", wrong)] if wrong else []
+    wrong = strongest(d.misfit)
+    lines += [("wrong", brief_text(wrong))] if wrong else []
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
     lines += [
         ("records", records_text(d.experiments, origin)),
@@ -100,8 +102,13 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     lines.append(("remains", rest_sentence(d)))
     lines.append(("blind to", _blind(d)))
     lines.append(("next", d.next_experiment.why))
-    lines.extend(("note", _FIRST.split(note, maxsplit=1)[0]) for note in d.notes)
+    lines.extend(("note", _first_sentence(note)) for note in d.notes)
     return lines
+
+
+def _first_sentence(text: str) -> str:
+    head, dot, _ = text.partition(". ")
+    return f"{head}{dot.rstrip()}"
 
 
 def _cause(d: Diagnosis, cause: Cause) -> str:
@@ -182,8 +189,11 @@ def effect_page(
 def check_sentence(report: "CheckReport") -> str:
     """Say how the check of an FMU ended."""
     against = "" if report.compared else " There was no model to compare it with."
-    if report.left_out:
-        against += f" Left out, as its step is fixed: {listing(report.left_out)}."
+    unseen = [name for name in report.left_out if name in OF_BINARIES]
+    if fixed := [name for name in report.left_out if name not in OF_BINARIES]:
+        against += f" Left out, as its step is fixed: {listing(fixed)}."
+    if unseen:
+        against += f" Left out, as lief is not installed (`pip install lief`): {listing(unseen)}."
     if report.passed:
         return f"{Path(report.path).name} passed all {len(report.rows)} checks.{against}"
     failed = listing([r.name for r in report.failures])
@@ -221,3 +231,37 @@ def _errors(e: Errors, scale: Scale) -> str:
         f" at most {scale.text(e.holdout_max_m)};"
         f" training {scale.text(e.train_rms_m)} rms"
     )
+
+
+def posterior_table(found: Posterior) -> Table:
+    """Return every parameter with mean, sd, 94 % interval, effective draws and r-hat."""
+    rows = []
+    for f in found.figures:
+        unit, display = shown_in(found.model, f.name)
+        mean, low, high = (convert(x, unit, display) for x in (f.mean, f.low, f.high))
+        spread = convert(f.mean + f.sd, unit, display) - mean
+        rows.append(
+            (
+                f.name,
+                number(mean, 4),
+                number(spread),
+                f"{number(low, 4)} to {number(high, 4)}",
+                display,
+                f"{f.ess:.0f}",
+                f"{f.r_hat:.3f}",
+                found.model.parameter(f.name).description,
+            )
+        )
+    head = ("parameter", "mean", "sd", "94 % interval", "unit", "ess", "r-hat", "meaning")
+    return Table(head, tuple(rows))
+
+
+def posterior_text(found: Posterior, *, origin: str = "measured", width: int = 100) -> str:
+    """Return a posterior: records, chains, the parameters, warnings."""
+    drawn = f"{found.chains} chains of {found.draws} draws, {found.divergences} divergent"
+    head = [("records", records_text(found.task.experiments, origin)), ("drawn", drawn)]
+    tail = [("warning", w) for w in found.warnings] + [("note", n) for n in found.sentences]
+    blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
+    blocks.append(posterior_table(found).fitted(width))
+    blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
+    return "\n\n".join(blocks)

@@ -1,0 +1,464 @@
+"""Variants of the base fit: resonances, ringing, and a voltage that is smooth between samples.
+
+After each step of the force a resonance rings, and what the samples show of it is a tone below half
+the sampling rate f_s that decays as fast as the resonance itself, whatever its own frequency: one
+at f is seen at |f - k f_s|. Any such tone adds, with unknown amplitude and phase,
+
+    q_k = 2 Re(z) q_(k-1) - |z|^2 q_(k-2) + b_0 (F_k - F_(k-1)) + b_1 (F_(k-1) - F_(k-2)),
+    z = exp((-2 pi d + 2 pi i f) / f_s)
+
+to the prediction, F the force. The residual is projected on it for a grid of f and d, as in
+`screening`, the fitted parameters' directions taken out.
+
+A simulation joins the samples of the voltage by straight lines. Where an amplifier smooths them,
+chords cut the bends of a fast signal off: by u'' h^2/12 in the mean of a sampling interval h, 0.2 %
+of the amplitude of a sine with 40 samples a period. A plant that answers within some intervals
+shows this mean, and the error looks like a further resonance or a lag.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.colour import residual_colour
+from psa_casadi.diagnosis.screening import independent, without
+from psa_casadi.diagnosis.task import shows_ringing
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import trace_record
+from psa_casadi.identification.force_start import force_of, retuned
+from psa_casadi.identification.refitting import Progress, quick_from, refit, without_blur
+from psa_casadi.identification.search import search
+from psa_casadi.identification.start.ordinary import ordinary_values
+from psa_casadi.identification.start.starting_points import linear_start, resolved
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import filtered
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment, fitted
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.timings import stage
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Tones and decay rates that are tried, over the sampling rate.
+_TONES, _DECAYS = np.arange(0.04, 0.501, 0.02), (0.03, 0.06, 0.12, 0.25)
+#: Records whose sampling interval differs by this share do not contribute, nor those that gaps make
+#: this many times as long as their samples.
+_SAME, _LONGER = 0.01, 4.0
+#: Multiple of the sampling rate about which a tone's resonance may lie at most.
+_IMAGES = 2
+#: Less than this of a column is rounding.
+_NEW = 1e-7
+
+
+@dataclass(frozen=True)
+class Ringing:
+    """A decaying tone in a residual.
+
+    `tone` [Hz] and `decay` [Hz], damping ratio times frequency; `rate` of sampling [Hz];
+    `decrease` of the whitened sum of squares over the noise's variance, two amplitudes being free.
+    """
+
+    tone: float
+    decay: float
+    rate: float
+    decrease: float
+
+    @property
+    def resonances(self) -> tuple[tuple[float, float], ...]:
+        """Frequencies [Hz] with damping ratios that are seen at this tone when sampled."""
+        return tuple((f, min(1.0, self.decay / f)) for f in images(self.tone, self.rate, _IMAGES))
+
+
+def images(tone: float, rate: float, most: int) -> list[float]:
+    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz].
+
+    At half the sampling rate these are pairs, apart by rounding only.
+    """
+    found = {round(abs(k + sign * tone / rate), 9) for k in range(most + 1) for sign in (1.0, -1.0)}
+    return [share * rate for share in sorted(found)]
+
+
+def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
+    """Return the tone that explains most of a residual; None where no record can show one.
+
+    The residual is whitened by its own autoregression, so that a tone has to follow the force to
+    count: one that is there all the time is taken for colour.
+    """
+    interval = min(e.record.sample_time for e in fitted(experiments))
+    forces = [
+        None if e.held_out_whole else _force(fit, k, e, interval) for k, e in enumerate(experiments)
+    ]
+    if all(f is None for f in forces):
+        return None
+    colour = residual_colour(fit.residuals, [int(e.used.sum()) for e in experiments])
+    basis = independent(colour.whiten(fit.jacobian))
+    residual = without(colour.whiten(fit.residuals), basis)
+    best: Ringing | None = None
+    for tone in _TONES:
+        columns = [_response(forces, experiments, interval, tone, d) for d in _DECAYS]
+        free = without(colour.whiten(np.hstack(columns)), basis)
+        for decay, own in zip(_DECAYS, np.hsplit(free, len(_DECAYS)), strict=True):
+            decrease = _explained(own, residual) / colour.level**2
+            if best is None or decrease > best.decrease:
+                best = Ringing(float(tone) / interval, decay / interval, 1.0 / interval, decrease)
+    return best
+
+
+def _explained(columns: FloatArray, residual: FloatArray) -> float:
+    """Return the decrease of a residual's (n,) sum of squares along two columns (n, 2).
+
+    A sixth of the time of their orthonormal basis by `independent`. Of one in the other's
+    direction, and of none, nothing counts.
+    """
+    found = 0.0
+    first: FloatArray | None = None
+    for column in np.ascontiguousarray(columns.T):
+        size = float(np.linalg.norm(column))
+        own = column if first is None else column - (first @ column) * first
+        norm = float(np.linalg.norm(own))
+        if norm > _NEW * size:
+            first = own / norm
+            found += float(first @ residual) ** 2
+    return found
+
+
+def _force(fit: Fit, number: int, experiment: Experiment, interval: float) -> FloatArray | None:
+    """Return a record's simulated force [N] from its first sample on, at even distances [s].
+
+    None where the record is sampled at another rate, is mostly gaps, or cannot be simulated.
+    """
+    record = experiment.record
+    count = _places(experiment, interval)[-1] + 1
+    if abs(record.sample_time / interval - 1.0) > _SAME or count > _LONGER * record.n:
+        return None
+    try:
+        force = force_of(fit, number, record)
+    except PsaError:
+        return None
+    even = record.time[0] + interval * np.arange(count)
+    change: FloatArray = np.interp(even, record.time, force - force[0])
+    return change
+
+
+def _places(experiment: Experiment, interval: float) -> npt.NDArray[np.int64]:
+    """Return which of the even samples each sample of a record is, or is next to."""
+    time = experiment.record.time
+    found: npt.NDArray[np.int64] = np.rint((time - time[0]) / interval).astype(np.int64)
+    return found
+
+
+def _response(
+    forces: Sequence[FloatArray | None],
+    experiments: Sequence[Experiment],
+    interval: float,
+    tone: float,
+    decay: float,
+) -> FloatArray:
+    """Return the two columns of a tone at the used samples; tone and decay over the rate."""
+    z = np.exp(-2.0 * np.pi * decay + 2j * np.pi * tone)
+    poles = [1.0, -2.0 * z.real, abs(z) ** 2]
+    parts = []
+    for force, e in zip(forces, experiments, strict=True):
+        own = np.zeros((int(e.used.sum()), 2))
+        if force is not None:
+            where = _places(e, interval)[e.used]
+            rung = filtered([1.0, -1.0], poles, force)
+            own[:, 0] = rung[where]
+            own[:, 1] = np.append(0.0, rung)[where]  # a sample later
+        parts.append(own)
+    return np.vstack(parts)
+
+
+#: Standard errors by which the share of the difference that the residual holds must exceed none,
+#: and how far it may be from the whole of it. Smooth plants have 0.85 to 0.98 (the base has bent
+#: itself to the rest), others 0.0 +- 0.1, and residuals that hold something else -6000 to 11.
+_SURE, _NEAR = 6.0, 0.25
+
+
+def smooth_between(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> tuple[tuple[Experiment, ...], Note] | None:
+    """Return the experiments with the voltage moved to a smooth curve's mean, and a note; or None.
+
+    The difference of the two displacements is fitted to what the `fit` leaves, beside all fitted
+    parameters: the share of it that the residual holds is near 1 for a smooth voltage, 0 for
+    straight lines. None where it is neither, or a record cannot be simulated.
+    """
+    try:
+        pairs = enumerate(experiments)
+        added = np.concatenate([_difference(fit, k, e)[e.used] for k, e in pairs])
+    except PsaError:
+        return None
+    basis, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
+    own, left = (x - basis @ (basis.T @ x) for x in (added, fit.residuals))
+    power = float(own @ own)
+    if power <= 0.0:
+        return None
+    share, error = float(own @ left) / power, float(np.sqrt(np.mean(left**2) / power))
+    if not (share > _SURE * error and abs(share - 1.0) < _NEAR):
+        return None
+    moved = tuple(replace(e, record=_moved(e.record)) for e in experiments)
+    interval = (share - 1.96 * error, share + 1.96 * error)
+    return moved, note("smooth_voltage", share=share, low=interval[0], high=interval[1])
+
+
+def _difference(fit: Fit, number: int, experiment: Experiment) -> FloatArray:
+    """Return what a smooth voltage changes in a record's displacement (n,) [m].
+
+    Straight lines between twice as many samples of the curve lack a quarter of it.
+    """
+    record, start = experiment.record, fit.start(number)
+    if experiment.held_out_whole:
+        return np.zeros(record.n)
+    time, voltage = np.empty(2 * record.n - 1), np.empty(2 * record.n - 1)
+    time[::2], time[1::2] = record.time, _middle(record.time)
+    voltage[::2], voltage[1::2] = record.voltage, _middle(record.voltage) + 1.5 * _higher(record)
+    finer = Record(
+        name=record.name,
+        time=time,
+        voltage=voltage,
+        load_force=_between(record, time, record.load_force),
+        temperature=_between(record, time, record.temperature),
+    )
+    straight, smooth = (
+        trace_record(fit.model, r, start, (), stop=r.n, way=fit.way, by_start=False).output
+        for r in (record, finer)
+    )
+    return np.asarray((smooth[::2] - straight) * 4.0 / 3.0)
+
+
+def _between(record: Record, time: FloatArray, column: FloatArray | None) -> FloatArray | None:
+    return None if column is None else np.interp(time, record.time, column)
+
+
+def _middle(values: FloatArray) -> FloatArray:
+    return 0.5 * (values[1:] + values[:-1])
+
+
+def _higher(record: Record) -> FloatArray:
+    """Return by how much the mean of a smooth curve is above each straight line, (n - 1,) [V].
+
+    A parabola with the second derivative c has a mean that is higher by -h^2 c/12, and is higher by
+    1.5 times that in the middle. At a sample, c is the median of the second differences there and
+    on either side: a corner has none.
+    """
+    step = np.diff(record.time)
+    bends = np.zeros(record.n + 2)
+    bends[2:-2] = np.diff(np.diff(record.voltage) / step) / _middle(step)
+    bends = np.median([bends[:-2], bends[1:-1], bends[2:]], axis=0)
+    return np.asarray(-(step**2) * _middle(bends) / 12.0)
+
+
+def _moved(record: Record) -> Record:
+    """Return a record whose straight lines have the mean of a smooth curve in each interval.
+
+    A sample is moved by the mean of the intervals on its sides.
+    """
+    higher = _higher(record)
+    beside = np.concatenate([higher[:1], _middle(higher), higher[-1:]])
+    return replace(record, voltage=record.voltage + beside)
+
+
+#: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
+#: of another effect.
+_AS_GOOD, _LIKE = 10.0, 3.0
+#: To what share of the rms one beside the causes found must lead.
+_MUCH = 0.985
+#: n ln(ratio of rms) by which a fit with resonances must be better to count.
+_CLEAR = 15.0
+#: Multiple of the sampling rate about which the images of a mode's tone are tried at most.
+_IMAGES_variants = 3
+_QUICK, _FIRST, _BEST = 8, 4, 2
+#: How far above what is of use the cost after the first evaluations may be.
+_HOPEFUL = 2.0
+#: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
+_AGAIN = 1.5
+#: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band; the
+#: decrease of the whitened sum of squares from which ringing is seen, and resonances at most.
+_NEAR_BAND, SEEN, _RESONANCES = (300.0, 10_000.0), 40.0, 2
+
+
+@stage("base fit again")
+def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
+    """Fit the base from resonances and lags that fast records show; None if none explain more.
+
+    Ordinary lags lead nowhere for a stack that rings within the record's band. The search begins
+    with an ordinary loop and, while it misses something, with that of the base.
+    """
+    if "k_P" not in base.model.values:
+        return None
+    records = [e.record for e in fitted(experiments)]
+    progress("resonances and lags that the records show")
+    linear = linear_start(records, base.model.values)
+    fastest = min(r.sample_time for r in records)
+    if linear is None or not resolved(base.model, linear.candidates, fastest):
+        return None
+    ordinary = base.model.with_values(ordinary_values(base.model, records))
+    best = base
+    for model in (ordinary, base.model):
+        with suppress(PsaError):
+            own = search(model, experiments, linear=linear.candidates, progress=progress).best
+            best = min(best, own, key=lambda f: f.rms)
+            if own.cost < _AGAIN * len(own.residuals):
+                break
+    return best if _short(base, best) > _CLEAR else None
+
+
+@stage("base fit again")
+def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
+    """Fit with resonances near or above the band; None where none explains much more.
+
+    Steps excite such a resonance, and what a slow record shows of its ringing looks like noise
+    after each step. `before` may hold causes; the mechanics is sought again where it holds none.
+    """
+    found = before
+    for _ in range(_RESONANCES):
+        more = _with_ringing(found, experiments, progress, SEEN)
+        if more is None:
+            break
+        found = more
+    if found.rms > _MUCH * before.rms:
+        return None
+    return found if before.model.effects else _tuned(found, experiments, progress)
+
+
+@stage("base fit again")
+def instead_of_mode(
+    before: Fit, mode: Component, found: Fit, experiments: Sequence[Experiment], progress: Progress
+) -> Fit | None:
+    """Fit with a resonance of the stack's own where a further mode was `found`.
+
+    `before` is the model to which the mode was added. A stack that rings near the sampling rate
+    shows a tone at one of its images, |k f_s + f| and |k f_s - f|, which decays as fast: its
+    damping ratio times its frequency is the same. None where no mass explains the data about as
+    well as the mode.
+    """
+    progress("base fit, with the mode as a resonance of the stack's own")
+    values = found.model.values
+    tone, damping = values[mode.tone or ""], values["mode_damping"]
+    rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
+    near = images(tone, rate, _IMAGES_variants)
+    starts = [m for f in near for m in _masses(before.model.values, [f], damping * tone / f)]
+    return _with_masses(before, starts, experiments, _as_good(found, _AS_GOOD))
+
+
+@stage("base fit again")
+def instead_of(
+    base: Fit, found: Fit, experiments: Sequence[Experiment], progress: Progress
+) -> Fit | None:
+    """Fit the base with resonances of its own where an effect was `found`.
+
+    None where no masses explain the data about as well as the effect. A resonance above the band
+    delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
+    what looks like a further mode.
+    """
+    own = _with_ringing(base, experiments, progress, least=_as_good(found, _LIKE))
+    if own is not None and _short(own, found) < _LIKE:
+        return _tuned(own, experiments, progress)
+    if not shows_ringing(experiments):
+        return None
+    again = retuned(base, experiments, progress, reached=found.rms)
+    if _short(base, again) <= _CLEAR:
+        return None
+    return without_blur(again, experiments) if _short(again, found) < _LIKE else None
+
+
+def rings(effect: Component) -> bool:
+    """Whether an effect is a further resonance of the plant."""
+    return effect.tone is not None and effect.belongs_to == "plant"
+
+
+def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+    """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
+    left = ringing(found, experiments)
+    if left is None or left.decrease >= SEEN:
+        found = retuned(found, experiments, progress)
+    return without_blur(found, experiments)
+
+
+def _short(found: Fit, other: Fit) -> float:
+    """Return n ln(rms of a fit / rms of another one)."""
+    return len(other.residuals) * float(np.log(found.rms / other.rms))
+
+
+def _as_good(other: Fit, short: float) -> float:
+    """Return the rms [m] that falls short of another fit's by n ln(ratio of rms) = `short`."""
+    return other.rms * float(np.exp(short / len(other.residuals)))
+
+
+def _with_ringing(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+    seen: float = 0.0,
+    least: float = np.inf,
+) -> Fit | None:
+    """Fit with a mass free, from the resonances that the residual's ringing may be of.
+
+    None where it shows less than `seen`, a decrease of the whitened sum of squares, or where none
+    explains clearly more, down to the rms `least` [m]. A mass that is free already is tried
+    elsewhere, too.
+    """
+    rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
+    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
+        return None
+    tone = ringing(fit, experiments)
+    if tone is None or tone.decrease < seen:
+        return None
+    progress(f"base fit, with a resonance that may be seen at {tone.tone:.3g} Hz")
+    starts = [m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z)]
+    return _with_masses(fit, starts, experiments, least)
+
+
+def _masses(
+    p: Mapping[str, float], frequencies: Sequence[float], damping: float
+) -> Iterator[dict[str, float]]:
+    """Yield mass and damping of wafers or bonding layers for resonances [Hz] at a damping ratio."""
+    for part in ("_P", "_B") if "k_B" in p else ("",):
+        for frequency in frequencies:
+            mass = p[f"k{part}"] / (2.0 * np.pi * frequency) ** 2
+            lost = 2.0 * damping * float(np.sqrt(mass * p[f"k{part}"]))
+            yield {f"m{part}": mass, f"c{part}": lost}
+
+
+def _with_masses(
+    before: Fit,
+    starts: Sequence[Mapping[str, float]],
+    experiments: Sequence[Experiment],
+    least: float = np.inf,
+) -> Fit | None:
+    """Fit with one mass free from several starts; None where none explains clearly more.
+
+    None as well where no rms comes near the `least` that is of use [m].
+    """
+    least = min(least, before.rms * float(np.exp(-_CLEAR / len(before.residuals))))
+
+    def begun(start: Mapping[str, float]) -> Fit | None:
+        free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
+        return quick_from(
+            before, before.model, experiments, free,
+            start_states=before.starts(), evaluations=_FIRST, start=start,
+        )  # fmt: skip
+
+    def further(quick: Fit) -> Fit | None:
+        names, states = quick.unknowns.names, quick.starts()
+        return quick_from(
+            quick, quick.model, experiments, names, start_states=states, evaluations=_QUICK
+        )
+
+    limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
+    found = [f for f in side_by_side(begun, starts) if f is not None and f.cost < limit]
+    ended = side_by_side(further, sorted(found, key=lambda f: f.cost)[:_BEST])
+    best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
+    if best is None:
+        return None
+    try:
+        final = refit(best, experiments, best.unknowns.names, least=least)
+    except PsaError:
+        return None
+    return final if _short(before, final) > _CLEAR else None

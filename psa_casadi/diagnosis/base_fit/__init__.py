@@ -1,1 +1,0 @@
-"""The base model fitted again where it was lost: its resonances and their ringing."""

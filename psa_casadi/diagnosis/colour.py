@@ -1,0 +1,419 @@
+"""The colour of the noise as an autoregression for each record, and tests for what it is not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import filtered, first_order_noise
+from psa_casadi.records.repeats import autoregression_of
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
+_WHITE = 0.05
+_LARGEST = 0.95
+#: Correlations at which it is asked what a projection leaves, the least share of a difference that
+#: must be left, and the share of directions up to which it is asked at all.
+_TRIED, _TOLD, _MANY = (0.15, 0.3, 0.45, 0.6, 0.7, 0.8, 0.88, _LARGEST), 0.5, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Colour:
+    """Noise e_k = a_1 e_(k-1) + ... + w_k, with w white of standard deviation `level` [m].
+
+    `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
+    records' numbers of samples. `further` are the colours of the columns beside the displacement,
+    each with a level in its own unit.
+    """
+
+    autoregression: tuple[FloatArray, ...]
+    level: float
+    lengths: tuple[int, ...]
+    further: tuple["Colour", ...] = ()
+
+    @property
+    def each(self) -> tuple["Colour", ...]:
+        """This colour and those of the further columns."""
+        return (self, *self.further)
+
+    @property
+    def inflation(self) -> float:
+        """Factor by which the colour inflates the variance of a mean, over all records.
+
+        The noise's density at frequency 0 over its mean density: (1 + r)/(1 - r) of a first-order
+        autoregression.
+        """
+        each = [_at_rest(a) / p for a, p in zip(self.autoregression, self._powers, strict=True)]
+        return max(1.0, float(np.average(each, weights=self.lengths)))
+
+    @property
+    def rms(self) -> float:
+        """Rms of the noise over all records [m]."""
+        return self.level * float(np.sqrt(np.average(self._powers, weights=self.lengths)))
+
+    @cached_property
+    def _powers(self) -> tuple[float, ...]:
+        """Variance of every record's noise over that of w."""
+        return tuple(_power(a) for a in self.autoregression)
+
+    def whiten(self, signal: FloatArray) -> FloatArray:
+        """Filter a signal (samples,) or columns (samples, k), every record for itself."""
+        if not signal.size or not any(a.size for a in self.autoregression):
+            return signal
+        white = signal.copy()
+        first = 0
+        records = zip(self.autoregression, self._powers, self.lengths, strict=True)
+        for a, power, length in records:
+            part = signal[first : first + length]
+            if a.size and length > a.size:
+                own = white[first : first + length]
+                own[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
+                own[: a.size] = part[: a.size] / np.sqrt(power)
+            first += length
+        return white
+
+    def whiten_all(self, signal: FloatArray, further: Sequence[FloatArray]) -> FloatArray:
+        """Filter a signal of the displacement and those of the further columns, and stack them.
+
+        A further one counts over its noise level, in metres of that of the displacement.
+        """
+        if not further:
+            return self.whiten(signal)
+        beside = [
+            self.level / own.level * own.whiten(part)
+            for own, part in zip(self.further, further, strict=True)
+        ]
+        return np.concatenate([self.whiten(signal), *beside])
+
+
+def colour_of(
+    remainder: FloatArray,
+    lengths: Sequence[int],
+    known: Sequence[FloatArray | None] | None = None,
+    removed: FloatArray | None = None,
+) -> Colour:
+    """Return colour and level of what no model and no candidate explains.
+
+    `removed` (samples, k) is an orthonormal basis of what was projected out of it: slow directions
+    for the most part, which take a colour's slow part along. The correlation is the one that leaves
+    what is seen (`left_correlation`), where that can be told.
+
+    `known` holds the autoregression of records whose noise is known without a model (repeats). The
+    others share one of first order, estimated from the remainder: it can describe the noise of a
+    sensor with a filter, but neither a tone nor a slow misfit on top of white noise, so that those
+    remain visible after whitening.
+    """
+    given = list(known or [None] * len(lengths))
+    top = bottom = 0.0
+    first = 0
+    for length, own in zip(lengths, given, strict=True):
+        part = remainder[first : first + length]
+        if own is None:
+            top += float(part[1:] @ part[:-1])
+            bottom += float(part @ part)
+        first += length
+    seen = top / bottom if bottom > 0 else 0.0
+    if removed is not None and bottom > 0:
+        ends = np.cumsum(lengths)[:-1]
+        pairs = zip(np.split(removed, ends), given, strict=True)
+        parts = [q for q, own in pairs if own is None and len(q)]
+        seen = _before(seen, parts)
+    correlation = float(np.clip(seen, 0.0, _LARGEST))
+    shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
+    each = tuple(shared if own is None else own for own in given)
+    return _with_level(each, remainder, lengths)
+
+
+def left_correlation(correlation: float, removed: Sequence[FloatArray]) -> float:
+    """Return the correlation of neighbours that a first-order autoregression shows after all.
+
+    `removed` are the rows, record by record, of the basis Q that was projected out of it. With the
+    covariance S_ij = r^|i-j| within records and the mean D of the shifts to either side the
+    expected products are tr(D P S P) of neighbours and tr(P S P) of the samples, P = I - Q Q^T.
+    """
+    q = np.vstack(removed)
+    covered = np.vstack([_correlated(correlation, part) for part in removed])
+    shifted = np.vstack([_beside(part) for part in removed])
+    inner, spread = q.T @ q, q.T @ covered
+    pairs = sum(len(part) - 1 for part in removed)
+    top = correlation * pairs - 2.0 * np.sum(shifted * covered)
+    top += np.sum((q.T @ shifted) * spread.T)
+    bottom = len(q) - 2.0 * np.trace(spread) + np.sum(inner * spread.T)
+    return float(top / bottom)
+
+
+def _correlated(r: float, columns: FloatArray) -> FloatArray:
+    """Return S q for columns q: their sum over all samples, weighted with r^|i-j|."""
+    ahead = filtered([1.0], [1.0, -r], columns)
+    behind = filtered([1.0], [1.0, -r], columns[::-1])[::-1]
+    both: FloatArray = ahead + behind - columns
+    return both
+
+
+def _beside(columns: FloatArray) -> FloatArray:
+    """Return half the sum of the neighbours on either side."""
+    found = np.zeros_like(columns)
+    found[1:] += 0.5 * columns[:-1]
+    found[:-1] += 0.5 * columns[1:]
+    return found
+
+
+def _before(seen: float, removed: Sequence[FloatArray]) -> float:
+    """Return the correlation of which `seen` is left after the projection.
+
+    Where what is left hardly grows with it any more (`_TOLD`), the correction stays as it was at
+    the last place where it did; there is none where the directions are `_MANY` of the samples.
+    """
+    samples, directions = sum(len(part) for part in removed), removed[0].shape[1]
+    if directions > _MANY * samples:
+        return seen
+    own, left = [0.0], [left_correlation(0.0, removed)]
+    for r in _TRIED:
+        if seen <= left[-1]:
+            break
+        more = left_correlation(r, removed)
+        if more - left[-1] < _TOLD * (r - own[-1]):
+            break
+        own.append(r)
+        left.append(more)
+    return float(np.interp(seen, left, own)) + min(0.0, seen - left[0]) + max(0.0, seen - left[-1])
+
+
+def noise_rms(residual: FloatArray, colour: Colour) -> float:
+    """Return the rms of the noise in a residual [m], from its fast part, at most the colour's.
+
+    Of noise with a colour the fast part alone holds little; what no candidate explains may hold
+    more than noise.
+    """
+    return min(first_order_noise(residual)[0], colour.rms)
+
+
+def excess_power(residual: FloatArray, colour: Colour, floor: float | None = None) -> float:
+    """Return the power [m^2] of a residual above its noise, negative where that is less.
+
+    The noise's power is `floor`^2, or what `noise_rms` finds, and what that is uncertain by.
+    """
+    level = noise_rms(residual, colour) if floor is None else floor
+    return float(np.mean(residual**2)) - level**2 * (1.0 + uncertain(residual))
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square of the values that exist; 0 without any."""
+    valid = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(valid**2))) if valid.size else 0.0
+
+
+def uncertain(residual: FloatArray) -> float:
+    """Return the relative standard error of the noise's power from a residual's fast part.
+
+    About 2/sqrt(n) of white noise. The power of a first-order autoregression hangs on what its fast
+    part tells of the correlation r: 1.4 q/sqrt(n) with q = (1 + r)/(1 - r), within a fifth of what
+    60 draws each of r = 0.4 to 0.9 and n = 2,000 to 5,000 showed; at most 1.
+    """
+    r = first_order_noise(residual)[1] if residual.size else 0.0
+    factor = max(2.0, 1.4 * (1.0 + r) / (1.0 - r))
+    return float(min(1.0, factor / np.sqrt(max(residual.size, 1))))
+
+
+def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
+    """Return the colour of the residual itself, whatever it holds, one autoregression per record.
+
+    A missing effect counts as colour then: a negative control, and what a tone must stand out of
+    (`ringing`), but not a way to know the noise.
+    """
+    ends = np.cumsum(lengths)
+    parts = np.split(residual, ends[:-1])
+    each = (autoregression_of(part) if part.size else part for part in parts)
+    return _with_level(tuple(each), residual, lengths)
+
+
+def _with_level(
+    autoregression: tuple[FloatArray, ...], signal: FloatArray, lengths: Sequence[int]
+) -> Colour:
+    """Return the colour whose level is that of the whitened signal."""
+    colour = Colour(autoregression, 1.0, tuple(lengths))
+    level = float(np.sqrt(np.mean(colour.whiten(signal) ** 2)))
+    return replace(colour, level=max(level, 1e-15))
+
+
+def _at_rest(a: FloatArray) -> float:
+    """Density of the noise at frequency 0 over that of w."""
+    return float(1.0 / max((1.0 - np.sum(a)) ** 2, 1e-6))
+
+
+def _power(a: FloatArray) -> float:
+    """Variance of the noise over that of w: the sum of squares of its impulse response."""
+    if not a.size:
+        return 1.0
+    impulse = np.zeros(4096)
+    impulse[0] = 1.0
+    return float(np.sum(filtered([1.0], np.concatenate([[1.0], -a]), impulse) ** 2))
+
+
+#: Neighbours correlate, the spectrum has a line, the residual or its size follows the drive.
+Seen = Literal["correlation", "line", "drive", "size"]
+
+_LAGS = 25
+#: Squares of the residual over their mean that count at most.
+_MOST = 9.0
+
+
+@dataclass(frozen=True)
+class Omnibus:
+    """Probability of the residual under noise alone, and the test that says so.
+
+    `seen` is what that test sees, `output` the one of several whose residual it is. `excess` is the
+    share of the residual's power above the noise; `size` [m] the rms of what the test sees,
+    `knowable` [m] that below which nothing can be told of a stack.
+    """
+
+    p_value: float
+    excess: float
+    seen: Seen
+    size: float
+    knowable: float
+    output: str = ""
+
+    @property
+    def alarm(self) -> bool:
+        """Whether something besides noise is in the residual, large enough to be told."""
+        return self.p_value < thresholds().alarm and self.size > self.knowable
+
+    @property
+    def finding(self) -> Note:
+        """What is in the residual besides noise, where the test alarms."""
+        return note("structure", seen=self.seen, output=self.output, excess=self.excess)
+
+
+def omnibus(
+    residual: FloatArray,
+    voltage: FloatArray,
+    time: FloatArray,
+    colour: Colour,
+    floor: float,
+    *,
+    knowable: float,
+    even: bool,
+) -> Omnibus:
+    """Test a residual (samples,) [m] for structure that noise of the given colour does not have.
+
+    Three tests with Bonferroni's correction: Ljung-Box on the whitened residual; Fisher's g for a
+    line in its spectrum; and an F test on general features of the voltage and time. With `even` a
+    fourth one asks whether its size is the same everywhere: a sensor's noise is, what a colour may
+    have swallowed of a misfit is not. `excess` is the share of the residual's power above the noise
+    `floor` [m]; what is seen must be larger than what is `knowable` [m].
+    """
+    white = colour.whiten(residual)
+    tests: dict[Seen, tuple[float, float]] = {
+        "correlation": _neighbours(white),
+        "line": _fisher_line(white),
+        "drive": _features(white, voltage, time, colour),
+    }
+    if even:
+        tests["size"] = _sizes(white, voltage, time, colour)
+    seen, (p, share) = min(tests.items(), key=lambda item: item[1][0])
+    power = float(np.mean(residual**2))
+    size = float(np.sqrt(share * power))
+    excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
+    p = min(1.0, len(tests) * p)
+    return Omnibus(p, excess, seen, size, knowable)
+
+
+def whiteness(white: FloatArray) -> float:
+    """Return the p-value of Ljung and Box's test (1978) that neighbours are not correlated."""
+    return _neighbours(white)[0]
+
+
+def _neighbours(white: FloatArray) -> tuple[float, float]:
+    """Return the p-value, and the largest correlation: what is correlated has that share."""
+    n = len(white)
+    centred = white - np.mean(white)
+    power = float(centred @ centred)
+    if power <= 0 or n <= 2 * _LAGS:
+        return 1.0, 0.0
+    r = np.array([centred[k:] @ centred[:-k] / power for k in range(1, _LAGS + 1)])
+    statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, _LAGS + 1)))
+    return float(scipy.special.chdtrc(_LAGS, statistic)), float(np.max(np.abs(r)))
+
+
+def _fisher_line(white: FloatArray) -> tuple[float, float]:
+    """Return the p-value of the strongest line, and its share of the power."""
+    power = np.abs(np.fft.rfft(white - np.mean(white))[1:-1]) ** 2
+    count = len(power)
+    if count < 8 or not np.sum(power) > 0:
+        return 1.0, 0.0
+    share = float(np.max(power) / np.sum(power))
+    return float(min(1.0, count * (1.0 - share) ** (count - 1))), share
+
+
+def _features(
+    white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour
+) -> tuple[float, float]:
+    """F test of the residual on u, u^2, u^3, sgn(u'), |u'|, u sgn(u'), a trend and slow waves."""
+    u, rate, turn, t = _drive(voltage, time)
+    columns = [np.ones_like(u), u, u**2, u**3, turn, np.abs(rate), u * turn, u**2 * turn, t, t**2]
+    columns += [f(np.pi * k * t) for k in (1, 2, 3) for f in (np.sin, np.cos)]
+    x = colour.whiten(np.column_stack(columns))
+    return _f_test(x, white)
+
+
+def _sizes(
+    white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour
+) -> tuple[float, float]:
+    """F test of the squares on voltage, rate, time and way since the last reversal.
+
+    Breusch and Pagan, Econometrica 47 (1979) 1287, with Koenker's correction; squares are over
+    their mean in each record, and those above `_MOST` count as that.
+    """
+    lengths = [n for n in colour.lengths if n]
+    parts = np.split(white, np.cumsum(lengths)[:-1])
+    powers = np.array([np.mean(part**2) for part in parts])
+    if not np.all(powers > 0):
+        return 1.0, 0.0
+    u, rate, turn, t = _drive(voltage, time)
+    speed = np.abs(rate) / (float(np.max(np.abs(rate))) or 1.0)
+    way, age = _since_reversal(u, turn)
+    columns = [u, u**2, speed, np.sqrt(speed), way, np.exp(-20.0 * way), np.exp(-0.1 * age), t]
+    x = np.column_stack([*columns, t**2])
+    squares = np.minimum(white**2 / np.repeat(powers, lengths), _MOST)
+    return _f_test(x - np.mean(x, axis=0), squares - np.mean(squares))
+
+
+def _drive(
+    voltage: FloatArray, time: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return voltage about its mean over its range, its rate, direction, and the time in 0 to 1."""
+    u = (voltage - np.mean(voltage)) / (np.ptp(voltage) or 1.0)
+    rate = np.gradient(u)
+    turn = np.sign(rate) * (np.abs(rate) > 1e-3 * np.max(np.abs(rate)))
+    return u, rate, turn, (time - time[0]) / ((time[-1] - time[0]) or 1.0)
+
+
+def _since_reversal(u: FloatArray, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the distance |u - u_r| from the last reversal and the samples since it."""
+    index = np.arange(len(u))
+    moving = np.flatnonzero(turn)
+    reversed_at = moving[1:][turn[moving[1:]] != turn[moving[:-1]]]
+    last = np.zeros(len(u), dtype=np.int64)
+    last[reversed_at] = reversed_at
+    last = np.maximum.accumulate(last)
+    return np.abs(u - u[last]), (index - last).astype(np.float64)
+
+
+def _f_test(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return the p-value that columns x (n, k) tell nothing of y (n,), and their share of it."""
+    coefficients, _, rank, _ = np.linalg.lstsq(x, y, rcond=None)
+    explained = float(np.sum((x @ coefficients) ** 2))
+    rest = float(y @ y) - explained
+    freedom = len(y) - rank
+    if rest <= 0 or freedom <= 0:
+        return 1.0, 0.0
+    p = float(scipy.special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
+    return p, explained / (explained + rest)

@@ -1,0 +1,188 @@
+"""Whether held-out samples confirm a cause, what they cover, and whether a model holds there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from psa_casadi.diagnosis.colour import Colour, rms
+from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
+from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage
+from psa_casadi.notes import Note, note
+from psa_casadi.records.record import FEWEST_SAMPLES
+from psa_casadi.records.split import Experiment, Kind, counts
+
+#: Gain [%] of an error that doubles.
+_DOUBLED = -100.0
+#: Share of the readings from which on a saturated sensor hides more than it shows.
+_HIDDEN = 0.5
+
+
+def too_few_held_out(experiments: Sequence[Experiment]) -> Note | None:
+    """Return that too few readings are held out to judge a model by; None where enough are."""
+    count = sum(int(e.held_out.sum()) for e in experiments)
+    if count >= FEWEST_SAMPLES:
+        return None
+    return note("few_held_out", count=count, least=FEWEST_SAMPLES)
+
+
+def unconfirmed(
+    experiments: Sequence[Experiment],
+    gain: Gain,
+    *,
+    whole: float,
+    lost: float,
+    partly: bool,
+    hidden: float,
+) -> Note | None:
+    """Return why the records do not confirm the causes of an extended model; None where they do.
+
+    `hidden` is the share of the readings that a saturated sensor has made. The interval of the
+    held-out `gain` tells nothing where it reaches from an error that doubles to the `whole` gain
+    [%], which leaves the noise alone; that of a saturation which shows in one of eight parts does
+    too, so that all but the part that gains most must also have `lost` something [nats]. The
+    voltage must be one that stacks bear and, where the causes explain the records `partly` and
+    much remains, the displacement no other quantity.
+    """
+    few = too_few_held_out(experiments)
+    if few is not None:
+        return few
+    if hidden > _HIDDEN:
+        return note("saturated", share=hidden)
+    low, high = gain.interval
+    if low <= _DOUBLED and high >= whole and lost > thresholds().held_out:
+        return note("gain_unknown", low=low, high=high)
+    records = [e.record for e in experiments]
+    if doubtful_voltage(records):
+        return note("no_such_voltage")
+    if partly and doubtful_quantity(records):
+        return note("other_quantity")
+    return None
+
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Largest held-out errors that do not count (stray readings), the fewest that are tested, and those
+#: of a whole record: fewer do not tell the colour of its noise.
+_STRAY, _FEWEST, _FEWEST_OF_RECORDS = 2, 50, 512
+
+
+@dataclass(frozen=True)
+class Excess:
+    """By which factor held-out errors exceed what they should be [-], and its p-value."""
+
+    factor: float = 1.0
+    p_value: float = 1.0
+
+    def __bool__(self) -> bool:
+        return self.factor > 1.0
+
+
+def held_out_excess(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    predicted: Sequence[FloatArray],
+    colour: Colour,
+    noise: Sequence[NoiseFloor],
+) -> Excess:
+    """Return by which factor held-out errors exceed those of the fit; 1 where noise would do so.
+
+    Samples of records that are fitted for the most part are compared with the fitted ones, both
+    whitened by `colour` and scaled by the records' noise. The ratio F of their mean squares is
+    about normal under noise of kurtosis K, with mean (n + k)/(n - k) for k fitted parameters and n
+    samples of the fit, and variance (K - 1)(1/m + 1/n) for m held-out samples. Whole records that
+    are held out are compared with their own `noise`: parameters that the fitted ones leave open
+    make an error there too, so that only a clear excess counts. One below what can be told of a
+    stack does not.
+    """
+    own = [not e.held_out_whole for e in experiments]
+    parts = held_out_residuals(experiments, predicted)
+    beyond = [
+        rms(part) / floor.level
+        for part, floor, mine in zip(parts, noise, own, strict=True)
+        if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
+    ]
+    found = _within(fit, experiments, parts, colour, own)
+    worst = max(beyond, default=0.0)
+    if worst > max(thresholds().unseen_ratio_of_records, found.factor):
+        found = Excess(worst, thresholds().unseen_alarm)
+    size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / found.factor**2))
+    return found if size > knowable_of(fit, experiments) else Excess()
+
+
+def _within(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    parts: Sequence[FloatArray],
+    colour: Colour,
+    own: Sequence[bool],
+) -> Excess:
+    scales = [1.0 / s if mine else 0.0 for s, mine in zip(fit.sigma, own, strict=True)]
+    held = np.concatenate([p * s for p, s in zip(parts, scales, strict=True)])
+    used = np.concatenate(
+        [r * s for r, s in zip(fit.residuals_of(experiments), scales, strict=True)]
+    )
+    counts = np.repeat(own, [len(p) for p in parts])
+    fitted = np.repeat(own, [int(e.used.sum()) for e in experiments])
+    lengths = tuple(len(p) for p in parts)
+    squares = np.sort(replace(colour, lengths=lengths).whiten(held)[counts] ** 2)[:-_STRAY]
+    learnt = colour.whiten(used)[fitted] ** 2
+    n, m, k = len(learnt), len(squares), len(fit.theta)
+    power = float(np.mean(learnt)) if n else 0.0
+    if m < _FEWEST or n <= 2 * k or power <= 0:
+        return Excess()
+    ratio = float(np.mean(squares)) / power
+    kurtosis = max(3.0, float(np.mean(learnt**2)) / power**2)
+    spread = np.sqrt((kurtosis - 1.0) * (1.0 / m + 1.0 / n))
+    chance = float(scipy.special.ndtr(-(ratio * (n - k) / (n + k) - 1.0) / spread))
+    return Excess(float(np.sqrt(ratio)), chance) if _tells(ratio, chance) else Excess()
+
+
+def _tells(ratio: float, chance: float) -> bool:
+    return chance < thresholds().unseen_alarm and ratio > thresholds().unseen_ratio ** 2
+
+
+#: Shares of the samples, and of the voltage's span, that are worth a word.
+_SAMPLES, _SPAN = 0.02, 0.01
+
+
+def coverage_notes(experiments: Sequence[Experiment]) -> tuple[Note, ...]:
+    """Return what the held-out figure does not rest on; none where all is shown.
+
+    There may be too few of them. It extrapolates where held-out samples have kinds of stretch that
+    no fitted sample shows, and where their voltage goes beyond the fitted one. It says nothing of
+    kinds that are not held out.
+    """
+    records = [e.record for e in experiments]
+    voltage = np.concatenate([r.voltage for r in records])
+    span = float(np.ptp(voltage))
+    fitted = counts(records, [e.used for e in experiments], span)
+    held = counts(records, [e.held_out for e in experiments], span)
+    few = too_few_held_out(experiments)
+    if not fitted or few is not None:
+        return () if few is None else (note("held_out_says_little", why=few),)
+    notes = []
+    for code, asked, known in (
+        ("extrapolates", held, fitted), ("not_held_out", fitted, held),
+    ):  # fmt: skip
+        share, kinds = _without_like(asked, known)
+        if share > _SAMPLES:
+            notes.append(note(code, share=share, kinds=kinds))
+    used = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    judged = np.concatenate([e.record.voltage[e.held_out] for e in experiments])
+    low, high, least, most = (float(f(v)) for v in (used, judged) for f in (np.min, np.max))
+    if max(low - least, most - high) > _SPAN * span:
+        notes.append(note("voltages_beyond", least=least, most=most, low=low, high=high))
+    return tuple(notes)
+
+
+def _without_like(asked: dict[Kind, int], known: dict[Kind, int]) -> tuple[float, tuple[str, ...]]:
+    """Return the share of samples whose kind is not near any `known` one, and the largest kinds."""
+    alone = {k: n for k, n in asked.items() if not any(k.near(other) for other in known)}
+    first = sorted(alone, key=lambda k: -alone[k])[:2]
+    return sum(alone.values()) / sum(asked.values()), tuple(k.words for k in first)

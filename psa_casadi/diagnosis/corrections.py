@@ -1,0 +1,372 @@
+"""Unnamed corrections beside a model: their forms, and what each would remove.
+
+Beside the fitted model everything is linear: measured - predicted = J d + C w + noise, d the change
+of the model's own parameters, w ~ N(0, (s p)^2) the weights of one correction. The size s is that
+of the largest evidence. The evidence is on the scale of the hypotheses' score.
+
+A correction is a sum of columns with weights w_k ~ N(0, (s p_k)^2): s its size, found from the
+data, p_k the shape of the prior, smooth where 1/k or steeper. Quantities are over their range:
+
+    curve         cos(k pi q)                       p_k = 1/k            of voltage or displacement
+    direction     d cos(k pi q), k from 0           p_k = 1/(1 + k)      d a narrow stop, -1 to 1
+    memory        stops E_r, plays^2, plays^3       p_k = 1              of the voltage
+    relaxation    z_tau - x, tau z' + z = x         p_k = 1              tau over decades
+    modes         resonators driven by the force    p_k = 1              frequencies over decades
+    time          cos(k pi t/T)                     p_k = 1/k            of every record
+    gain in time  x cos(k pi t/T)                   p_k = 1/k
+
+Stops and plays: Visintin 1994; their squares and cubes make loops that are asymmetric or S-shaped
+(generalised Prandtl-Ishlinskii, Al Janaideh, Rakheja and Su 2009).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.colour import Colour
+from psa_casadi.diagnosis.held_out import held_out_rms
+from psa_casadi.diagnosis.screening import independent, without
+from psa_casadi.diagnosis.task import shows_ringing
+from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.start.linear_response import plays
+from psa_casadi.records.noise import filtered
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.linear_part import linear_part
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Relaxations per decade, modes.
+_PER_DECADE, MODES = 2, 24
+#: Damping ratio of modes; relaxations go to so many times the record.
+_DAMPING, _LONGEST = 0.05, 3.0
+#: A mode rings so many times in the longest record, and within a hundred samples.
+_PERIODS, _SLOWEST = 8.0, 0.01
+
+
+@dataclass(frozen=True)
+class Signals:
+    """What columns are made of: the records, their voltages and predictions [m].
+
+    `respond` filters a signal at the plant's force as the stack does, over its response at rest.
+    """
+
+    experiments: Sequence[Experiment]
+    predicted: Sequence[FloatArray]
+    respond: Callable[[int, FloatArray], FloatArray]
+
+    def times(self) -> tuple[float, float]:
+        """Shortest sampling interval and longest duration of a record [s]."""
+        records = [e.record for e in self.experiments]
+        return min(r.sample_time for r in records), max(r.duration for r in records)
+
+    def voltage(self, k: int) -> FloatArray:
+        """Voltage of a record over the range of all, 0 to 1."""
+        every = [e.record.voltage for e in self.experiments]
+        return _over_range(self.experiments[k].record.voltage, every)
+
+    def displacement(self, k: int) -> FloatArray:
+        """Predicted displacement of a record over the range of all, 0 to 1."""
+        return _over_range(self.predicted[k], self.predicted)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One form at one port: its name, its columns of a record (n, k) and the prior's shape (k,)."""
+
+    name: str
+    port: str
+    columns: Callable[[Signals, int], FloatArray]
+    shape: Callable[[int], FloatArray]
+    fast: bool = False
+
+
+def _over_range(values: FloatArray, every: Sequence[FloatArray]) -> FloatArray:
+    low = min(float(np.min(v)) for v in every)
+    high = max(float(np.max(v)) for v in every)
+    return (values - low) / max(high - low, 1e-300)
+
+
+def _cosines(q: FloatArray, first: int, count: int) -> FloatArray:
+    return np.cos(np.pi * np.outer(q, np.arange(first, first + count)))
+
+
+def _voltage_curve(s: Signals, k: int) -> FloatArray:
+    return s.respond(k, _cosines(s.voltage(k), 1, CURVE))
+
+
+def _force_curve(s: Signals, k: int) -> FloatArray:
+    return s.respond(k, _cosines(s.displacement(k), 1, CURVE))
+
+
+def _reading_curve(s: Signals, k: int) -> FloatArray:
+    return _cosines(s.displacement(k), 1, CURVE)
+
+
+def _direction(s: Signals, k: int) -> FloatArray:
+    q = s.voltage(k)
+    side = (q[:, None] - plays(q, [NARROW])) / NARROW
+    return s.respond(k, side * _cosines(q, 0, BRANCH))
+
+
+def _memory(s: Signals, k: int) -> FloatArray:
+    q = s.voltage(k)
+    radii = np.array([radius(k) for k in range(ELEMENTS)])
+    followed = plays(q, radii)
+    return s.respond(k, np.hstack([q[:, None] - followed, followed**2, followed**3]))
+
+
+def _relaxation(s: Signals, k: int) -> FloatArray:
+    record = s.experiments[k].record
+    x = s.displacement(k)
+    taus = time_constants([e.record for e in s.experiments])
+    step = np.append(0.0, np.diff(record.time))
+    return np.column_stack([_relaxed(x, step, float(tau)) - x for tau in taus])
+
+
+def time_constants(records: Sequence[Record]) -> FloatArray:
+    """Return the time constants of a relaxation [s], evenly over the decades of the records."""
+    shortest = min(r.sample_time for r in records)
+    longest = _LONGEST * max(r.duration for r in records)
+    count = max(2, round(_PER_DECADE * float(np.log10(longest / shortest))))
+    found: FloatArray = np.geomspace(shortest, longest, count)
+    return found
+
+
+def _modes(s: Signals, k: int) -> FloatArray:
+    record = s.experiments[k].record
+    x, dt = s.displacement(k), record.sample_time
+    shortest, longest = s.times()
+    columns = []
+    lowest = max(_PERIODS / longest, _SLOWEST / shortest)
+    for f in np.geomspace(lowest, 0.45 / shortest, MODES):
+        columns += [_resonator(x, f, dt, order) for order in (0, 1)]
+    return np.column_stack(columns)
+
+
+def _time(s: Signals, k: int) -> FloatArray:
+    t = s.experiments[k].record.time
+    return _cosines((t - t[0]) / (t[-1] - t[0]), 1, BRANCH)
+
+
+def _gain_in_time(s: Signals, k: int) -> FloatArray:
+    return s.displacement(k)[:, None] * _time(s, k)
+
+
+def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
+    """Return z of tau z' + z = x with x linear between samples, z(0) = x(0)."""
+    if np.ptp(step[1:]) < 1e-6 * step[-1]:
+        a = float(np.exp(-step[-1] / tau))
+        b = (1.0 - a) * tau / step[-1]
+        even: FloatArray = x[0] + filtered([1.0 - b, b - a], [1.0, -a], x - x[0])
+        return even
+    z = np.empty_like(x)
+    z[0] = x[0]
+    for i in range(1, len(x)):
+        a = float(np.exp(-step[i] / tau))
+        b = (1.0 - a) * tau / max(step[i], 1e-300)
+        z[i] = a * z[i - 1] + (b - a) * x[i - 1] + (1.0 - b) * x[i]
+    return z
+
+
+def _resonator(x: FloatArray, frequency: float, dt: float, order: int) -> FloatArray:
+    pole = np.exp(2.0 * np.pi * frequency * dt * (-_DAMPING + 1j * np.sqrt(1.0 - _DAMPING**2)))
+    change = np.append(0.0, np.diff(x))
+    before = [1.0, 0.0] if order == 0 else [0.0, 1.0]
+    return filtered(before, [1.0, -2.0 * pole.real, abs(pole) ** 2], change)
+
+
+def _flat(count: int) -> FloatArray:
+    return np.ones(count)
+
+
+def _smooth(count: int) -> FloatArray:
+    return 1.0 / np.arange(1, count + 1)
+
+
+KINDS = (
+    Kind("curve", "drive voltage", _voltage_curve, _smooth),
+    Kind("curve", "reading", _reading_curve, _smooth),
+    Kind("curve", "force", _force_curve, _smooth, fast=True),
+    Kind("direction", "force", _direction, _smooth),
+    Kind("memory", "force", _memory, _flat),
+    Kind("relaxation", "force", _relaxation, _flat),
+    Kind("modes", "force", _modes, _flat),
+    Kind("time", "reading", _time, _smooth),
+    Kind("gain in time", "force", _gain_in_time, _smooth),
+)
+
+
+#: Coordinates this near to a bound stay there.
+_AT_BOUND = 1e-6
+#: Sizes s that are tried, over the rms of what the correction may explain.
+_SIZES = np.geomspace(1e-3, 1e3, 25)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """One correction beside a model: evidence over it, what it leaves, and what it adds.
+
+    `predicted` [m] are whole records with the correction, `added` its own part of them; `weights`
+    those of the kind's columns; `holdout_rms` [m] the error in held-out samples; `moved` is how far
+    the model's own theta follows; `copies` the share of what named causes add that it can add as
+    well.
+    """
+
+    kind: Kind
+    evidence: float
+    holdout_rms: float
+    weights: FloatArray
+    predicted: tuple[FloatArray, ...]
+    added: tuple[FloatArray, ...]
+    moved: FloatArray
+    copies: float = 0.0
+
+
+def corrections(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    colour: Colour,
+    named: Sequence[FloatArray] | None = None,
+) -> tuple[Correction, ...]:
+    """Return all corrections beside a fit, the one of the highest evidence first.
+
+    `named` are the predictions [m] of whole records with named causes, for `Correction.copies`.
+    """
+    try:
+        full = fit.predictions(experiments)
+        signals = Signals(experiments, [p.displacement for p in full], _responses(fit, experiments))
+    except PsaError:
+        return ()
+    follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
+    fast = shows_ringing(experiments)
+    found = [_correction(kind, signals, follow, named) for kind in KINDS if fast or not kind.fast]
+    return tuple(sorted(found, key=lambda c: -c.evidence))
+
+
+class _Following:
+    """The model's own parameters, which follow a correction as far as prior and bounds let them."""
+
+    def __init__(
+        self,
+        fit: Fit,
+        experiments: Sequence[Experiment],
+        colour: Colour,
+        jacobians: Sequence[FloatArray],
+    ) -> None:
+        self.colour, self.whole, self.residuals = colour, jacobians, fit.residuals
+        low, high = fit.unknowns.bounds()
+        self.free = (fit.theta > low + _AT_BOUND) & (fit.theta < high - _AT_BOUND)
+        known = np.isfinite(fit.unknowns.prior)
+        self.prior = np.where(known, fit.unknowns.prior, 1.0)[self.free]
+        self.held = np.diag(known[self.free].astype(np.float64))
+        used = np.vstack([j[e.used] for j, e in zip(jacobians, experiments, strict=True)])
+        scaled = used[:, self.free] * self.prior
+        self.white = np.vstack([self.over_noise(scaled), self.held])
+        self.basis = independent(self.white)
+        self.target = self.beside(fit.residuals)
+
+    def over_noise(self, columns: FloatArray) -> FloatArray:
+        """Return columns at the used samples, whitened, over the noise."""
+        white: FloatArray = self.colour.whiten(columns) / self.colour.level
+        return white
+
+    def beside(self, columns: FloatArray) -> FloatArray:
+        """Return columns over the noise, whitened, less what the parameters can follow."""
+        none = np.zeros((len(self.held), *columns.shape[1:]))
+        return without(np.concatenate([self.over_noise(columns), none]), self.basis)
+
+    def moved(self, added: FloatArray) -> FloatArray:
+        """Return the change of theta (size,) with what is added at used samples."""
+        rest = np.append(self.over_noise(self.residuals - added), np.zeros(len(self.held)))
+        theta = np.zeros(len(self.free))
+        theta[self.free] = self.prior * np.linalg.lstsq(self.white, rest, rcond=None)[0]
+        return theta
+
+
+def _correction(
+    kind: Kind, signals: Signals, follow: _Following, named: Sequence[FloatArray] | None
+) -> Correction:
+    experiments = signals.experiments
+    parts = [kind.columns(signals, k) for k in range(len(experiments))]
+    shape = kind.shape(parts[0].shape[1])
+    used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
+    free = follow.beside(used)
+    weights, evidence = _weights(free, follow.target)
+    own = tuple(p @ (shape * weights) for p in parts)
+    moved = follow.moved(used @ weights)
+    changes = [j @ moved for j in follow.whole]
+    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, own, strict=True))
+    copied = 0.0 if named is None else _copied(free, signals, follow, named)
+    held = held_out_rms(experiments, predicted)
+    return Correction(kind, evidence, held, weights * shape, predicted, own, moved, copied)
+
+
+def _copied(
+    free: FloatArray, signals: Signals, follow: _Following, named: Sequence[FloatArray]
+) -> float:
+    """Return the share of what named causes add that columns (samples, k) can add as well."""
+    pairs = zip(named, signals.predicted, signals.experiments, strict=True)
+    target = follow.beside(np.concatenate([(n - p)[e.used] for n, p, e in pairs]))
+    power = float(target @ target)
+    return float(np.sum((independent(free).T @ target) ** 2)) / power if power > 0 else 0.0
+
+
+def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
+    """Return the posterior mean of w ~ N(0, s^2) and ln of the Bayes factor, s the best one."""
+    n = len(target)
+    u, singular, vt = np.linalg.svd(columns, full_matrices=False)
+    along = u.T @ target
+    power = float(target @ target)
+    best: tuple[float, FloatArray] = (-np.inf, np.zeros(columns.shape[1]))
+    largest = float(np.max(singular, initial=0.0))
+    if largest <= 0.0 or power <= 0.0:
+        return best[1], 0.0
+    for size in _SIZES:
+        # the ratio of prior and noise, on the scale of the largest direction
+        ratio = (size / largest) ** 2 * n
+        shrunk = ratio * singular**2 / (1.0 + ratio * singular**2)
+        left = power - float(np.sum(shrunk * along**2))
+        log_ratio = -0.5 * n * np.log(left / power) - 0.5 * float(
+            np.sum(np.log1p(ratio * singular**2))
+        )
+        if log_ratio > best[0]:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                scaled = np.where(singular > 1e-12 * largest, shrunk / singular, 0.0) * along
+            best = (log_ratio, vt.T @ scaled)
+    return best[1], max(best[0] - float(np.log(len(_SIZES))), 0.0) if best[0] > 0 else best[0]
+
+
+def _responses(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> Callable[[int, FloatArray], FloatArray]:
+    """Return the filter of the plant from force to displacement, for records that show it.
+
+    Effects of the drive come before the force; a high-pass among them has no response at rest.
+    """
+    if not shows_ringing(experiments):
+        return lambda k, x: x
+    drive = [e.name for e in fit.model.effects if e.belongs_to == "drive"]
+    try:
+        part = linear_part(fit.model.without(drive))
+        rest = part.response(np.zeros(1))[0]
+    except (PsaError, np.linalg.LinAlgError):
+        return lambda k, x: x
+    if not np.isfinite(rest) or rest == 0.0:
+        return lambda k, x: x
+
+    def respond(k: int, columns: FloatArray) -> FloatArray:
+        step, n = experiments[k].record.sample_time, len(columns)
+        pad = min(n, 4000)
+        long = np.concatenate([np.repeat(columns[:1], pad, axis=0), columns,
+                               np.repeat(columns[-1:], pad, axis=0)])  # fmt: skip
+        omega: FloatArray = np.asarray(2.0 * np.pi * np.fft.rfftfreq(len(long), step), dtype=float)
+        response = part.response(omega) / rest
+        out = np.fft.irfft(np.fft.rfft(long, axis=0) * response[:, None], len(long), axis=0)
+        return np.asarray(out[pad : pad + n])
+
+    return respond

@@ -1,1 +1,0 @@
-"""Unnamed corrections: generic forms at every port that keep the names of effects honest."""

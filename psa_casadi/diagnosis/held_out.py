@@ -1,0 +1,394 @@
+"""Errors on held-out samples, the share that each cause removes, and the error budget.
+
+    share = sum_j (P_before,j - P_after,j) / s_j^2  /  sum_j (P_base,j - s_j^2) / s_j^2
+
+P_j are mean squares of the models' held-out errors in output j, s_j is the rms of its noise. A
+stack has one output, its displacement, of which s_j cancels. The interval is the jackknife's over
+the held-out records where there are four or more, else over eight blocks of each record's held-out
+samples (Efron and Tibshirani 1993, chapter 11).
+
+All powers are mean squares over the held-out samples, above that of the noise:
+
+    share of a cause = (P_without - P_all) / (P_base - noise^2)
+
+P_without is that of the model fitted again without the cause. Its interval:
+`psa_casadi.diagnosis.held_out`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from psa_casadi.diagnosis.colour import rms
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.further import predicted_further
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.records.split import Experiment
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Held-out records from which on they are the parts; else so many blocks of each are.
+FEWEST_RECORDS, _BLOCKS = 4, 8
+
+
+def parts_of(*errors: Sequence[FloatArray]) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return sums of squares (parts, models, outputs) and sample counts (parts, outputs).
+
+    `errors` holds of every model the held-out errors (n, outputs) of every record, nan where an
+    output is not judged. The parts are the records that have any, where there are at least four,
+    else eight blocks of each.
+    """
+    rows = [own for own in zip(*errors, strict=True) if len(own[0])]
+    if len(rows) < FEWEST_RECORDS:
+        rows = [
+            block
+            for own in rows
+            for block in zip(*(np.array_split(e, _BLOCKS) for e in own), strict=True)
+            if len(block[0])
+        ]
+    outputs = errors[0][0].shape[1]
+    judged = [~np.isnan(np.array(row)).all(axis=0) for row in rows]
+    sums = [
+        [np.sum(e**2, axis=0, where=there) for e in row]
+        for row, there in zip(rows, judged, strict=True)
+    ]
+    counts = np.array([there.sum(axis=0) for there in judged], dtype=np.int64)
+    return np.reshape(sums, (-1, len(errors), outputs)), counts.reshape(-1, outputs)
+
+
+def jackknife(of: Callable[[BoolArray], float], every: BoolArray) -> tuple[float, float]:
+    """Return a figure over all parts, and the half width of its 95 % interval.
+
+    With L the figure over all of k parts and L_i that without part i it is
+    L +- t_(k-1) sqrt((k-1)/k sum (L_i - mean)^2) (Efron and Tibshirani 1993, chapter 11).
+    """
+    k = len(every)
+    if k < 2:
+        return of(every), 0.0
+    without = [of(every & (np.arange(k) != i)) for i in range(k)]
+    spread = float(np.sqrt((k - 1) * np.var(without)))
+    return of(every), float(scipy.special.stdtrit(k - 1, 0.975)) * spread
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one model [m], in training and held-out samples; percent of the measured range."""
+
+    train_rms_m: float
+    holdout_rms_m: float
+    holdout_max_m: float
+    holdout_nrmse_percent: float
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Reduction of the held-out rms by the extended model [%], with a 95 % interval.
+
+    `held_out_records` is the number of records that the interval is taken over, 0 where it is
+    blocks of fewer ones: then it speaks for their voltages only.
+    """
+
+    holdout_rms_reduction_percent: float
+    interval: tuple[float, float]
+    held_out_records: int = 0
+
+
+def held_out_residuals(
+    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return measured minus predicted over the held-out samples of every experiment [m]."""
+    parts = []
+    for e, y in zip(experiments, predicted, strict=True):
+        parts.append((measured(e.record) - y)[e.held_out])
+    return parts
+
+
+def held_out_rms(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> float:
+    """Return the root mean square over all held-out samples [m]."""
+    return rms(np.concatenate(held_out_residuals(experiments, predicted)))
+
+
+def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Return the root mean square errors of the further columns over all held-out samples.
+
+    In their SI units; those of the fitted samples where none is held out. Raises PsaError.
+    """
+    found = []
+    theta = fit.placed(experiments)
+    for f in fit.further:
+        shown = predicted_further(fit.model, experiments, fit.unknowns, theta, f, way=fit.way)
+        parts = [
+            (getattr(experiments[k].record, f.column) - x)[experiments[k].held_out]
+            for k, x in shown.items()
+        ]
+        held = np.concatenate(parts)
+        found.append(rms(held) if held.size else f.rms)
+    return tuple(found)
+
+
+def output_gain(samples: float, before: float, after: float, straight: float = 0.0) -> float:
+    """Return m ln(E0 / E): what held-out samples of one output give a model over another one.
+
+    `samples` are m, counted as those of white noise; E0 and E the rms errors `before` and `after`,
+    each with what cannot be told of the output, `straight`, in the output's unit.
+    """
+    old, new = (max(float(np.hypot(e, straight)), 1e-300) for e in (before, after))
+    return samples * float(np.log(old / new))
+
+
+def whole_residuals(
+    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return measured minus predicted [m] of every record, nan where nothing was measured."""
+    return [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
+
+
+def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> Errors:
+    """Return the errors of a model's predictions of whole records.
+
+    A record whose displacement rests counts over the largest range of all.
+    """
+    largest = max(e.record.range_m for e in experiments)
+    train = np.concatenate(
+        [(measured(e.record) - y)[e.used] for e, y in zip(experiments, predicted, strict=True)]
+    )
+    held = np.concatenate(held_out_residuals(experiments, predicted))
+    squares = shares = 0.0
+    for e, part in zip(experiments, held_out_residuals(experiments, predicted), strict=True):
+        squares += float(np.sum((part / (e.record.range_m or largest)) ** 2))
+        shares += len(part)
+    if not len(held):
+        held = train
+        squares, shares = float(np.mean(train**2)) / largest**2, 1.0
+    return Errors(
+        train_rms_m=rms(train),
+        holdout_rms_m=rms(held),
+        holdout_max_m=float(np.max(np.abs(held))),
+        holdout_nrmse_percent=100.0 * float(np.sqrt(squares / shares)),
+    )
+
+
+def held_out_parts(
+    experiments: Sequence[Experiment], *predicted: Sequence[FloatArray]
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return sums of squares (parts, models) [m^2] and sample counts (parts,) of held-out parts.
+
+    The parts are those of `psa_casadi.diagnosis.held_out`.
+    """
+    sums, counts = parts_of(*(held_out_columns(experiments, p) for p in predicted))
+    return sums[:, :, 0], counts[:, 0]
+
+
+def held_out_columns(
+    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return `held_out_residuals` as columns (n, 1): the displacement is the one output."""
+    return [r[:, None] for r in held_out_residuals(experiments, predicted)]
+
+
+def gain_of(
+    experiments: Sequence[Experiment],
+    base: Sequence[FloatArray],
+    extended: Sequence[FloatArray],
+) -> Gain:
+    """Return the reduction of the held-out rms, with a jackknife interval of the errors' ratio.
+
+    The interval is that of the ratio's logarithm over the parts of `held_out_parts`.
+    """
+    sums, counts = held_out_parts(experiments, base, extended)
+    records = sum(bool(len(r)) for r in held_out_residuals(experiments, base))
+
+    def of(kept: npt.NDArray[np.bool_]) -> float:
+        return _log_ratio(np.sum(sums[kept], axis=0))
+
+    centre, half = jackknife(of, np.ones(len(counts), dtype=bool))
+    low, high = (100.0 * (1.0 - float(np.exp(centre + side * half))) for side in (1.0, -1.0))
+    told = len(counts) if records >= FEWEST_RECORDS else 0
+    return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), told)
+
+
+def lost_elsewhere(
+    experiments: Sequence[Experiment],
+    base: Sequence[FloatArray],
+    extended: Sequence[FloatArray],
+    inflation: float,
+) -> float:
+    """Return what held-out samples lose, but for the part that gains most [nats].
+
+    That is m ln(E/E_0) over the other parts of `held_out_parts`: m their samples over the noise's
+    `inflation`, E_0 and E the errors' rms. Infinite where there is only one part.
+    """
+    sums, counts = held_out_parts(experiments, base, extended)
+    if len(sums) < 2:
+        return np.inf
+    others = np.arange(len(sums)) != int(np.argmax(sums[:, 0] - sums[:, 1]))
+    return float(counts[others].sum()) / inflation * _log_ratio(np.sum(sums[others], axis=0))
+
+
+def _log_ratio(sums: FloatArray) -> float:
+    """Logarithm of the errors' ratio [-], from their sums of squares before and after [m^2]."""
+    before, after = (max(float(s), 1e-300) for s in sums)
+    return 0.5 * float(np.log(after / before))
+
+
+#: The least noise that weighs an output, and the least excess, over the base's error (in power).
+_LEAST_NOISE, _LEAST_EXCESS = 1e-30, 1e-9
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one cause, or an unnamed correction, removes of the error [-], and 95 % interval.
+
+    0 to 1 as a rule; below 0 where it adds error.
+    """
+
+    what: str
+    share: float
+    interval: tuple[float, float]
+
+    @property
+    def shown(self) -> tuple[float, float, float]:
+        """The share and the ends of its interval as they are shown, cut to 0 to 1."""
+        share, low, high = (min(max(v, 0.0), 1.0) for v in (self.share, *self.interval))
+        return share, low, high
+
+    @property
+    def percents(self) -> tuple[str, str, str]:
+        """The same as percentages without their sign, with decimals where all are near 0 or 1.
+
+        A share that is not 0 is never told as 0, one below 1 told as 100 only from 99.995 on.
+        """
+        share, low, high = self.shown
+        off = min(1.0 - self.interval[0], self.interval[1])
+        off = 1.0 if off < 0.0 else off  # beyond what is shown
+        digits = 0 if off > 0.01 else 1 if off > 0.001 else 2
+        while digits < 2 and share < 1.0 and float(f"{100 * share:.{digits}f}") >= 100.0:
+            digits += 1
+        least = 10.0**-digits
+        told = f"{100 * share:.{digits}f}"
+        if 0.0 < 100 * share < 0.5 * least:
+            told = f"under {least:.{digits}f}"
+        return told, f"{100 * low:.{digits}f}", f"{100 * high:.{digits}f}"
+
+    @property
+    def text(self) -> str:
+        """The share with its interval, such as "62 % (58 to 66 %)"."""
+        share, low, high = self.percents
+        return f"{share} % ({low} to {high} %)"
+
+
+@dataclass(frozen=True, eq=False)
+class Removed:
+    """What models remove of the held-out error of a `base` above the `noise`.
+
+    `errors_of` turns a model's predictions of all records into its held-out errors (n, outputs) of
+    each, nan where an output is not judged; `noise` (outputs,) is the rms of each output's noise.
+    """
+
+    errors_of: Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
+    base: Sequence[FloatArray]
+    noise: Sequence[float]
+
+    def share(self, what: str, before: Sequence[FloatArray], after: Sequence[FloatArray]) -> Share:
+        """Return the share of the base's excess that `after` removes of what `before` leaves."""
+        of, count = self._of(before, after)
+        centre, half = jackknife(of, np.ones(count, dtype=bool))
+        return Share(what, centre, (centre - half, centre + half))
+
+    def from_base(self, after: Sequence[FloatArray]) -> float:
+        """Return the share that `after` removes of the base's excess, without its interval."""
+        of, count = self._of(self.base, after)
+        return of(np.ones(count, dtype=bool))
+
+    @cached_property
+    def _base_errors(self) -> Sequence[FloatArray]:
+        return self.errors_of(self.base)
+
+    def _of(
+        self, before: Sequence[FloatArray], after: Sequence[FloatArray]
+    ) -> tuple[Callable[[BoolArray], float], int]:
+        """Return the share over chosen parts, and their number, 0 where there is no excess."""
+        old = self._base_errors if before is self.base else self.errors_of(before)
+        sums, counts = parts_of(self._base_errors, old, self.errors_of(after))
+        floor = np.asarray(self.noise, dtype=np.float64) ** 2
+        whole = _powers(sums, counts)[0]
+        weights = 1.0 / np.maximum(floor, max(_LEAST_NOISE * float(np.max(whole)), 1e-300))
+        if not np.sum(weights * (whole - floor * (whole > 0))) > 0:
+            return lambda _: 0.0, 0
+
+        def of(kept: BoolArray) -> float:
+            base, left, rest = _powers(sums[kept], counts[kept])
+            error = float(weights @ base)
+            excess = error - float(weights @ (floor * (counts[kept].sum(axis=0) > 0)))
+            return float(weights @ (left - rest)) / max(excess, _LEAST_EXCESS * error, 1e-300)
+
+        return of, len(counts)
+
+
+def _powers(sums: FloatArray, counts: npt.NDArray[np.int64]) -> FloatArray:
+    """Return the mean squares (models, outputs) over parts, 0 for an output without a sample."""
+    found: FloatArray = np.sum(sums, axis=0) / np.maximum(np.sum(counts, axis=0), 1)
+    return found
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The held-out error of the base model above the noise, and where it goes.
+
+    `excess_rms_m` is that error, `noise_rms_m` the noise; `together` what all causes remove,
+    `causes` what each does beside the others, `unnamed` what the best correction would remove of
+    the base's error (nothing named) or beyond the causes; `remains_rms_m` and
+    `remains_percent` of the range, each record's over its own as of all errors, are what the named
+    causes leave above the noise.
+    """
+
+    excess_rms_m: float
+    noise_rms_m: float
+    together: Share
+    causes: tuple[Share, ...]
+    unnamed: Share | None
+    remains_rms_m: float
+    remains_percent: float
+
+
+def removed_from(
+    experiments: Sequence[Experiment], base: Sequence[FloatArray], noise: float
+) -> Removed:
+    """Return what models remove of a base's held-out error [m]; `noise` [m] is the rms of it."""
+    return Removed(partial(held_out_columns, experiments), base, (noise,))
+
+
+def budget(
+    experiments: Sequence[Experiment],
+    base: Sequence[FloatArray],
+    extended: Sequence[FloatArray],
+    without: Sequence[tuple[str, Sequence[FloatArray]]],
+    correction: tuple[str, Sequence[FloatArray]] | None,
+    noise: float,
+) -> Budget:
+    """Return the budget of an extended model over a base.
+
+    `without` holds the predictions [m] of the model fitted again without each cause, `correction`
+    those with the best unnamed correction; `noise` [m] is the rms of the noise.
+    """
+    removed = removed_from(experiments, base, noise)
+    sums, counts = held_out_parts(experiments, base, extended)
+    powers = np.sum(sums, axis=0) / max(int(np.sum(counts)), 1)
+    excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
+    whole = errors_of(experiments, extended)
+    return Budget(
+        excess_rms_m=excess,
+        noise_rms_m=noise,
+        together=removed.share("together", base, extended),
+        causes=tuple(removed.share(name, less, extended) for name, less in without),
+        unnamed=None
+        if correction is None
+        else removed.share(correction[0], extended, correction[1]),
+        remains_rms_m=remains,
+        remains_percent=whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300),
+    )

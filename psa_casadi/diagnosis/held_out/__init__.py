@@ -1,1 +1,0 @@
-"""Errors on data that no fit has seen, and whether a model holds there."""

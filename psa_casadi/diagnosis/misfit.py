@@ -1,0 +1,480 @@
+"""What a simulation gets wrong: views, lines and harmonics of one record's residual."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from psa_casadi.diagnosis.noise import NoiseFloor
+from psa_casadi.diagnosis.views import (
+    Drive,
+    Ground,
+    View,
+    axes,
+    drive_of,
+    ground_of,
+    hold_axis,
+    time_axis,
+    view,
+)
+from psa_casadi.errors import InputError
+from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.drive import drive_frequency
+from psa_casadi.records.record import Record
+from psa_casadi.records.repeats import Repetition, repetitions
+
+FloatArray = npt.NDArray[np.float64]
+IndexArray = npt.NDArray[np.int64]
+
+#: Points of the spectrum that are kept; lines that are listed.
+_POINTS, LINES = 300, 6
+#: A line is one that noise would show in one of so many records.
+_CHANCE = 1e-4
+#: The lowest frequency [1/duration] at which a line can be told from drift; widest surroundings.
+_LOWEST, _WIDEST = 8, 64
+_MAINS = (50.0, 60.0)
+_HARMONICS = 40
+#: The drive moves at a frequency where it has this share of its range.
+_LOUD = 5e-3
+
+
+@dataclass(frozen=True)
+class Line:
+    """A tone: `frequency` [Hz], `amplitude` [m, or counts], and what has such a frequency."""
+
+    frequency: float
+    amplitude: float
+    name: str
+    of_drive: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Amplitude density [m/sqrt(Hz)] of a residual and of the noise at `frequency` [Hz].
+
+    `lines` are the strongest first; `share` is what those that are no harmonics of the drive hold
+    of the residual's power above the noise. Amplitudes are in `unit`.
+    """
+
+    frequency: FloatArray
+    density: FloatArray
+    floor: FloatArray
+    lines: tuple[Line, ...]
+    share: float
+    unit: str
+
+    @property
+    def others(self) -> tuple[Line, ...]:
+        """The lines that are not the drive's."""
+        return tuple(line for line in self.lines if not line.of_drive)
+
+
+def spectrum_of(
+    record: Record, residual: FloatArray, floor: NoiseFloor, excess: float, drive: float | None
+) -> Spectrum:
+    """Return the spectrum of a residual (n,), nan counting as zero after the mean is removed.
+
+    `excess` [m^2] is its power above the noise, `drive` [Hz] the fundamental of a periodic voltage.
+    Hann's window over the whole record; uneven sampling is bridged by straight lines.
+    """
+    even, step = _even(record.time, residual)
+    n = even.size
+    window = np.hanning(n + 1)[:-1]
+    there = float(np.mean(even != 0.0)) or 1.0
+    power = np.abs(np.fft.rfft(even * window)) ** 2 * 2.0 * step / float(window @ window) / there
+    frequency = np.arange(power.size) / (n * step)
+    lines = _lines(record, frequency, power, drive, window)
+    held = sum(0.5 * line.amplitude**2 for line in lines if not line.of_drive)
+    share = min(1.0, held / max(excess, held)) if held > 0 else 0.0
+    f, density = _condensed(frequency, power)
+    noise = _floor_density(floor, f, record.sample_time)
+    return Spectrum(f, density, noise, lines, share, record.displacement_unit)
+
+
+def _lines(
+    record: Record,
+    frequency: FloatArray,
+    power: FloatArray,
+    drive: float | None,
+    window: FloatArray,
+) -> tuple[Line, ...]:
+    """Return the strongest lines; where the voltage moves too, they are the drive's."""
+    width = float(frequency[1])
+    v, _ = _even(record.time, record.voltage)
+    moved = 2.0 * np.abs(np.fft.rfft(v * window)) / float(np.sum(window))
+    loud = moved > _LOUD * float(np.ptp(record.voltage))
+    peaks, around = _peaks(power)
+    rows = []
+    for k in peaks.tolist():
+        near = slice(k - 2, k + 3)
+        held = max(float(np.sum(power[near]) - 5.0 * around[k]), 0.0)
+        # a tone of amplitude A holds A^2/2, spread over the window's lines
+        amplitude = float(np.sqrt(2.0 * held * width))
+        centre = float(power[near] @ frequency[near] / np.sum(power[near]))
+        line = _named(centre, amplitude, drive, record.sample_time, width)
+        if not line.of_drive and loud[near].any():
+            line = Line(centre, amplitude, "moved by the drive", True)
+        rows.append(line)
+    return tuple(sorted(rows, key=lambda line: -line.amplitude)[:LINES])
+
+
+def _even(time: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
+    """Return the residual without its mean, 0 where missing, on an even grid, and its step."""
+    there = np.isfinite(residual)
+    centred = np.where(there, residual - np.mean(residual[there]), 0.0)
+    step = float(time[-1] - time[0]) / (time.size - 1)
+    steps = np.diff(time)
+    if float(np.max(np.abs(steps - step))) < 0.1 * step:
+        return centred, step
+    grid = time[0] + step * np.arange(time.size)
+    even = np.interp(grid, time[there], centred[there])
+    return even, step
+
+
+def _peaks(power: FloatArray) -> tuple[IndexArray, FloatArray]:
+    """Return where a line stands out of its surroundings, and the mean power of those (n,).
+
+    Powers of noise are exponentially distributed, their median ln 2 times their mean.
+    """
+    edges = [_LOWEST]
+    while edges[-1] < power.size:
+        edges.append(edges[-1] + int(np.clip(edges[-1], _LOWEST, _WIDEST)))
+    if len(edges) < 3:
+        return np.zeros(0, dtype=np.int64), np.zeros_like(power)
+    edges = [*edges[:-2], power.size]
+    level = np.array([np.median(power[a:b]) for a, b in pairwise(edges)])
+    centres = 0.5 * (np.array(edges[:-1]) + np.array(edges[1:]))
+    around = np.interp(np.arange(power.size), centres, level / np.log(2.0))
+    # neighbouring powers of a window share noise, and a median of few is uncertain
+    limit = 1.4 * around * (np.log(power.size) - np.log(_CHANCE))
+    inner = np.arange(max(_LOWEST, 3), power.size - 3)
+    highest = np.max([power[inner + d] for d in (-3, -2, -1, 1, 2, 3)], axis=0)
+    found = inner[(power[inner] > limit[inner]) & (power[inner] > highest)]
+    return found[np.argsort(-power[found])[: 4 * LINES]], around
+
+
+def _named(f: float, amplitude: float, drive: float | None, step: float, width: float) -> Line:
+    """Return a line with what may have made it: the drive, the mains or its alias, or unknown."""
+    near = 1.5 * width
+    if drive is not None:
+        order = round(f / drive)
+        if 1 <= order <= _HARMONICS and abs(f - order * drive) < near:
+            return Line(f, amplitude, f"harmonic {order} of the drive", True)
+    for mains in _MAINS:
+        for order in (1, 2, 3):
+            tone, rate = order * mains, 1.0 / step
+            alias = abs(tone - rate * round(tone / rate))
+            if abs(f - alias) < max(near, 2e-3 * tone):
+                what = f"{mains:g} Hz mains" if order == 1 else f"{tone:g} Hz, from the mains"
+                return Line(f, amplitude, what if tone < 0.5 * rate else f"alias of {what}", False)
+    return Line(f, amplitude, "", False)
+
+
+def _condensed(frequency: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies and root mean powers of bands that widen with the frequency."""
+    edges = np.unique(np.geomspace(1, power.size, _POINTS).astype(np.int64))
+    starts = edges[:-1] if edges.size > 1 else edges
+    size = np.diff(np.r_[starts, power.size])
+    means = np.add.reduceat(power, starts) / size
+    return np.add.reduceat(frequency, starts) / size, np.sqrt(means)
+
+
+def _floor_density(floor: NoiseFloor, frequency: FloatArray, step: float) -> FloatArray:
+    """Return the density of the noise from its autocovariance, faded out after Bartlett."""
+    lags = np.arange(floor.autocovariance.size)
+    faded = floor.autocovariance * (1.0 - lags / lags.size) * np.where(lags > 0, 2.0, 1.0)
+    power = np.cos(2.0 * np.pi * np.outer(frequency * step, lags)) @ faded
+    return np.sqrt(np.maximum(2.0 * step * power, 0.0))
+
+
+BoolArray = npt.NDArray[np.bool_]
+
+#: Fewest periods that are split.
+PERIODS = 3
+#: The excited lines hold this share of the voltage's power.
+_EXCITED = 0.995
+_SIGNIFICANT = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class HarmonicSplit:
+    """Power of a residual [m^2] by its place among the harmonics of the drive.
+
+    `linear` lies at the excited lines, coherent with the voltage; `even` and `odd` at harmonics
+    that are not excited; `noise` between the harmonics, what lies under them included.
+    `fundamental` [Hz] is the drive's, `excited` the number of its lines.
+    """
+
+    fundamental: float
+    periods: int
+    excited: int
+    linear: float
+    even: float
+    odd: float
+    noise: float
+
+    @property
+    def repeats(self) -> float:
+        """Power of all that repeats."""
+        return self.linear + self.even + self.odd
+
+
+def harmonic_split(record: Record, residual: FloatArray) -> HarmonicSplit | None:
+    """Split a residual (n,) under a voltage of three periods or more, None under any other.
+
+    The harmonics of a periodic voltage carry all that repeats: even nonlinearity at even, odd at
+    odd harmonics; lines between them are noise. At an excited line the linear misfit and the
+    coherent odd one cannot be separated by one record. Source: Pintelon and Schoukens, System
+    Identification, 2nd ed., section 4.3.
+    """
+    run = _period(record)
+    if run is None:
+        return None
+    periods = (run.stop + run.lag - run.start) // run.lag
+    # the first period is left to transients where enough others remain
+    periods -= periods > PERIODS
+    stop = run.stop + run.lag
+    part = slice(stop - periods * run.lag, stop)
+    e, v = residual[part].reshape(periods, run.lag), record.voltage[part]
+    if not np.isfinite(e).any(axis=0).all():
+        return None
+    amplitude = np.abs(np.fft.rfft(v - np.mean(v)))[::periods]
+    excited = _excited(amplitude)
+    base = int(np.gcd.reduce(np.flatnonzero(excited)))
+    order = np.arange(amplitude.size)
+    harmonic = (order % base == 0) & (order > 0)
+    classes = {
+        "linear": excited,
+        "even": harmonic & ~excited & (order // base % 2 == 0),
+        "odd": harmonic & ~excited & (order // base % 2 == 1),
+    }
+    line, between = _powers(_filled(e), periods)
+    found = {name: _significant(line[c], between[c], periods) for name, c in classes.items()}
+    total = float(np.sum(line[1:])) + float(np.sum(between[1:])) * (periods - 1)
+    noise = max(total - sum(found.values()), 0.0)
+    first = float(record.time[run.start + run.lag] - record.time[run.start])
+    return HarmonicSplit(base / first, periods, int(excited.sum()), **found, noise=noise)
+
+
+def _period(record: Record) -> Repetition | None:
+    """Return the longest run of the shortest distance with three periods of the voltage in it."""
+    runs = [r for r in repetitions(record) if r.stop - r.start >= (PERIODS - 1) * r.lag]
+    if not runs:
+        return None
+    shortest = min(r.lag for r in runs)
+    return max((r for r in runs if r.lag == shortest), key=lambda r: r.stop - r.start)
+
+
+def _excited(amplitude: FloatArray) -> BoolArray:
+    """Return the fewest lines that hold 99.5 % of the power, and those as strong as the last."""
+    power = amplitude**2
+    power[0] = 0.0
+    order = np.argsort(-power)
+    last = int(np.searchsorted(np.cumsum(power[order]), _EXCITED * float(np.sum(power))))
+    strong: BoolArray = power >= 0.5 * power[order[min(last, order.size - 1)]]
+    return strong
+
+
+def _filled(e: FloatArray) -> FloatArray:
+    """Return periods (periods, lag) without line and mean, missing samples from other periods."""
+    there = np.isfinite(e)
+    usual = np.nanmean(e, axis=0)
+    whole = np.where(there, e, usual).ravel()
+    # a line through the means of the periods does not touch what repeats
+    middle = np.arange(e.shape[0]) - 0.5 * (e.shape[0] - 1)
+    slope = float(middle @ np.mean(np.where(there, e, usual), axis=1) / (middle @ middle))
+    place = (np.arange(whole.size) - 0.5 * (whole.size - 1)) / e.shape[1]
+    flat: FloatArray = whole - np.mean(whole) - slope * place
+    return flat
+
+
+def _powers(e: FloatArray, periods: int) -> tuple[FloatArray, FloatArray]:
+    """Return the power [m^2] of every harmonic, and the mean of the lines around each (lines,)."""
+    power = 2.0 * np.abs(np.fft.rfft(e)) ** 2 / e.size**2
+    lines = (power.size - 1) // periods + 1
+    rows = np.zeros((lines + 1, periods))
+    rows.ravel()[: power.size] = power[: rows.size]
+    means = np.sum(rows[:, 1:], axis=1) / max(periods - 1, 1)
+    before = np.r_[means[0], means[: lines - 1]]
+    return rows[:lines, 0], 0.5 * (before + means[:lines])
+
+
+def _significant(line: FloatArray, between: FloatArray, periods: int) -> float:
+    """Return the power of some harmonics above the noise, 0 where noise could have made it."""
+    noise = float(np.sum(between))
+    if not line.size or not np.sum(line) > 0:
+        return 0.0
+    above = float(np.sum(line)) - noise
+    if noise > 0:
+        freedom = 4 * (periods - 1) * max(1, line.size // 2)
+        p = float(scipy.special.fdtrc(2 * line.size, freedom, float(np.sum(line)) / noise))
+        above = above if p < _SIGNIFICANT else 0.0
+    return max(above, 0.0)
+
+
+#: A view that explains less than this of the excess is not put into words.
+WORTH_SAYING = 0.05
+#: A drift is removed before other views are taken if the drive turns so often in a bin of time.
+TURNS = 2
+#: Fewer samples than this show nothing.
+FEWEST = 64
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Residual per decade of time since a hold began [m], signed by the change, and its error."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """One record's residual: its size, the views of it, and what is seen.
+
+    `rms` [m, or counts] is without the mean `mean`; `floor` is the noise, `excess` the share of the
+    power above it. The view named "holds" is None in a record without holds, as is `slope`;
+    `split` is None unless the voltage is periodic. `findings` begin with the size; the rest is
+    what explains more than 5 % of the excess, in falling order, and the split; noise has none.
+    """
+
+    record: str
+    rms: float
+    mean: float
+    floor: NoiseFloor
+    excess: float
+    views: tuple[View, ...]
+    holds: View | None
+    slope: Slope | None
+    spectrum: Spectrum
+    split: HarmonicSplit | None
+    findings: tuple[Note, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return texts(self.findings)
+
+
+def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
+    """Return what the residual (n,) [m] of a record shows, measured minus predicted.
+
+    `residual` is nan where nothing counts. Time and memory grow with the number of samples.
+
+    Raises:
+        InputError: the residual has another length than the record, or fewer than 64 samples.
+    """
+    if residual.shape != record.time.shape or np.count_nonzero(np.isfinite(residual)) < FEWEST:
+        raise InputError(
+            f"record '{record.name}': its residual has {np.count_nonzero(np.isfinite(residual))}"
+            f" valid samples of {residual.size} for {record.n} instants; give one value for each"
+            f" instant, {FEWEST} of them valid at least."
+        )
+    ground = ground_of(residual, floor.level)
+    drive = drive_of(record)
+    over_time = view(ground, time_axis(record))
+    steady = _steady(ground, record, over_time, drive)
+    rows = axes(record, _predicted(record, residual), drive)
+    # what varies as slowly as time itself would vanish with the drift
+    slow = ("amplitude", "frequency")
+    views = [over_time, *(view(ground if a.name in slow else steady, a) for a in rows)]
+    held, slope, count = _holds(record, ground)
+    split = harmonic_split(record, residual)
+    line = split.fundamental if split is not None else drive_frequency(record)
+    spectrum = spectrum_of(record, residual, floor, ground.excess, line)
+    power = float(np.mean(ground.residual**2))
+    excess = max(0.0, 1.0 - floor.level**2 / power) if power > 0 else 0.0
+    rms, mean, unit = float(np.sqrt(power)), float(np.nanmean(residual)), record.displacement_unit
+    said = [(v.share, _followed(v, unit)) for v in views if v.significant]
+    if held is not None and held.significant:
+        said.append((held.share, _held(held, slope, count, unit)))
+    said.append((spectrum.share, _lines_misfit(spectrum)))
+    worth = sorted((row for row in said if row[0] > WORTH_SAYING), key=lambda row: -row[0])
+    findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in worth)]
+    if split is not None and split.repeats > WORTH_SAYING * ground.excess:
+        findings.append(_split(split, unit))
+    return Misfit(
+        record.name, rms, mean, floor, excess, tuple(views), held, slope, spectrum, split,
+        tuple(findings),
+    )  # fmt: skip
+
+
+def _steady(ground: Ground, record: Record, over_time: View, drive: Drive) -> Ground:
+    """Return the residual without its slow part, if the drive turns often in every bin of time.
+
+    A drift would hide smaller views. Under a slow drive the two cannot be told apart, and the
+    residual stays as it is.
+    """
+    if not over_time.significant or drive.turns.size < TURNS * over_time.x.size:
+        return ground
+    time = record.time[ground.index] - record.time[0]
+    return replace(ground, residual=ground.residual - np.interp(time, over_time.x, over_time.mean))
+
+
+def _predicted(record: Record, residual: FloatArray) -> FloatArray:
+    """Return the prediction that the residual was taken from, up to a constant."""
+    if record.displacement is None:
+        return np.full(record.n, np.nan)
+    predicted: FloatArray = record.displacement - residual
+    return predicted
+
+
+def _holds(record: Record, ground: Ground) -> tuple[View | None, Slope | None, int]:
+    """Return the residual against lg of the time since a hold began, its slope, and the holds."""
+    axis, count = hold_axis(record)
+    if not count:
+        return None, None, 0
+    found = view(ground, axis)
+    good = found.spread > 0
+    if np.count_nonzero(good) < 3:
+        return found, None, count
+    x, weight = np.log10(found.x[good]), found.spread[good] ** -2.0
+    x = x - np.average(x, weights=weight)
+    spread = float(np.sum(weight * x**2))
+    value = float(np.sum(weight * x * found.mean[good])) / spread
+    return found, Slope(value, 1.0 / float(np.sqrt(spread))), count
+
+
+def _size(record: Record, rms: float, mean: float, floor: NoiseFloor, excess: float) -> Note:
+    """Return how large the residual is, against its noise."""
+    unit = record.displacement_unit
+    return note(
+        "residual", record=record.name, rms=(rms, unit), noise=(floor.level, unit),
+        ratio=rms / floor.level if floor.level > 0 else None, source=floor.source,
+        excess=excess, mean=(mean, unit) if abs(mean) > rms else None,
+    )  # fmt: skip
+
+
+def _followed(v: View, unit: str) -> Note:
+    """Return what the residual follows, with the extremes that stand clear of their errors."""
+    ends = tuple(((float(v.mean[k]), unit), (float(v.x[k]), v.x_unit)) for k in v.extremes)
+    return note("follows", axis=v.name, ends=ends, share=v.share)
+
+
+def _held(v: View, slope: Slope | None, count: int, unit: str) -> Note:
+    """Return how the residual moves in holds; without a slope it only differs."""
+    if slope is None:
+        return _followed(v, unit)
+    clear = abs(slope.value) > 3.0 * slope.error
+    moves = (slope.value, unit) if clear else None
+    return note("holds", count=count, moves=moves, share=v.share)
+
+
+def _lines_misfit(s: Spectrum) -> Note:
+    lines = tuple((line.frequency, line.name, (line.amplitude, s.unit)) for line in s.others[:3])
+    return note("lines", lines=lines, count=len(s.others), share=s.share)
+
+
+def _split(s: HarmonicSplit, unit: str) -> Note:
+    total = s.repeats + s.noise
+    rows = {"linear": s.linear, "even": s.even, "odd": s.odd}
+    parts = tuple(
+        (name, p / total, (float(np.sqrt(p)), unit))
+        for name, p in sorted(rows.items(), key=lambda row: -row[1])
+        if p > 0
+    )
+    return note(
+        "harmonics", periods=s.periods, excited=s.excited, parts=parts, rest=s.noise / total
+    )

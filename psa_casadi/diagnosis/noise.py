@@ -1,0 +1,212 @@
+"""The noise floor of every record: from repeats, from holds, or from the fast part."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.colour import Colour, noise_rms, rms
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import first_order_noise, last_place_of, quantum_of
+from psa_casadi.records.record import Record
+from psa_casadi.records.repeats import MeasuredNoise, holds, repeats
+from psa_casadi.records.split import Experiment
+
+FloatArray = npt.NDArray[np.float64]
+Source = Literal["repeats", "holds", "fast part"]
+
+#: Fewer samples than this give no level to a few per cent.
+ENOUGH = 200
+#: Noise is called white where no autocorrelation exceeds this.
+VISIBLE = 0.1
+#: Samples from which the colour of the noise is known without a model.
+_COLOUR = 500
+#: Lags of the autocovariance that a first-order autoregression is given with.
+_LAGS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFloor:
+    """The noise of one record: standard deviation `level` [m, or counts] and where it comes from.
+
+    `autocovariance` (lags,) [m^2] begins at lag 0 and is that of `level`; `autoregression` (p,) is
+    empty for white noise; `samples` is what the level rests on. `quantum` is the step between the
+    sensor's levels, None where it shows none; `finding` says all this.
+    """
+
+    record: str
+    level: float
+    source: Source
+    samples: int
+    autocovariance: FloatArray
+    autoregression: FloatArray
+    quantum: float | None
+    finding: Note
+
+    @property
+    def sentence(self) -> str:
+        """All this in words."""
+        return str(self.finding)
+
+
+def noise_floor(
+    records: Sequence[Record], residuals: Sequence[FloatArray]
+) -> tuple[NoiseFloor, ...]:
+    """Return the noise floor of every record, from the best source that it offers.
+
+    Repeats come first, then holds: no model is involved in them. Else the fast part of the residual
+    (n,), nan where nothing counts, shows the noise, white or of first order (`first_order_noise`).
+    No level is below quantum/sqrt(12), the rms of rounding to a quantum.
+    """
+    return tuple(_floor(r, e) for r, e in zip(records, residuals, strict=True))
+
+
+def pooled_level(
+    noise: Sequence[NoiseFloor], residuals: Sequence[FloatArray], colour: Colour
+) -> float:
+    """Return the rms of the noise over all records [m].
+
+    Where no voltage was repeated that of the residual's fast part counts, at most that of noise of
+    the given colour and at least that of rounding: a hold may ring.
+    """
+    counts = [np.count_nonzero(np.isfinite(e)) for e in residuals]
+    powers = [
+        n.level**2
+        if n.source == "repeats"
+        else max(noise_rms(e[np.isfinite(e)], colour), _rounding(n.quantum)) ** 2
+        for n, e in zip(noise, residuals, strict=True)
+    ]
+    return float(np.sqrt(np.average(powers, weights=counts)))
+
+
+def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
+    """Return the autoregression of a record's noise where repeats tell it, else None.
+
+    Holds do not: what rings or hums during a hold would count as the noise's colour. Where a
+    `residual` (n,) is smaller than what differs between repeats, the repeats hold more than noise:
+    what a first loop leaves behind, and creep.
+    """
+    source, found, _ = _source(record)
+    if found is None or source != "repeats" or found.samples < _COLOUR:
+        return None
+    return found.autoregression if found.level <= rms(residual) else None
+
+
+def knowable(record: Record, error: float, residual: FloatArray) -> float:
+    """Return the rms [m] below which a `residual` (n,) tells nothing of a stack.
+
+    It is that of the simulation's own largest `error` [m], of the form that no model has exactly
+    (`form_of_range`), and of rounding in the sensor or the file where the residual is hardly
+    more than that.
+    """
+    quantum, last_place, size = _resolution(record)
+    rounding = _rounding(max(quantum or 0.0, last_place))
+    if rms(residual) > thresholds().dithered * rounding:
+        rounding = 0.0
+    return float(np.sqrt(rounding**2 + error**2 + (thresholds().form_of_range * size) ** 2))
+
+
+def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:
+    """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
+    error = max((s.error for s in fit.simulated), default=0.0)
+    counts = [int(e.used.sum()) for e in experiments]
+    parts = fit.residuals_of(experiments)
+    squares = [
+        knowable(e.record, error, part) ** 2 for e, part in zip(experiments, parts, strict=True)
+    ]
+    return float(np.sqrt(np.average(squares, weights=counts)))
+
+
+def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
+    valid = residual[np.isfinite(residual)]
+    quantum, _, _ = _resolution(record)
+    source, found, how = _source(record)
+    if found is not None and found.level > rms(valid):
+        source, found, how = _FAST_PART
+    if found is None:
+        level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
+        covariance = np.asarray(level**2 * r ** np.arange(_LAGS if r > 0 else 1), np.float64)
+        found = MeasuredNoise(level, covariance, np.array([r] if r > 0 else []), valid.size)
+    rounding = _rounding(quantum)
+    level, covariance = found.level, found.autocovariance.copy()
+    if level < rounding:
+        covariance[0] += rounding**2 - level**2
+        level = rounding
+    coloured = bool(np.any(np.abs(covariance[1:]) > VISIBLE * covariance[0]))
+    unit = record.displacement_unit
+    finding = note(
+        "noise", record=record.name, level=(level, unit), how=how, samples=found.samples,
+        coloured=coloured, quantum=None if quantum is None else (quantum, unit),
+        rounding=(rounding, unit),
+    )  # fmt: skip
+    return NoiseFloor(
+        record.name, level, source, found.samples, covariance, found.autoregression, quantum,
+        finding,
+    )  # fmt: skip
+
+
+def _rounding(quantum: float | None) -> float:
+    """Rms of rounding to a quantum, 0 where there is none."""
+    return (quantum or 0.0) / float(np.sqrt(12.0))
+
+
+_FAST_PART: tuple[Source, None, Note] = ("fast part", None, note("noise_fast"))
+
+
+@lru_cache(maxsize=64)
+def _resolution(record: Record) -> tuple[float | None, float, float]:
+    """Return a record's quantum, its last decimal place, and its range [m]; None, 0 without any."""
+    y = record.displacement
+    valid = np.zeros(0) if y is None else y[np.isfinite(y)]
+    if not valid.size:
+        return None, 0.0, 0.0
+    return quantum_of(valid), last_place_of(valid), float(np.ptp(valid))
+
+
+@lru_cache(maxsize=64)
+def _source(record: Record) -> tuple[Source, MeasuredNoise | None, Note]:
+    """Return the best source that needs no model, what it says, and how it does so."""
+    again = repeats(record)
+    if again is not None and again.samples >= ENOUGH:
+        return "repeats", again, note("noise_repeats", apart=(again.distances[0], "s"))
+    still = holds(record)
+    if still is not None and still.samples >= ENOUGH:
+        return "holds", still, note("noise_holds", count=still.count)
+    return _FAST_PART
+
+
+#: Robust standard deviations of the residual from which on a repeated reading is the sensor's.
+_FAR = 6.0
+#: Share of repeated readings from which on the sensor's count is so coarse that they say nothing.
+_RARE = 0.2
+
+
+def without_stuck_readings(
+    experiments: Sequence[Experiment], fit: Fit
+) -> tuple[tuple[Experiment, ...], int]:
+    """Return the experiments without repeated readings far from a fit, and how many these are.
+
+    Noise repeats a reading by chance here and there; where that is also far from the model, which
+    the record alone cannot tell from a stack that is late, the sensor was stuck.
+    """
+    kept, count = [], 0
+    for e, predicted in zip(experiments, fit.predicted(experiments), strict=True):
+        y = measured(e.record)
+        residual = np.abs(y - predicted)
+        again = np.r_[False, np.diff(y) == 0.0]
+        noise = 1.4826 * float(np.nanmedian(residual))
+        far = residual > _FAR * noise
+        bad = again & far if np.mean(again) < _RARE else np.zeros_like(again)
+        count += int(np.count_nonzero(bad))
+        given = e.record.displacement
+        record = e.record
+        if given is not None and bad.any():
+            record = replace(record, displacement=np.where(bad, np.nan, given))
+        kept.append(replace(e, record=record, used=e.used & ~bad, held_out=e.held_out & ~bad))
+    return tuple(kept), count

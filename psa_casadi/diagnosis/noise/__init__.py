@@ -1,1 +1,0 @@
-"""The noise of a record: its colour, its level, and what no noise explains."""

@@ -1,0 +1,417 @@
+"""Trial directions: what each effect would add to the prediction at its trial values.
+
+There is one direction for each weight, at its ordinary size. With the whitened directions W over
+the noise level, the residual r over it, and weights g with the prior N(0, s^2 I), s =
+`LINEAR_PRIOR` (Bayesian linear regression),
+
+    g = (W'W + I/s^2)^-1 W'r,    D = r'W g,
+
+D the decrease of the sum of squares, that of the prior included. Noise alone makes D nearly a
+chi-square variable of as many degrees of freedom as (W'W + I/s^2)^-1 W'W has trace.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from psa_casadi.component import (
+    DISPLACEMENT_PEAKS,
+    DISPLACEMENT_STEPS,
+    RECORD_DURATION,
+    SPECTRAL_PEAKS,
+    Component,
+)
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column
+from psa_casadi.identification.fitting.prediction import OUTPUT, measured, trace_record
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
+from psa_casadi.model.compose import Model
+from psa_casadi.records.drive import tells_tone
+from psa_casadi.records.noise import peaks as highest_peaks
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.ahead import compiled
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.start import memory_names
+from psa_casadi.simulation.ways import Way
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
+_PEAKS, _FINER = 4, 8
+#: Bins of the displacement; periods between so many of them over the range are tried.
+_BINS, _FEWEST_PERIODS, _MOST_PERIODS = 2048, 4, 256
+#: A jump is the difference of the means over so many bins on either side.
+_SIDE = 64
+
+
+def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Frequencies [Hz] of the highest peaks in the spectrum of the first record's residual.
+
+    Samples that do not count are 0, so that a line keeps its phase across them. The range of a
+    periodic drive's harmonics is left out, since it may be distortion, but for the mains.
+    """
+    experiment = experiments[0]
+    count = experiment.stop
+    used = experiment.used[:count]
+    residual = np.zeros(count)
+    residual[used] = fit.residuals[: int(used.sum())]
+    residual[used] -= np.mean(residual[used])
+    power = np.abs(np.fft.rfft(residual * np.hanning(count), _FINER * count)) ** 2
+    frequency = np.fft.rfftfreq(_FINER * count, experiment.record.sample_time)
+    lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
+    order = highest_peaks(power[lowest:], apart, 5 * _PEAKS) + lowest
+    record = experiment.record
+    tones = [k for k in order if tells_tone(frequency[k], record, hum=True)]
+    strongest = np.array(tones[:_PEAKS], dtype=int)
+    return tuple(float(f) for f in np.sort(frequency[strongest])) or (
+        0.1 / experiment.record.sample_time,
+    )
+
+
+def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Periods [m] with which the residual of the largest record repeats over the displacement.
+
+    Of the mean residual in bins of the predicted displacement, under a Hann window.
+    """
+    _, span, count, total = _binned(fit, experiments)
+    if span <= 0.0:
+        return ()
+    mean = total / np.maximum(count, 1)
+    power = np.abs(np.fft.rfft(mean * np.hanning(_BINS), _FINER * _BINS)) ** 2
+    first = _FINER * _FEWEST_PERIODS
+    order = highest_peaks(power[first : _FINER * _MOST_PERIODS], 3 * _FINER, _PEAKS) + first
+    return tuple(float(p) for p in np.sort(span * _FINER / order))
+
+
+def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+    """Places [m] at which the residual of the largest record jumps over the displacement.
+
+    Where the difference of its means on either side is largest over what equal noise would make of
+    it; places are displacements of the model, without the record's offset.
+    """
+    low, span, count, total = _binned(fit, experiments)
+    if span <= 0.0:
+        return ()
+    below, sums = (np.append(0.0, np.cumsum(q)) for q in (count, total))
+    edges = np.arange(_SIDE, _BINS - _SIDE + 1)
+    left, right = (below[edges + k] - below[edges + k - _SIDE] for k in (0, _SIDE))
+    before, after = (sums[edges + k] - sums[edges + k - _SIDE] for k in (0, _SIDE))
+    seen = np.minimum(left, right) > 0
+    jump = after / np.maximum(right, 1) - before / np.maximum(left, 1)
+    power = np.where(seen, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
+    places = edges[highest_peaks(power, _SIDE, _PEAKS)]
+    found = low + span * np.sort(places) / _BINS
+    return tuple(float(x) for x in found)
+
+
+def _binned(
+    fit: Fit, experiments: Sequence[Experiment]
+) -> tuple[float, float, FloatArray, FloatArray]:
+    """Return lowest displacement and range [m]; samples and sum of the residual in bins of it.
+
+    Of the record whose displacement, as the model has it, goes furthest; the residual is about its
+    mean.
+    """
+    parts = []
+    for k, (e, residual) in enumerate(zip(experiments, fit.residuals_of(experiments), strict=True)):
+        if e.held_out_whole:
+            continue
+        shown = measured(e.record)[: e.stop][e.used[: e.stop]]
+        parts.append((shown - residual - fit.offset(k), residual))
+    x, residual = max(parts, key=lambda part: float(np.ptp(part[0])))
+    low, span = float(x.min()), float(np.ptp(x))
+    places = (_BINS * (x - low) / max(span, 1e-300)).astype(np.int64)
+    places = np.minimum(places, _BINS - 1)
+    count = np.bincount(places, minlength=_BINS).astype(float)
+    total = np.bincount(places, residual - np.mean(residual), _BINS).astype(float)
+    return low, span, count, total
+
+
+_RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """One effect at one set of trial values.
+
+    `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
+    times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
+    history. `one_sided` says that only positive multiples make sense. `further` are the same
+    changes of the further columns, in their units, without what their offsets can follow. `weight`
+    names the parameter that moves, of several that an effect is linear in (see `spans`).
+    """
+
+    effect: Component
+    values: dict[str, float]
+    memory: tuple[dict[str, float], ...]
+    unit_gain: float
+    column: FloatArray
+    one_sided: bool
+    finite: bool
+    further: tuple[FloatArray, ...] = ()
+    weight: str = ""
+
+
+def directions(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    effects: Sequence[Component],
+    *,
+    finite_steps: bool = True,
+) -> list[Direction]:
+    """Return the directions of all effects over their probe values, at the fitted model.
+
+    Without `finite_steps` only derivatives are taken, which some effects have not at their null.
+    They are simulated side by side.
+    """
+    peaks = {SPECTRAL_PEAKS: residual_peaks(fit, experiments)}
+    if any(DISPLACEMENT_PEAKS in e.probe.values() for e in effects):
+        peaks[DISPLACEMENT_PEAKS] = residual_periods(fit, experiments)
+    if any(DISPLACEMENT_STEPS in e.probe.values() for e in effects):
+        peaks[DISPLACEMENT_STEPS] = residual_jumps(fit, experiments)
+    tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
+    composed = {e.name: fit.model.with_effect(e) for e in effects}
+
+    def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
+        effect, values = task
+        model = composed[effect.name].with_values(values)
+        return list(_directions_at(fit, experiments, effect, model, values, finite_steps))
+
+    # else all cores wait for the first one's model, of which there are several tasks
+    compiled(fit.model.with_effect(e) for e in effects)
+    return [d for found in side_by_side(one, tasks) for d in found]
+
+
+def _probe_values(
+    effect: Component, experiments: Sequence[Experiment], peaks: Mapping[str, tuple[float, ...]]
+) -> Iterator[dict[str, float]]:
+    longest = max(e.record.duration for e in experiments)
+    grids: list[tuple[float, ...]] = []
+    probe = {n: grid for n, grid in effect.probe.items() if n not in effect.linear}
+    for name, grid in probe.items():
+        if grid == RECORD_DURATION:
+            grids.append((longest,))
+        elif isinstance(grid, str):
+            low, high = next(p.bounds for p in effect.parameters if p.name == name)
+            places = [f for f in peaks[grid] if low < f < high]
+            if grid == SPECTRAL_PEAKS and effect.belongs_to != "environment":
+                first = experiments[0].record  # a resonance answers at the drive's harmonics only
+                places = [f for f in places if tells_tone(f, first, hum=False)]
+            grids.append(tuple(places))
+        else:
+            grids.append(grid)
+    for point in product(*grids):
+        yield dict(zip(probe, point, strict=True))
+
+
+def _directions_at(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    effect: Component,
+    model: Model,
+    values: dict[str, float],
+    finite_steps: bool,
+) -> Iterator[Direction]:
+    gain = effect.gain or ""
+    parameter = model.parameter(gain)
+    scale = parameter.typical({**model.values, gain: 0.0})
+    one_sided = parameter.bounds[0] >= 0
+    moved, steps = {gain: scale}, [s * scale for s in effect.finite_step if finite_steps] or [0.0]
+    if effect.linear:
+        model = model.with_values(effect.at_gain(0.0, {}))
+        moved, steps = {n: model.parameter(n).typical(model.values) for n in effect.linear}, [0.0]
+        one_sided = False
+    for memory in _histories(fit, experiments, effect, model):
+        for step in steps:
+            trial = _Trial(fit, experiments, model, moved, memory, step)
+            try:
+                columns, further = trial.columns(), trial.further()
+            except PsaError:
+                continue
+            for k, (name, size) in enumerate(moved.items()):
+                column, others = columns[:, k], tuple(f[:, k] for f in further)
+                every = np.concatenate([column, *others])
+                if not np.all(np.isfinite(every)) or not np.any(every):
+                    continue
+                if effect.linear:
+                    weight, own, unit = name, {**values, name: size}, 1.0
+                else:
+                    weight, own, unit = "", values, step or size
+                yield Direction(
+                    effect, own, memory, unit, column, one_sided, bool(step), others, weight
+                )
+
+
+def _histories(
+    fit: Fit, experiments: Sequence[Experiment], effect: Component, model: Model
+) -> list[tuple[dict[str, float], ...]]:
+    """The effect's memories at rest, and for settling ones also as after long cycling."""
+    known = fit.starts()
+    settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
+    variants = [tuple(known)]
+    if settling:
+        cycled = []
+        for memory, e in zip(known, experiments, strict=True):
+            y = measured(e.record)[e.known]
+            cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
+        variants.append(tuple(cycled))
+    if effect.trial_starts:
+        return [tuple({**k, **trial} for k in known) for trial in effect.trial_starts]
+    return variants
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Parameters `moved` along their derivatives, by their sizes; or the one by a finite `step`."""
+
+    fit: Fit
+    experiments: Sequence[Experiment]
+    model: Model
+    moved: Mapping[str, float]
+    memory: tuple[dict[str, float], ...]
+    step: float
+
+    def columns(self) -> FloatArray:
+        """Return what each changes in the displacement's used samples (samples, m) [m]."""
+        parts = [self._moved(k, OUTPUT) for k in range(len(self.experiments))]
+        if self.step:
+            left = self.fit.residuals_of(self.experiments)
+            for k, (e, residual) in enumerate(zip(self.experiments, left, strict=True)):
+                shown = measured(e.record)[: e.stop][e.used[: e.stop]]
+                parts[k] = parts[k] + (self.fit.offset(k) - (shown - residual))[:, None]
+        return np.concatenate(parts)
+
+    def further(self) -> tuple[FloatArray, ...]:
+        """Return what each changes in every further column, beyond offsets and factors."""
+        found = []
+        for f in self.fit.further:
+            records = with_column(self.experiments, f.column)
+            left = f.left_of(np.concatenate([self._in_column(f, k) for k in records]))
+            found.append(left + f.residuals[:, None] if self.step else left)
+        return tuple(found)
+
+    def _in_column(self, f: Further, k: int) -> FloatArray:
+        e = self.experiments[k]
+        total = -measured_in(e, f.column) if self.step else np.zeros(int(e.used.sum()))
+        total = total[:, None]
+        for factor, output in zip(f.factors, COLUMNS[f.column].outputs, strict=True):
+            total = total + factor * self._moved(k, output)
+        return total
+
+    def _moved(self, k: int, output: str) -> FloatArray:
+        """Return an output after the step, or its changes along the derivatives (samples, m)."""
+        e, step = self.experiments[k], self.step
+        if e.held_out_whole:
+            return np.zeros((0, len(self.moved)))
+        model = self.model.with_values(dict.fromkeys(self.moved, step)) if step else self.model
+        start = dict.fromkeys(memory_names(model.structure), 0.0) | self.memory[k]
+        rtol = self.fit.way.rtol if step else _RTOL
+        found = trace_record(
+            model, e.record, start, () if step else tuple(self.moved),
+            stop=e.stop, way=Way(rtol, rtol), by_start=False, output=output,
+        )  # fmt: skip
+        sizes = np.array(list(self.moved.values()))
+        moved = found.output[:, None] if step else found.sensitivity * sizes
+        return moved[e.used[: e.stop]]
+
+
+def spans(trials: Sequence[Direction]) -> list[list[int]]:
+    """Return the places of directions that belong together: those of a span, or single ones."""
+    found: dict[object, list[int]] = {}
+    for k, d in enumerate(trials):
+        others = tuple(v for n, v in d.values.items() if n not in d.effect.linear)
+        found.setdefault((d.effect.name, others) if d.weight else k, []).append(k)
+    return list(found.values())
+
+
+def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
+    """Return the direction along which all weights of a span move at once by their gains (m,)."""
+    first = directions[0]
+    values = {**first.values, **dict.fromkeys(first.effect.linear, 0.0)}
+    for d, gain in zip(directions, gains, strict=True):
+        values[d.weight] = float(gain) * d.values[d.weight]
+    every = zip(*(d.further for d in directions), strict=True)
+    return Direction(
+        first.effect,
+        values,
+        first.memory,
+        1.0,
+        np.column_stack([d.column for d in directions]) @ gains,
+        one_sided=False,
+        finite=False,
+        further=tuple(np.column_stack(own) @ gains for own in every),
+    )
+
+
+def declared(directions: Sequence[Direction]) -> FloatArray:
+    """Return the gains (m,) of a span's directions at the effect's declared weights."""
+    own = {p.name: p.value for p in directions[0].effect.parameters}
+    return np.array([own[d.weight] / d.values[d.weight] for d in directions])
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """Directions of a span: the `gram` (m, m) of their unit vectors, their `norms` over the noise.
+
+    Residuals come as projections t (..., m) on the unit vectors, over the noise level.
+    """
+
+    gram: FloatArray
+    norms: FloatArray
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """W'W (m, m)."""
+        found: FloatArray = self.norms[:, None] * self.gram * self.norms
+        return found
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """That of the weights (m, m), with their prior."""
+        weighted = self.information + np.eye(len(self.norms)) / LINEAR_PRIOR**2
+        found: FloatArray = np.linalg.inv(weighted).astype(np.float64)
+        return found
+
+    def gains(self, t: FloatArray) -> FloatArray:
+        """Return the weights (..., m), in ordinary sizes, that fit best."""
+        found: FloatArray = (t * self.norms) @ self.covariance
+        return found
+
+    def decrease(self, t: FloatArray) -> FloatArray:
+        """Return D (...), less what noise makes of more weights than one, at least 0.
+
+        Compared with the threshold for single directions, noise passes it as rarely.
+        """
+        removed = np.sum(self.gains(t) * t * self.norms, axis=-1)
+        found: FloatArray = np.maximum(removed - self.surplus, 0.0).astype(np.float64)
+        return found
+
+    @cached_property
+    def surplus(self) -> float:
+        """What a chi-square that is passed as rarely as a false alarm is above that of one."""
+        freedom = max(float(np.sum(self.covariance * self.information)), 1.0)
+        share = thresholds().false_alarm
+        largest, of_one = (
+            2.0 * float(scipy.special.gammainccinv(0.5 * f, share)) for f in (freedom, 1.0)
+        )
+        return largest - of_one
+
+    @cached_property
+    def penalties(self) -> FloatArray:
+        """What the evidence loses by each combination of the weights (m,), rising."""
+        values = np.linalg.eigvalsh(self.information)
+        found: FloatArray = 0.5 * np.log1p(LINEAR_PRIOR**2 * np.maximum(values, 0.0))
+        return found
+
+    def detectable(self, gains: FloatArray) -> float:
+        """Return the multiple of these weights (m,) that is as large as the noise."""
+        power = float(gains @ self.information @ gains)
+        return 1.0 / math.sqrt(power) if power > 0.0 else math.inf

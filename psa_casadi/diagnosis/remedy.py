@@ -1,0 +1,314 @@
+"""How large an effect is for one stack, in tests that anyone can repeat on the device.
+
+A test plays a voltage through the model with the effect and with the effect's gain at 0. The
+difference d(t) of what the two show is what the effect does:
+
+    hold       step to the highest voltage: d 10 s and 10 min later, less d at the step's end
+    reversal   slow loops: the largest difference of d between the two ways at one voltage
+    range      slow rise: the largest |d - (a + b y_0)|, and at the top d itself
+    slew       loop at the records' fastest rate: the largest |d|
+    resonance  linearised at rest: the largest ratios of the two responses, and where
+    record     the records themselves: the range of d in one of them, and its rms
+
+y_0 is what the model shows without the effect; offset a and slope b are fitted, since a user takes
+them for zero and sensitivity. Of an identified model voltages, rate and duration are those of its
+records; else the voltage is the rated one and the record a standard one.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.signature import STACK, standard_voltage
+from psa_casadi.errors import PsaError
+from psa_casadi.model.compose import Model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.records.record import Record
+from psa_casadi.simulation.linear_part import linear_part
+from psa_casadi.simulation.simulate import input_samples, record_inputs
+from psa_casadi.simulation.start import start_on
+from psa_casadi.simulation.ways import accurate, output_of
+
+FloatArray = npt.NDArray[np.float64]
+
+#: When a hold is looked at [s] after its step, and how long the step takes [s].
+_HELD, _STEP = (10.0, 600.0), 0.02
+#: Samples of one way, and how long a slow one takes [s].
+_SAMPLES, _SLOW = 200, 1.0
+#: Tolerance of the runs over the range of the displacement: both err alike.
+_RTOL = 1e-5
+#: Resonances that are told, and the smallest change of the response there that counts.
+_MOST, _TOLD = 3, 0.02
+#: Period [s] of a model's loops that has no records, and its warming [K] in them.
+_PERIOD, _WARMING = 0.25, 1.0
+
+
+class Figure(NamedTuple):
+    """What a test shows: a value, its unit ("" for that of the displacement), where in the test."""
+
+    test: str
+    value: float
+    unit: str
+    at: float
+    at_unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """What a model is driven with: voltages [V], largest rate [V/s], longest duration [s], plays.
+
+    A play is time (n,), inputs (n, nu) and the state at its start, None where it is at rest;
+    `without` keeps what a model without the effect shows in it.
+    """
+
+    low: float
+    high: float
+    rate: float
+    longest: float
+    plays: tuple[tuple[FloatArray, FloatArray, FloatArray | None], ...]
+    without: dict[int, FloatArray] = field(default_factory=dict)
+
+
+def drive_of(model: Model, effect: Component, records: Sequence[Record]) -> Drive:
+    """Return what a model is driven with: its records, that of its evidence, or standard loops."""
+    known = model.evidence
+    plays = []
+    for r in records:
+        run = None if known is None else known.run_of(r.name)
+        x0 = None if run is None else _state(model, run.start)
+        plays.append((r.time, record_inputs(model, r, r.n), x0))
+    if known is not None and known.seen.rate > 0:
+        seen = known.seen
+        if not plays and known.reference is not None:
+            found, run = known.reference, known.run_of(known.reference.record)
+            inputs = {n: np.array(v) for n, v in found.inputs.items() if n in model.input_names}
+            x0 = None if run is None else _state(model, run.start)
+            plays = [(np.array(found.time), input_samples(model, len(found.time), inputs), x0)]
+        return Drive(seen.voltage.low, seen.voltage.high, seen.rate, seen.duration, tuple(plays))
+    high = model.values["u_rated"] / (model.values["G"] or 1.0)
+    time, voltage = standard_voltage(_PERIOD, high)
+    inputs = {"voltage": voltage}
+    if "temperature" in model.input_names:
+        room = next(i.start for i in model.structure.inputs if i.name == "temperature")
+        inputs["temperature"] = room + _WARMING * time / time[-1]
+    u = input_samples(model, len(time), inputs)
+    memory = effect.trial_starts[0] if effect.trial_starts else None
+    x0 = start_on(model, time, u, memory).x
+    fastest = float(np.max(np.abs(np.diff(voltage) / np.diff(time))))
+    return Drive(0.0, high, fastest, np.inf, tuple(plays) or ((time, u, x0),))
+
+
+def _state(model: Model, start: Mapping[str, float]) -> FloatArray:
+    return np.array([start.get(s.name, s.start) for s in model.structure.states])
+
+
+def _shown(model: Model, t: FloatArray, u: FloatArray, x0: FloatArray | None = None) -> FloatArray:
+    """Return what a model shows (n,), from rest if no start is given."""
+    begun = start_on(model, t, u).x if x0 is None else x0
+    steps, _ = accurate(model, t, u, begun, rtol=_RTOL, hold="linear")
+    y: FloatArray = steps.y[:, model.output_names.index(output_of(model) or "displacement")]
+    return y
+
+
+def _played(
+    on: Model, off: Model, t: FloatArray, voltage: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return d (n,), and what the model shows without the effect (n,)."""
+    u = input_samples(on, len(t), {"voltage": voltage})
+    without = _shown(off, t, u)
+    return _shown(on, t, u) - without, without
+
+
+def _hold(on: Model, off: Model, drive: Drive) -> list[Figure]:
+    after = np.unique([*np.geomspace(1e-3, _HELD[-1], _SAMPLES), *_HELD])
+    step = np.linspace(0.0, _STEP, 41)
+    t = np.concatenate([step, _STEP + after])
+    way = np.minimum(t / _STEP, 1.0)
+    voltage: FloatArray = drive.low + (drive.high - drive.low) * 0.5 * (1.0 - np.cos(np.pi * way))
+    d, _ = _played(on, off, t, voltage)
+    at = len(step) + np.searchsorted(after, _HELD)
+    began = d[len(step) - 1]
+    return [Figure("hold", float(d[k] - began), "", s, "s") for k, s in zip(at, _HELD, strict=True)]
+
+
+def _slow_loops(on: Model, off: Model, drive: Drive) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return d on the last way up and down, and what is shown without the effect on the former.
+
+    All (n,) over voltages that rise evenly.
+    """
+    way = np.linspace(0.0, 1.0, _SAMPLES + 1)
+    share: FloatArray = np.concatenate([way, way[-2::-1], way[1:], way[-2::-1]])
+    t: FloatArray = _SLOW / _SAMPLES * np.arange(len(share), dtype=np.float64)
+    d, without = _played(on, off, t, drive.low + (drive.high - drive.low) * share)
+    up = slice(2 * _SAMPLES, 3 * _SAMPLES + 1)
+    return d[up], d[3 * _SAMPLES :][::-1], without[up]
+
+
+def _reversal(on: Model, off: Model, drive: Drive) -> list[Figure]:
+    up, down, _ = _slow_loops(on, off, drive)
+    return [Figure("reversal", float(np.max(np.abs(down - up))), "", drive.high, "V")]
+
+
+def _range(on: Model, off: Model, drive: Drive) -> list[Figure]:
+    up, _, without = _slow_loops(on, off, drive)
+    line = np.column_stack([np.ones_like(without), without])
+    bent = up - line @ np.linalg.lstsq(line, up, rcond=None)[0]
+    return [
+        Figure("range", float(np.max(np.abs(bent))), "", drive.high, "V"),
+        Figure("top", float(up[-1]), "", drive.high, "V"),
+    ]
+
+
+def _slew(on: Model, off: Model, drive: Drive) -> list[Figure]:
+    way = (drive.high - drive.low) / drive.rate
+    t: FloatArray = way * np.linspace(0.0, 2.1, 2 * _SAMPLES + 21)
+    share: FloatArray = 1.0 - np.abs(np.clip(t / way - 0.05, 0.0, 2.0) - 1.0)
+    d, _ = _played(on, off, t, drive.low + (drive.high - drive.low) * share)
+    return [Figure("slew", float(np.max(np.abs(d))), "", drive.rate, "V/s")]
+
+
+def _resonance(on: Model, off: Model, drive: Drive) -> list[Figure]:
+    with_it, without = linear_part(on), linear_part(off)
+    poles = np.linalg.eigvals(with_it.a)
+    ringing = np.unique(np.abs(poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)]))
+    near = np.geomspace(0.9, 1.1, _SAMPLES + 1)  # the peak lies beside the pole
+    found = []
+    for natural in ringing.tolist():
+        omega = natural * near
+        ratio = np.abs(with_it.response(omega) / without.response(omega))
+        best = int(np.argmax(np.abs(np.log(ratio))))
+        if abs(float(np.log(ratio[best]))) > _TOLD:
+            at = float(omega[best]) / (2.0 * np.pi)
+            found.append(Figure("resonance", float(ratio[best]), "1", at, "Hz"))
+    return sorted(found, key=lambda f: -abs(float(np.log(f.value))))[:_MOST]
+
+
+def _record(on: Model, off: Model, drive: Drive) -> list[Figure]:
+    rows = []
+    for k, (t, u, x0) in enumerate(drive.plays):
+        start = start_on(on, t, u).x if x0 is None else x0
+        if k not in drive.without:
+            drive.without[k] = _shown(off, t, u, start)
+        d = _shown(on, t, u, start) - drive.without[k]
+        rows.append((float(np.ptp(d)), float(np.std(d)), float(t[-1] - t[0])))
+    if not rows:
+        return []
+    largest, rms, duration = max(rows)
+    return [
+        Figure("record", largest, "", duration, "s"), Figure("rms", rms, "", duration, "s"),
+    ]  # fmt: skip
+
+
+#: A test returns its figures: (model with the effect, model without it, drive) -> figures.
+TESTS: dict[str, Callable[[Model, Model, Drive], list[Figure]]] = {
+    "hold": _hold,
+    "reversal": _reversal,
+    "range": _range,
+    "slew": _slew,
+    "resonance": _resonance,
+    "record": _record,
+}
+#: Figures that have a sign.
+SIGNED = ("hold", "top")
+
+
+_NORMAL_95 = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Size:
+    """What an effect changes in a test, in `unit`; signed where it moves on (hold, top).
+
+    `interval` (95 %) is what the uncertainty of the effect's own parameters leaves, None where that
+    is not known. `at` says where in the test: time after the step, rate, frequency, duration. The
+    test plays between the `voltages`, of a model of one's own as its records do (None), and of that
+    one `output` shows it. `beyond_records` says that the records do not reach there.
+    """
+
+    test: str
+    value: float
+    unit: str
+    interval: tuple[float, float] | None
+    at: float
+    at_unit: str
+    voltages: tuple[float, float] | None
+    beyond_records: bool = False
+    output: str = "displacement"
+
+
+def sizes(
+    effect: Component, model: Model, records: Sequence[Record] = (), *, unit: str = "m"
+) -> tuple[Size, ...]:
+    """Return how large an effect of a model is, none where the test cannot be simulated.
+
+    `records` are those that the model was identified from; without them the one in its evidence is
+    played. `unit` is that of their displacement.
+    """
+    drive = drive_of(model, effect, records)
+    off = model.with_values({effect.gain or "": 0.0})
+    test = TESTS[effect.what_now.test]
+    try:
+        found = test(model, off, drive)
+        interval = _intervals(effect, model, found, lambda changed: test(changed, off, drive))
+    except PsaError:
+        return ()
+    if not np.isfinite([f.value for f in found]).all():
+        return ()
+    return tuple(
+        Size(
+            f.test, f.value, f.unit or unit, within, f.at, f.at_unit, (drive.low, drive.high),
+            f.test == "hold" and f.at > drive.longest,
+        )
+        for f, within in zip(found, interval, strict=True)
+    )  # fmt: skip
+
+
+def example(effect: Component, stack: Model | None = None) -> tuple[Model, tuple[Size, ...]]:
+    """Return a stack with an effect, by default the P-885.51, and how large the effect is there.
+
+    A model that holds the effect keeps its values; else its gain has an ordinary size.
+    """
+    # delta, by which a voltage that leaks slowly makes a force that grows, belongs to no effect
+    model = stack or stack_model(STACK).with_values({"delta": 0.0})
+    if effect.name not in (c.name for c in model.components):
+        model = model.with_effect(effect)
+        gain = model.parameter(effect.gain or "")
+        ordinary = gain.typical({**model.values, gain.name: 0.0})
+        model = model.with_values({gain.name: min(ordinary, gain.bounds[1])})
+    return model, sizes(effect, model)
+
+
+def _intervals(
+    effect: Component,
+    model: Model,
+    found: Sequence[Figure],
+    test: Callable[[Model], Sequence[Figure]],
+) -> list[tuple[float, float] | None]:
+    """Return the 95 % intervals of figures.
+
+    (s_i - s)^2 add up over the columns i of a root of the covariance of the effect's parameters,
+    1.96 of which change them, within their bounds.
+    """
+    known = None if model.evidence is None else model.evidence.covariance.of(effect.fitted)
+    if known is None or not known.names or effect.trial_starts:  # its starts share the gain's size
+        return [None] * len(found)
+    size, directions = np.linalg.eigh(np.array(known.matrix))
+    moves = _NORMAL_95 * directions * np.sqrt(np.maximum(size, 0.0))
+    spread = np.zeros(len(found))
+    for move in moves.T:
+        changed = {}
+        for name, step in zip(known.names, move.tolist(), strict=True):
+            bounds = model.parameter(name).bounds
+            changed[name] = float(np.clip(model.values[name] + step, *bounds))
+        other = test(model.with_values(changed))
+        if len(other) != len(found):
+            return [None] * len(found)
+        spread += [(o.value - f.value) ** 2 for o, f in zip(other, found, strict=True)]
+    return [
+        (f.value - half if f.test in SIGNED else max(f.value - half, 0.0), f.value + half)
+        for f, half in zip(found, np.sqrt(spread).tolist(), strict=True)
+    ]

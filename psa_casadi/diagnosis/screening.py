@@ -1,0 +1,530 @@
+"""Screening: which effects, alone or several at once, would lower the residual.
+
+Every direction is prewhitened, the fitted parameters' directions are projected out, and the
+decrease of the sum of squares is compared with one threshold for the maximum over all directions,
+drawn from Gaussian noise along the actual directions (family-wise; Davies 1987, Hansen 1996).
+
+A base fit bends itself to several missing causes at once, so that the effect that explains most
+alone need not be one of them. Linear in the gains, the best set of so many effects (best subset
+regression) costs one small system of equations each, over products of directions that are known.
+
+    ln B = (n - k)/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
+
+S are sums of squares of n whitened residuals, of which k unknowns of the model before have taken
+their part, the noise level being the data's own; H is the information on the unknowns that the
+effect adds, those of the model before projected out, and P their prior standard deviations. An
+unknown that the data do not tell costs nothing, a sharp one costs what its prior range is wider
+than its interval (MacKay, Neural Computation 4 (1992), 415).
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.colour import Colour, colour_of
+from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR, Fitted
+
+FloatArray = npt.NDArray[np.float64]
+
+_DRAWS = 4000
+_SEED = 20150810  # of the threshold's simulation: the same data give the same verdict
+#: An effect whose score is below this share of the best one is not fitted; so many of the others
+#: are, more of them where their scores are this close to the best one's.
+_WORTH, _LEADING, _MOST, _AS_NEAR = 0.1, 4, 7, 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """One direction's decrease of the whitened sum of squares, and the gain it suggests.
+
+    Of a span (see `spans`) the direction is the best one in it; `penalty` is what the evidence
+    loses by its weights.
+    """
+
+    direction: Direction
+    decrease: float
+    gain: float
+    detectable_gain: float
+    penalty: float | None = None
+
+    @property
+    def start(self) -> float:
+        """Gain to start a fit from: the linear estimate, or the finite step that was tried.
+
+        A base fit without a one-sided effect may overshoot in its place, so that the estimate has
+        the wrong sign; the fit then starts from an ordinary size.
+        """
+        if self.direction.finite or (self.direction.one_sided and self.gain <= 0):
+            return self.direction.unit_gain
+        return self.gain
+
+
+@dataclass(frozen=True, eq=False)
+class Screening:
+    """Scores in falling order, the threshold for the largest, and the noise they were judged by."""
+
+    scores: tuple[Score, ...]
+    threshold: float
+    colour: Colour
+
+    def best_by_effect(self) -> dict[str, Score]:
+        """Return each effect's best score, in falling order."""
+        best: dict[str, Score] = {}
+        for score in self.scores:
+            best.setdefault(score.direction.effect.name, score)
+        return best
+
+    def leading(self) -> list[str]:
+        """Return the effects worth a fit, the best one first."""
+        best = self.best_by_effect()
+        if not best:
+            return []
+        top = next(iter(best.values())).decrease
+        limit = max(self.threshold, _WORTH * top)
+        near = [s for s in best.values() if s.decrease >= max(limit, _AS_NEAR * top)]
+        count = max(_LEADING, min(len(near), _MOST))
+        return [name for name, score in best.items() if score.decrease >= limit][:count]
+
+
+def screen(
+    fit: Fitted,
+    trials: Sequence[Direction],
+    lengths: Sequence[int],
+    known: Sequence[FloatArray | None] | None = None,
+    *,
+    colour: Colour | None = None,
+) -> Screening:
+    """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples.
+
+    `known` is the colour of the records' noise where it is known without a model; `colour` replaces
+    the whole estimate.
+    """
+    basis = independent(fit.jacobian)
+    none: FloatArray = np.zeros((len(fit.residuals), 0))
+    columns = np.hstack([none, *(d.column[:, None] for d in trials)])
+    if colour is None:
+        every = independent(np.hstack([basis, without(columns, basis)]))
+        colour = colour_of(without(fit.residuals, every), lengths, known, every)
+    beside = further_columns(fit, trials)
+    colour = replace(colour, further=_further_colours(fit, beside))
+    white_basis = independent(whitened_jacobian(fit, colour))
+    residual = without(whitened_residuals(fit, colour), white_basis)
+    whole = colour.whiten_all(columns, beside)
+    white = without(whole, white_basis)
+    raw = np.linalg.norm(whole, axis=0)
+    norm = np.linalg.norm(white, axis=0)
+    usable = norm > 1e-6 * raw
+    norm = np.where(usable, norm, 1.0)
+    unit = np.where(usable, white / norm, 0.0)
+    t = unit.T @ residual / colour.level
+    scores, seen = [], []
+    gram = unit.T @ unit
+    for places in spans(trials):
+        own = [trials[k] for k in places]
+        if own[0].weight:
+            span = Span(gram[np.ix_(places, places)], norm[places] * usable[places] / colour.level)
+            seen.append((places, span))
+            scores.append(_of_span(own, span, t[places]))
+            continue
+        k, direction = places[0], own[0]
+        allowed = usable[k] and (t[k] > 0 or not direction.finite)
+        scores.append(
+            Score(
+                direction,
+                float(t[k] ** 2) if allowed else 0.0,
+                float(t[k] * colour.level / norm[k] * direction.unit_gain),
+                float(direction.unit_gain * colour.level / norm[k]) if usable[k] else np.inf,
+            )
+        )
+    scores.sort(key=lambda s: -s.decrease)
+    return Screening(tuple(scores), _threshold(gram, seen), colour)
+
+
+def _of_span(own: Sequence[Direction], span: Span, t: FloatArray) -> Score:
+    """Return the score of a span's best direction; `t` (m,) are the residual's projections."""
+    return Score(
+        combined(own, span.gains(t)),
+        float(span.decrease(t)),
+        1.0,
+        span.detectable(declared(own)),
+        float(np.sum(span.penalties)) - 0.5 * span.surplus,
+    )
+
+
+def whitened_residuals(fit: Fitted, colour: Colour) -> FloatArray:
+    """Return the whitened residuals (samples,), those of the further columns below."""
+    return colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])
+
+
+def whitened_jacobian(fit: Fitted, colour: Colour) -> FloatArray:
+    """Return the whitened derivatives by theta (samples, size), the further columns' below."""
+    return colour.whiten_all(fit.jacobian, [f.jacobian for f in fit.further])
+
+
+def further_columns(fit: Fitted, trials: Sequence[Direction]) -> list[FloatArray]:
+    """Return for every further column what the directions change in it (samples, directions)."""
+    return [
+        np.hstack([np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)])
+        for k, f in enumerate(fit.further)
+    ]
+
+
+def _further_colours(fit: Fitted, columns: Sequence[FloatArray]) -> tuple[Colour, ...]:
+    """Return the colour of what neither the fit nor a direction explains of the further columns."""
+    found = []
+    for f, own in zip(fit.further, columns, strict=True):
+        basis = independent(f.jacobian)
+        every = independent(np.hstack([f.basis, basis, without(own, basis)]))
+        found.append(colour_of(without(f.residuals, every), f.lengths, None, every))
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Copy:
+    """How well an effect can copy what another one adds.
+
+    `share` of the contribution's power, with all of the effect's directions; the `direction` that
+    does best alone, and the `gain` at which it does.
+    """
+
+    share: float
+    direction: Direction
+    gain: float
+
+
+def copies(
+    fit: Fitted, added: FloatArray, trials: Sequence[Direction], colour: Colour
+) -> tuple[float, dict[str, Copy]]:
+    """Return the power of a contribution over the noise's, and how each effect can copy it.
+
+    `added` (samples,) [m] is what another effect adds to the prediction. The fitted parameters are
+    projected out of it and of the trial directions.
+    """
+    basis = independent(colour.whiten(fit.jacobian))
+    target = without(colour.whiten(added), basis)
+    power = float(target @ target)
+    found: dict[str, Copy] = {}
+    for name in dict.fromkeys(d.effect.name for d in trials):
+        own = [d for d in trials if d.effect.name == name]
+        columns = np.column_stack([d.column for d in own])
+        free = without(colour.whiten(columns), basis)
+        norms = np.linalg.norm(free, axis=0)
+        usable = norms > 1e-6 * np.linalg.norm(columns, axis=0)
+        if power <= 0 or not usable.any():
+            continue
+        share = float(np.sum((independent(free[:, usable]).T @ target) ** 2)) / power
+        unit, sizes = np.where(usable, free / np.where(usable, norms, 1.0), 0.0), usable * norms
+        along = unit.T @ target / colour.level
+        ways = [_copy(own, p, unit, sizes / colour.level, along) for p in spans(own)]
+        _, direction, gain = max(ways, key=lambda w: w[0])
+        found[name] = Copy(share, direction, gain)
+    return power / colour.level**2, found
+
+
+def _copy(
+    trials: Sequence[Direction],
+    places: list[int],
+    unit: FloatArray,
+    norms: FloatArray,
+    along: FloatArray,
+) -> tuple[float, Direction, float]:
+    """Return how much of a target a span or a direction explains, and how it does so best."""
+    first = trials[places[0]]
+    if not first.weight:
+        t, norm = float(along[places[0]]), float(norms[places[0]])
+        return t**2, first, t / max(norm, 1e-300) * first.unit_gain
+    span = Span(unit[:, places].T @ unit[:, places], norms[places])
+    own, t_own = [trials[k] for k in places], along[places]
+    return float(span.decrease(t_own)), combined(own, span.gains(t_own)), 1.0
+
+
+def independent(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the columns' span; tiny directions are dropped.
+
+    The columns are scaled first.
+    """
+    norm = np.linalg.norm(columns, axis=0)
+    scaled: FloatArray = columns[:, norm > 0] / norm[norm > 0]
+    if not scaled.shape[1]:
+        return scaled
+    u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    basis: FloatArray = u[:, s > 1e-7 * s[0]]
+    return basis
+
+
+def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return vectors (samples,) or columns less what an orthonormal basis spans of them."""
+    projected: FloatArray = vectors - basis @ (basis.T @ vectors)
+    return projected
+
+
+def _threshold(gram: FloatArray, seen: Sequence[tuple[list[int], Span]]) -> float:
+    """Quantile of the largest decrease that white noise makes along directions and spans.
+
+    `gram` is that of the unit directions, `seen` has the places of those that are in spans.
+    """
+    if not len(gram):
+        return np.inf
+    values, vectors = np.linalg.eigh(gram)
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    noise = np.random.default_rng(_SEED).standard_normal((_DRAWS, len(gram)))
+    drawn = noise @ root.T
+    single = np.ones(len(gram), dtype=bool)
+    single[[k for places, _ in seen for k in places]] = False
+    every = [*(drawn[:, single] ** 2).T, *(span.decrease(drawn[:, p]) for p, span in seen)]
+    largest = np.max(every, axis=0)
+    return float(np.quantile(largest, 1.0 - thresholds().false_alarm))
+
+
+#: A direction of which less than this is new beside the fitted parameters is left out.
+_NEW = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Directions of different effects, the gains that fit best together, and what they promise.
+
+    `promise` is n/2 ln(S / (S - D)): S the whitened sum of squares, D its decrease. What the
+    evidence loses by more weights than one of a span (see `spans`) is taken off.
+    """
+
+    directions: tuple[Direction, ...]
+    gains: tuple[float, ...]
+    promise: float
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the effects."""
+        return frozenset(d.effect.name for d in self.directions)
+
+
+def _ways(
+    trials: Sequence[Direction], gram: FloatArray, sizes: FloatArray
+) -> tuple[dict[str, npt.NDArray[np.int64]], FloatArray, FloatArray]:
+    """Return the directions (ways, m) of each effect, what priors add to the gram, and costs.
+
+    `gram` is that of unit directions, `sizes` are theirs over the noise level, 0 where the fitted
+    parameters can follow one. `costs` stand at the first place of a span: what the evidence loses
+    by its weights but for the best told combination. A span that lacks a weight is left out.
+    """
+    found: dict[str, list[list[int]]] = {}
+    weak, cost = np.full(len(trials), _NEW**2), np.zeros(len(trials))
+    for places in spans(trials):
+        first, own = trials[places[0]], sizes[places]
+        if first.weight:
+            span = Span(gram[np.ix_(places, places)], own)
+            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * own, _NEW) ** 2
+            cost[places[0]] = float(np.sum(span.penalties[:-1]))
+        if first.weight or own[0]:
+            found.setdefault(first.effect.name, []).append(places)
+    most = {name: max(map(len, own)) for name, own in found.items()}
+    whole = {n: [p for p in own if len(p) == most[n]] for n, own in found.items()}
+    return {n: np.array(own, dtype=np.int64) for n, own in whole.items()}, weak, cost
+
+
+def _together(
+    trials: Sequence[Direction],
+    own: Sequence[npt.NDArray[np.int64]],
+    places: npt.NDArray[np.int64],
+    multiples: FloatArray,
+    promise: float,
+) -> Together:
+    """Return the directions at these places with their multiples, those of a span as one."""
+    ends = np.cumsum([p.shape[1] for p in own])[:-1]
+    directions, gains = [], []
+    for of_one, sizes in zip(np.split(places, ends), np.split(multiples, ends), strict=True):
+        these = [trials[int(k)] for k in of_one]
+        whole = combined(these, sizes) if these[0].weight else these[0]
+        directions.append(whole)
+        gains.append(whole.unit_gain if these[0].weight else float(sizes[0]) * whole.unit_gain)
+    return Together(tuple(directions), tuple(gains), promise)
+
+
+def best_sets(
+    fit: Fitted,
+    trials: Sequence[Direction],
+    colour: Colour,
+    size: int,
+    alike: Sequence[Sequence[str]] = (),
+) -> list[Together]:
+    """Return the best directions of every set of so many effects, the best set first.
+
+    The fitted parameters are free to follow. Gains have the sign that makes sense. Of sets that are
+    the same but for effects that are `alike` only the best one is returned.
+    """
+    basis = independent(whitened_jacobian(fit, colour))
+    residual = without(whitened_residuals(fit, colour), basis)
+    main = np.column_stack([d.column for d in trials])
+    columns = colour.whiten_all(main, further_columns(fit, trials))
+    free = without(columns, basis)
+    norm = np.linalg.norm(free, axis=0)
+    usable = norm > _NEW * np.linalg.norm(columns, axis=0)
+    unit = np.where(usable, free / np.where(usable, norm, 1.0), 0.0)
+    gram, along = unit.T @ unit, unit.T @ residual
+    positive = np.array([d.one_sided or d.finite for d in trials], dtype=bool)
+    ways, weak, cost = _ways(trials, gram, norm * usable / colour.level)
+    gram += np.diag(weak)
+    total, n = float(residual @ residual), len(residual)
+    found = []
+    for names in combinations(ways, size):
+        if any(len(set(names) & set(group)) > 1 for group in alike):
+            continue
+        own = [ways[name] for name in names]
+        grids = np.meshgrid(*(np.arange(len(p)) for p in own), indexing="ij")
+        index = np.hstack([p[g.ravel()] for p, g in zip(own, grids, strict=True)])
+        systems = gram[index[:, :, None], index[:, None, :]]
+        gains = np.linalg.solve(systems, along[index][:, :, None])[:, :, 0]
+        decrease = np.sum(gains * along[index], axis=1)
+        decrease[np.any(positive[index] & (gains <= 0.0), axis=1)] = 0.0
+        best = int(np.argmax(decrease))
+        share = min(float(decrease[best]) / max(total, 1e-300), 1.0 - 1e-9)
+        promise = -0.5 * n * float(np.log1p(-share)) - float(np.sum(cost[index[best]]))
+        multiples = gains[best] / np.maximum(norm[index[best]], 1e-300)
+        found.append(_together(trials, own, index[best], multiples, promise))
+    heads = {n: group[0] for group in alike for n in group}
+    best_of: dict[frozenset[str], Together] = {}
+    for each in sorted(found, key=lambda t: -t.promise):
+        best_of.setdefault(frozenset(heads.get(n, n) for n in each.names), each)
+    return list(best_of.values())
+
+
+def evidence(before: Fitted, after: Fitted, colour: Colour) -> float:
+    """Return ln B of a fit with one more effect over the fit without it.
+
+    The log-likelihoods of displacement and further columns add up, each with its own noise level.
+    """
+    share = _freedom(before) / len(before.residuals)
+    gained = share * _gained(before.residuals, after.residuals, colour)
+    jacobians = []
+    level = _level(after.residuals, colour, 0.0)
+    jacobians.append(colour.whiten(after.jacobian) / max(level, 1e-300))
+    for own, f in zip(colour.further, after.further, strict=True):
+        jacobians.append(own.whiten(f.jacobian) / _level(f.residuals, own, f.straight))
+    gained += sum(further_gains(before, after, colour).values())
+    added, jacobian = _added(before, after), np.concatenate(jacobians)
+    kept = [k for k in range(after.unknowns.size) if k not in added]
+    new, old = jacobian[:, added], jacobian[:, kept]
+    free = new - old @ np.linalg.lstsq(old, new, rcond=1e-10)[0]
+    prior = after.unknowns.prior[added]
+    scaled = free * np.where(np.isfinite(prior), prior, 1.0)
+    _, penalty = np.linalg.slogdet(np.eye(len(added)) + scaled.T @ scaled)
+    return gained - 0.5 * float(penalty)
+
+
+def further_gains(before: Fitted, after: Fitted, colour: Colour) -> dict[str, float]:
+    """Return what every further column adds to the log-likelihood of a fit over another one."""
+    rows = zip(colour.further, before.further, after.further, strict=True)
+    return {
+        new.column: _gained(old.residuals, new.residuals, own, new.straight)
+        for own, old, new in rows
+    }
+
+
+def _gained(before: FloatArray, after: FloatArray, colour: Colour, straight: float = 0.0) -> float:
+    """Return n/2 ln(S_before / S_after), each with what the sensor's form may cost."""
+    levels = [_level(r, colour, straight) for r in (before, after)]
+    return len(after) * float(np.log(max(levels[0], 1e-300) / max(levels[1], 1e-300)))
+
+
+def _level(residual: FloatArray, colour: Colour, straight: float) -> float:
+    """Return the rms of a whitened residual, at least that of what is `straight`."""
+    return float(np.hypot(np.sqrt(np.mean(colour.whiten(residual) ** 2)), straight))
+
+
+def estimated(before: Fitted, screening: Screening) -> dict[str, float]:
+    """Return every effect's ln B as its trial directions tell it, without a full fit.
+
+    Linear in the gain g with prior N(0, s^2), s = `LINEAR_PRIOR` ordinary sizes, and estimated to
+    sigma: ln B = (n - k)/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged
+    over the probe values, each as likely as the others.
+    """
+    found: dict[str, list[float]] = {}
+    white = whitened_residuals(before, screening.colour)
+    total = float(np.sum(white**2))
+    for score in screening.scores:
+        share = min(score.decrease * screening.colour.level**2 / max(total, 1e-300), 1.0 - 1e-9)
+        gained = -0.5 * (len(white) - before.unknowns.size) * float(np.log1p(-share))
+        found.setdefault(score.direction.effect.name, []).append(_linear(score, gained))
+    return {name: float(np.logaddexp.reduce(v) - np.log(len(v))) for name, v in found.items()}
+
+
+def levelled(
+    evidences: Mapping[str, float],
+    alike: Sequence[Sequence[str]],
+    judged: Collection[str] = (),
+) -> dict[str, float]:
+    """Return the evidence with that of the best one for all effects that are `alike`.
+
+    They are the same but for a form that none of them is known to have. Where some of a group are
+    `judged` by a full fit, the best one of those counts.
+    """
+    found = dict(evidences)
+    for group in alike:
+        present = [n for n in group if n in found]
+        known = [n for n in present if n in judged] or present
+        found |= dict.fromkeys(present, max((found[n] for n in known), default=0.0))
+    return found
+
+
+def temperature(largest: float) -> float:
+    """Return what evidence is divided by before it becomes a probability.
+
+    The effects are not the true equations, so that their evidence differs by more than noise, and
+    the more the larger the `largest` one is: that of a whole model over the plain base, as the form
+    of each of its parts is approximate.
+    """
+    return max(thresholds().temperature, thresholds().temperature_share * largest)
+
+
+def probabilities(evidences: Mapping[str, float], whole: float = 0.0) -> dict[str, float]:
+    """Return the probability of each effect, given that one of them is the cause.
+
+    `whole` is the evidence of the model with the cause over the plain base, where the effects'
+    evidence is that over other causes and a better base.
+    """
+    if not evidences:
+        return {}
+    given = np.array(list(evidences.values()))
+    values = given / temperature(max(whole, float(np.max(given))))
+    weights = np.exp(values - np.logaddexp.reduce(values))
+    return dict(zip(evidences, weights.tolist(), strict=True))
+
+
+def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, ...]:
+    """Return the fewest effects whose probabilities sum to `level`, the most probable first."""
+    chosen, total = [], 0.0
+    for name, p in sorted(probability.items(), key=lambda item: -item[1]):
+        if total >= level:
+            break
+        chosen.append(name)
+        total += p
+    return tuple(chosen)
+
+
+def _freedom(fit: Fitted) -> int:
+    """Return the number of residuals less that of the unknowns: what is left to tell the noise."""
+    return max(len(fit.residuals) - fit.unknowns.size, 0)
+
+
+def _linear(score: Score, gained: float) -> float:
+    if score.penalty is not None:
+        return gained - score.penalty
+    if not np.isfinite(score.detectable_gain) or score.detectable_gain == 0.0:
+        return 0.0
+    width = LINEAR_PRIOR * score.direction.unit_gain / abs(score.detectable_gain)
+    return gained * width**2 / (1.0 + width**2) - 0.5 * float(np.log1p(width**2))
+
+
+def _added(before: Fitted, after: Fitted) -> list[int]:
+    """Return the coordinates of `after` that `before` has not."""
+    known, names = before.unknowns, after.unknowns
+    added = [k for k, n in enumerate(names.names) if n not in known.names]
+    for record, states in enumerate(names.started):
+        first = names.first(record)
+        added += [first + k for k, s in enumerate(states) if s not in known.started[record]]
+    return added

@@ -1,1 +1,0 @@
-"""What each effect would add to the base model, before it is fitted."""

@@ -1,0 +1,327 @@
+"""Moves of the search beside one effect more: modes, exchanges, several at once."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies
+from psa_casadi.diagnosis.search.fits import (
+    Start,
+    cost_beside,
+    exchanged,
+    fit_with_all,
+    in_place,
+    like,
+    to_end,
+    with_cause,
+    with_causes,
+    with_causes_afresh,
+)
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
+from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, SHARE, Known
+from psa_casadi.diagnosis.task import Task, thresholds
+from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Shaken, modes_of
+from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
+from psa_casadi.scales import stiffness_scale
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.start import start_on
+from psa_casadi.simulation.timings import stage
+from psa_casadi.simulation.ways import accurate
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Samples of all records from which modes are read off; evaluations of the fit.
+_ENOUGH, _EVALUATIONS = 20_000, 20
+#: To what share of the rms each mode must bring the residual. The seven largest of a mirror's axis
+#: do, the next one does not; noise has no mode that does.
+_LOWERED = 0.95
+#: So many fits of one mode in the place of several go to their end.
+_ALONE = 3
+_RTOL = 1e-4
+
+
+def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+    """Fit with a series of modes; None where the residual shows fewer than two, or no fit works.
+
+    Modes that a fit damps until they ring no more are left out: they stand for something else.
+    """
+    if "wafer_force" not in before.fit.model.structure.balances:
+        return None
+    even = [k for k, e in enumerate(experiments) if not e.held_out_whole and _even(e.record.time)]
+    most = _ENOUGH // max(1, len(even))
+    shaken, free = [], []
+    for k in even:
+        e = experiments[k]
+        part = _moving(e, most)
+        first, last = (int(e.used[:end].sum()) for end in (part.start, part.stop))
+        try:
+            drive = _at_rest(before.fit.model, e.record, e.stop)
+        except PsaError:
+            return None
+        left = measured(e.record)[part] - before.predicted[k][part]
+        shaken.append(Shaken(drive[part], left, e.used[part], e.record.sample_time))
+        free.append(before.fit.jacobian[before.fit.of_record(experiments, k)][first:last])
+    modes = modes_of(shaken, np.vstack(free), most=MOST, better=_LOWERED) if shaken else []
+    fit, states = before.fit, tuple(before.fit.starts())
+    while len(modes) >= FEWEST:
+        effect = MODAL_SERIES[len(modes)]
+        added = [(effect, _values(modes), 1.0)]
+        found = fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
+        if found is None:
+            return None
+        ringing = [m for m in _modes(found, len(modes)) if m.damping < MOST_DAMPED]
+        if len(ringing) == len(modes):
+            return hypothesis((*before.causes, effect), found, experiments)
+        base = found.model.without([effect.name])
+        modes, states = ringing, tuple(found.starts())
+        fit = replace(before.fit, model=base)
+    return None
+
+
+def one_mode(
+    series: Hypothesis, less: Hypothesis, experiments: Sequence[Experiment]
+) -> list[Hypothesis]:
+    """Fit one mode in the place of a series, from each of those, and the best to the end.
+
+    The series is the last cause; `less` is the hypothesis without it. The base begins where the
+    series has led it: modes may stand for what the base without them had bent itself to.
+    """
+    fit = series.fit
+    states = tuple(fit.starts())
+    starts = [_alone(mode, states) for mode in _modes(fit, series.causes[-1].count)]
+    found = side_by_side(
+        lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit, experiments), starts
+    )
+    best = sorted((h for h in found if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
+    return side_by_side(lambda h: to_end(h, experiments), best)
+
+
+def _alone(mode: Mode, states: tuple[dict[str, float], ...]) -> Start:
+    """Return where a single mode begins that stands for one of a series."""
+    low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
+    lead = np.clip(mode.ahead / (mode.share or 1e-300), low, high)
+    form = {
+        "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": float(lead)
+    }  # fmt: skip
+    return form, mode.share, states
+
+
+def _even(time: FloatArray) -> bool:
+    """Whether times (n,) lie on an even grid but for a tenth of a step."""
+    grid = np.linspace(time[0], time[-1], time.size)
+    return bool(np.max(np.abs(time - grid)) < 0.1 * (time[-1] - time[0]) / (time.size - 1))
+
+
+def _moving(e: Experiment, most: int) -> slice:
+    """Return so many samples at most, from where the voltage begins to move."""
+    v = e.record.voltage[: e.stop]
+    moves = np.flatnonzero(v != v[0])
+    begin = max(0, int(moves[0]) - 1) if moves.size else 0
+    return slice(begin, min(e.stop, begin + most))
+
+
+def _modes(fit: Fit, count: int) -> list[Mode]:
+    """Return the modes of a fit."""
+    names = ("frequency", "damping", "share", "ahead")
+    values = fit.model.values
+    return [Mode(*(values[f"series_{name}_{k}"] for name in names)) for k in range(1, count + 1)]
+
+
+def _values(modes: Sequence[Mode]) -> dict[str, float]:
+    return {
+        f"series_{name}_{k}": value
+        for k, mode in enumerate(modes, 1)
+        for name, value in asdict(mode).items()
+    }
+
+
+def _at_rest(model: Model, record: Record, count: int) -> FloatArray:
+    """Return the displacement that the wafers' force has at rest [m], at the first samples."""
+    t, u = record.time[:count] - record.time[0], record_inputs(model, record, count)
+    steps, _ = accurate(model, t, u, start_on(model, t, u).x, rtol=_RTOL, hold="linear")
+    values = model.structure.balance("wafer_force").map(count)
+    p = np.tile(model.parameter_vector()[:, None], count)
+    found: FloatArray = values(t[None], steps.x.T, u.T, p).full().ravel()
+    return found / stiffness_scale(model.values)
+
+
+#: So many rivals of a cause are fitted, and so many copies.
+_MOST = 3
+
+
+@stage("causes judged again")
+def exchange(h: Hypothesis, known: Known, task: Task) -> None:
+    """Fit in each cause's place what the screening beside all others finds near it."""
+    for cause in h.causes:
+        less = known.get(h.names - {cause.name})
+        if less is None:
+            continue
+        if len(h.causes) > 1:
+            for starts in _near(h, less, known)[:_MOST]:
+                task.progress(f"{_effect(starts).name} in the place of {cause.name}")
+                _put_in_place(h, less, starts, known, task)
+            known.remember(less, cause.name)
+        for copy in _copies(h, less, known, task):
+            name = copy.direction.effect.name
+            task.progress(f"{name}, which could copy {cause.name}")
+            known.note(like(h, less, copy, task.experiments, known.near(less, h)))
+            known.remember(less, name)
+
+
+def _near(h: Hypothesis, less: Hypothesis, known: Known) -> list[list[Score]]:
+    """Return the starts of effects that promise nearly what `h` gains beside the causes of `less`.
+
+    They are not among the causes, and bend no curve that one of them bends.
+    """
+    view = known.view(less)
+    promised, gained = view.estimated(), known.scale.evidence(h) - known.scale.evidence(less)
+    least = min(SHARE * gained, gained - NEAR)
+    return [
+        starts
+        for starts in view.leading()
+        if promised[_effect(starts).name] > least
+        and _effect(starts).name not in h.names
+        and known.different(_effect(starts), less)
+    ]
+
+
+def _put_in_place(
+    h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: Known, task: Task
+) -> None:
+    """Fit an effect beside the causes of `less`, from there and from where `h` has led the base.
+
+    To the end where that comes near.
+    """
+    goal = known.near(less, h)
+    rival = with_cause(less, task.experiments, starts, goal)
+    known.note(rival)
+    if rival is None:
+        return
+    effect = _effect(starts)
+    known.note(in_place(h, less, h.fit, rival.fit, effect, task.experiments, goal))
+    known.remember(less, effect.name)
+    best = known.get(rival.names)
+    if best is not None and known.scale.evidence(best) > known.scale.evidence(h) - NEAR:
+        known.finish([best])
+
+
+def _copies(h: Hypothesis, less: Hypothesis, known: Known, task: Task) -> list[Copy]:
+    """Return effects that could add what the cause not in `less` adds, but were not fitted so.
+
+    A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is
+    below `NEAR` might explain the data as well; a fit much worse than its copy was lost.
+    """
+    pairs = zip(h.predicted, less.predicted, task.experiments, strict=True)
+    added = np.concatenate([(p - q)[e.used] for p, q, e in pairs])
+    table = [e for e in task.table if e.name not in h.names]
+    trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
+    power, found = copies(less.fit, added, trials, known.scale.colour)
+    own = known.scale.evidence(h)
+    lost: dict[str, float] = {}
+    for name, copy in found.items():
+        left = 0.5 * power * (1.0 - copy.share)
+        fitted = known.get(less.names | {name})
+        reached = -np.inf if fitted is None else known.scale.evidence(fitted)
+        if left < NEAR and reached < own - left - NEAR:
+            lost[name] = left
+    return [found[n] for n in sorted(lost, key=lambda n: lost[n])[:_MOST]]
+
+
+def _effect(starts: Sequence[Score]) -> Component:
+    return starts[0].direction.effect
+
+
+#: So many sets are fitted.
+_SETS = 4
+#: ... of which so many are pairs with the best cause alone.
+_PAIRS = 2
+
+
+@stage("fits of several at once")
+def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
+    """Fit the base with the sets of two effects and more that promise most together.
+
+    The cause that explains most alone, that of `h`, may stand for several and hold the search
+    there: sets without it are tried. Or it is one of them: pairs with what leads beside it are
+    tried, as a fit that adds one cause to the other may end in another minimum than one that begins
+    with both. These go to their end, since they need more steps for it.
+    """
+    root, price = known.root, known.scale.price
+    view, alike = known.view(root), task.alike(root.fit)
+    if not view.trials:
+        return
+    every = [
+        found
+        for size in range(2, thresholds().most_causes + 1)
+        for found in best_sets(root.fit, view.trials, view.screening.colour, size, alike)
+    ]
+    ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
+    beside = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
+    pairs = [s for s in ranked if s.names in beside]
+    apart = [s for s in ranked if not s.names & h.names]
+    starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
+    said = ", ".join("+".join(sorted(s.names)) for s in starts)
+    task.progress(f"several causes at once: fitting {said}")
+    goal = cost_beside(known.best().fit, root.fit, task.experiments)
+    ways = [with_causes]
+    if "fits afresh" not in task.method.without:
+        ways.append(with_causes_afresh)
+    jobs = [(way, s) for way in ways for s in starts]
+    found = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
+    fitted = [f for f in found if f is not None]
+    better = [f for f in fitted if f.names in beside and known.scale.evidence(f) > 0.0]
+    others = [f for f in fitted if f not in better]
+    for f in _best_to_end(better, others, known, task, goal):
+        known.note(f)
+
+
+@stage("fits afresh")
+def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
+    """Fit children of a hypothesis from their other parents, where those promise more.
+
+    Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
+    a child gains what both of its parents have gained over what these share.
+    """
+    if "other parents" in task.method.without:
+        return
+    evidence = known.scale.evidence
+    for cause in h.causes:
+        shared = known.get(h.names - {cause.name})
+        if shared is None or not shared.causes:
+            continue
+        gained = evidence(h) - evidence(shared) - known.scale.price
+        for child in known.children(h):
+            other = known.get(child.names - {cause.name})
+            if other is not None and evidence(other) + gained > evidence(child):
+                added = child.causes[-1].name
+                task.progress(f"cause {len(child.causes)}: {added} as beside fewer causes")
+                known.note(in_place(child, other, other.fit, h.fit, cause, task.experiments))
+
+
+def _best_to_end(
+    pairs: Sequence[Hypothesis],
+    found: Sequence[Hypothesis],
+    known: Known,
+    task: Task,
+    goal: float,
+) -> list[Hypothesis]:
+    """Return fits of sets, the pairs and the best others of them to their end.
+
+    Of two fits of one set the better one so far need not be the one that ends lower. One whose cost
+    will stay above the `goal` ends before.
+    """
+    ranked = sorted(found, key=lambda h: -known.scale.score(h))
+    best, others = [*pairs, *ranked[:FINALISTS]], ranked[FINALISTS:]
+    said = ", ".join("+".join(sorted(h.names)) for h in best)
+    task.progress(f"{said} to the end")
+    return [*side_by_side(lambda h: to_end(h, task.experiments, goal), best), *others]

@@ -1,0 +1,186 @@
+"""The foreign code of an FMU runs in a process of its own, with limits of time and memory.
+
+Its task lies in a folder of its own. What it finds it appends to a file there, so that the rows
+that were finished stay, however it ends. Each line begins with a word that only the two processes
+know: code that ends the process early, or writes where it should not, can neither finish nor add a
+row.
+"""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import astuple
+from pathlib import Path
+
+from psa_casadi.children import end_with_parent, heard, kill_group, started_python
+from psa_casadi.errors import PsaError
+from psa_casadi.export.check.measured import Task, checks_of
+from psa_casadi.export.check.rows import CheckRow, stopped
+from psa_casadi.scratch import temporary_folder
+
+#: The row that is there only if the process ends badly outside of any check.
+OUTSIDE = "process ends"
+#: What is said of checks that do not come to an end.
+OVERTIME = (
+    "did not come back within the time limit of {:g} s of the whole check (--timeout sets it)"
+)
+_MODULE = "psa_casadi.export.check.apart"
+_TASK, _ROWS, _PRINTED = "task", "rows", "printed"
+#: How often the process looks at its memory [s], and from which share of it on it is full.
+_LOOK, _FULL = 0.02, 0.9
+#: How much a file of the process may hold [bytes], as what it prints goes to one; how much of that
+#: is told.
+_MOST_PRINTED, _LAST = 256 << 20, 300
+#: What a process ends with that cannot write its rows any more.
+_CLOSED = 71
+_DISTURBED = "the FMU disturbed the channel of the results: "
+
+
+def rows_apart(task: Task, end: float) -> list[CheckRow]:
+    """Return the rows of a task, and how its process ended unless that was well.
+
+    `end` is when it ends at the latest, as `time.monotonic` tells it.
+
+    Raises PsaError if it did not come as far as the code of the FMU.
+    """
+    with temporary_folder() as folder:
+        (folder / _TASK).write_bytes(pickle.dumps(task))
+        temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
+        with (
+            (folder / _ROWS).open("w+b") as rows,
+            (folder / _PRINTED).open("w+b") as printed,
+            started_python(_MODULE, str(folder), directory=folder, **temporary) as child,
+        ):
+            problem, complained = "", b""
+            try:
+                done = heard(child, limit=max(0.0, end - time.monotonic()))
+                code, complained = done.returncode, done.stderr
+            except subprocess.TimeoutExpired:
+                code, problem = 0, f"the FMU {OVERTIME.format(task.timeout)}"
+            finally:
+                kill_group(child)
+            found = _Found(task.key, rows.read())
+            printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LAST))
+            complained += printed.read()
+    problem = problem or found.problem or _ended(code, found, task.memory)
+    if not problem:
+        return found.rows
+    if said := complained.decode(errors="replace").strip()[-_LAST:]:
+        problem += f"; the last it printed: {said}"
+    if not found.rows and not found.begun:  # nothing of the FMU has run
+        raise PsaError(f"The process for the code of the FMU did not start: {problem}.")
+    return [*found.rows, stopped(found.begun or OUTSIDE, problem)]
+
+
+class _Found:
+    """What the lines of a process say; `begun` is the check that ran when it ended."""
+
+    def __init__(self, key: str, lines: bytes) -> None:
+        self.rows: list[CheckRow] = []
+        self.begun, self.problem = "", ""
+        self.complete = self.full = False
+        for line in lines.decode(errors="replace").splitlines():
+            word, _, text = line.partition(" ")
+            if word != key or self.complete:
+                self.problem = f"{_DISTURBED}something else was written between the results"
+                return
+            kind, *content = json.loads(text)
+            if kind == "begin":
+                self.begun = str(content[0])
+            elif kind == "row":
+                self.rows.append(CheckRow(*content))
+                self.begun = ""
+            self.full = self.full or kind == "memory"
+            self.complete = kind == "end"
+
+
+def _ended(code: int, found: _Found, memory: int) -> str:
+    """Return what was wrong with a process that ended by itself, "" if nothing was."""
+    if code == 0 and found.complete:
+        return ""
+    if found.full:
+        return f"the FMU reached the memory limit of {memory / 2**20:.0f} MiB (--memory sets it)"
+    if code == _CLOSED:
+        return f"{_DISTURBED}it was closed"
+    if code < 0:
+        name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
+        return f"the FMU ended its process by the signal {name}"
+    shown = f"{code:#x}" if code > 255 else str(code)  # Windows tells faults by such codes
+    when = "when it was unloaded" if found.complete else "before the checks were done"
+    return f"the FMU ended its process with exit code {shown} {when}"
+
+
+def main() -> None:
+    """Run the checks of the task in the folder that is named, and append what they find."""
+    end_with_parent()
+    folder = Path(sys.argv[1])
+    task: Task = pickle.loads((folder / _TASK).read_bytes())
+    (folder / _TASK).unlink()  # the foreign code shall not read the key there
+    rows = os.open(folder / _ROWS, os.O_WRONLY | os.O_APPEND)
+    printed = os.open(folder / _PRINTED, os.O_WRONLY | os.O_APPEND)
+    for stream, target in ((0, os.open(os.devnull, os.O_RDONLY)), (1, printed), (2, printed)):
+        os.dup2(target, stream)
+
+    def tell(*content: object) -> None:
+        try:
+            os.write(rows, f"{task.key} {json.dumps(content)}\n".encode())
+        except OSError:
+            os._exit(_CLOSED)
+
+    _limit(task.memory, lambda: tell("memory"))
+    try:
+        for check in checks_of(task):
+            tell("begin", check.name)
+            tell("row", *astuple(check.row()))
+    except MemoryError:
+        tell("memory")
+        raise
+    tell("end")
+
+
+def _limit(memory: int, act: Callable[[], None]) -> None:
+    """Limit what this process takes from now on; act when its memory is nearly full.
+
+    Linux counts private data, touched or not. Does nothing on a system that has no such limits.
+    """
+    if sys.platform == "win32":
+        return
+    import resource  # noqa: PLC0415 - there is none on Windows
+
+    most = _data_size() + memory
+    for kind, wanted in (
+        (resource.RLIMIT_CORE, 0), (resource.RLIMIT_FSIZE, _MOST_PRINTED),
+        (resource.RLIMIT_DATA, most),
+    ):  # fmt: skip
+        hard = resource.getrlimit(kind)[1]
+        size = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        with suppress(OSError, ValueError):
+            resource.setrlimit(kind, (size, size))
+
+    def watch() -> None:
+        while _data_size() < most - (1.0 - _FULL) * memory:
+            time.sleep(_LOOK)
+        act()
+
+    if _data_size():
+        threading.Thread(target=watch, daemon=True).start()
+
+
+def _data_size() -> int:
+    """Return the memory of this process that counts [bytes], 0 where the system does not tell."""
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmData:"):
+                return int(line.split()[1]) * 1024
+    return 0
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,308 @@
+"""The file modelDescription.xml of FMI 2.0 and of FMI 3.0, written from the variable table.
+
+What each unknown depends on is read off the symbolic Jacobian.
+
+Sources: FMI 2.0.5, sections 2.2 (schema), 3.3.1 (model exchange) and 4.3.1 (co-simulation);
+FMI 3.0.2, sections 2.4, 3.3 and 4.3.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import cache
+from xml.etree import ElementTree as ET
+
+import casadi as ca
+
+from psa_casadi.component import Expression
+from psa_casadi.export.common.markup import (
+    base_unit,
+    default_span,
+    describe,
+    generation_tool,
+    number,
+    xml_text,
+)
+from psa_casadi.export.common.publication import published
+from psa_casadi.export.common.variable_table import (
+    START_INDEX,
+    Variable,
+    starts_at_voltage,
+    variable_table,
+)
+from psa_casadi.model.compose import Model, Structure
+from psa_casadi.units import parse_unit
+
+Key = tuple[str, int]
+
+
+@cache
+def dependencies(structure: Structure) -> dict[Key, dict[Key, str]]:
+    """Return for each output, derivative and event indicator what it depends on, and how.
+
+    Keys are (kind, index). The dependence is "constant" where the partial derivative is a number,
+    "tunable" where it holds parameters only, else "dependent". Taken from the sparsity of the
+    Jacobian with respect to time, states, inputs and parameters.
+
+    At a sample instant a sampled state follows from these and from the sampled states before it,
+    so that what depends on it depends on all of them; keys of kind "sampled" stand for the latter.
+    """
+    direct = _direct(structure)
+    result: dict[Key, dict[Key, str]] = {}
+    for unknown, found in direct.items():
+        if unknown[0] != "next":
+            sources = [direct["next", index] for kind, index in found if kind == "sampled"]
+            through = {known: "dependent" for source in sources for known in source}
+            result[unknown] = {**found, **through}
+    return result
+
+
+def at_the_start(model: Model) -> dict[Key, dict[Key, str]]:
+    """Return the same while a model is initialised.
+
+    Where it has the parameter `start_voltage`, states and voltage start as that has it.
+    """
+    found = dependencies(model.structure)
+    if not starts_at_voltage(model):
+        return found
+    voltage = model.input_names.index("voltage")
+    moved = {("input", voltage), *(("state", i) for i in range(len(model.state_names)))}
+    through: dict[Key, str] = {("option", START_INDEX): "dependent"}
+    return {u: {**how, **through} if moved & how.keys() else how for u, how in found.items()}
+
+
+def without_sampled(found: dict[Key, str]) -> dict[Key, str]:
+    """Return what a variable depends on after the initialisation, when no sampled state is set."""
+    return {key: how for key, how in found.items() if key[0] != "sampled"}
+
+
+def _direct(structure: Structure) -> dict[Key, dict[Key, str]]:
+    """Return the same between instants, and what the sampled states ("next") follow from at one."""
+    s = structure
+    sizes = (("time", 1), ("state", len(s.states)), ("input", len(s.inputs)))
+    groups = (*sizes, ("parameter", len(s.parameters)), ("sampled", len(s.sampled)))
+    knowns: list[Key] = [(kind, i) for kind, size in groups for i in range(size)]
+    unknowns: list[Key] = [("derivative", i) for i in range(len(s.states))]
+    unknowns += [("output", i) for i in range(len(s.outputs))]
+    unknowns += [("indicator", i) for i in range(len(s.switches))]
+    unknowns += [("next", i) for i in range(len(s.sampled))]
+    values = ca.vertcat(s.xdot, s.y, *s.switches.values(), s.znext)
+    jacobian = ca.jacobian(values, ca.vertcat(s.time, s.x, s.u, s.p, s.z))
+    tunable = {p.name for p in s.parameters}
+    result: dict[Key, dict[Key, str]] = {u: {} for u in unknowns}
+    rows, columns = jacobian.sparsity().get_triplet()
+    for row, column, entry in zip(rows, columns, jacobian.nonzeros(), strict=True):
+        result[unknowns[row]][knowns[column]] = _kind(entry, tunable)
+    return result
+
+
+def _kind(entry: Expression, tunable: set[str]) -> str:
+    names = {str(symbol) for symbol in ca.symvar(entry)}
+    if not names:
+        return "constant"
+    return "tunable" if names <= tunable else "dependent"
+
+
+#: Log categories; the last one is shown only when debug logging is on.
+LOG_CATEGORIES = {
+    "logStatusWarning": "calls that succeeded, but look wrong",
+    "logStatusDiscard": "steps and evaluations that failed and may be retried",
+    "logStatusError": "calls that are not allowed or impossible",
+    "logSolver": "cost of each communication step",
+}
+_FLAGS_2 = dict.fromkeys(
+    (
+        "canNotUseMemoryManagementFunctions",
+        "canGetAndSetFMUstate",
+        "canSerializeFMUstate",
+        "providesDirectionalDerivative",
+    ),
+    "true",
+)
+_FLAGS_3 = dict.fromkeys(
+    (
+        "canGetAndSetFMUState",
+        "canSerializeFMUState",
+        "providesDirectionalDerivatives",
+        "providesAdjointDerivatives",
+        "providesEvaluateDiscreteStates",
+    ),
+    "true",
+)
+#: What each version's interfaces are capable of.
+_FLAGS = {
+    (2, "ModelExchange"): _FLAGS_2,
+    (2, "CoSimulation"): {
+        **_FLAGS_2,
+        "canHandleVariableCommunicationStepSize": "true",
+        "canInterpolateInputs": "true",
+        "maxOutputDerivativeOrder": "1",
+    },
+    (3, "ModelExchange"): {**_FLAGS_3, "needsCompletedIntegratorStep": "false"},
+    (3, "CoSimulation"): {
+        **_FLAGS_3,
+        "canHandleVariableCommunicationStepSize": "true",
+        "providesIntermediateUpdate": "true",
+        "canReturnEarlyAfterIntermediateUpdate": "true",
+        "hasEventMode": "true",
+        "maxOutputDerivativeOrder": "1",
+    },
+}
+_CONTINUOUS = {"variability": "continuous"}
+#: Causality, variability and initial of each kind of variable; the same words in both versions.
+_CAUSALITY = {
+    "time": {"causality": "independent", **_CONTINUOUS},
+    "state": {"causality": "local", **_CONTINUOUS, "initial": "exact"},
+    "derivative": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
+    "input": {"causality": "input", **_CONTINUOUS},
+    "output": {"causality": "output", **_CONTINUOUS, "initial": "calculated"},
+    "parameter": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
+    "option": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
+    "indicator": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
+    "sampled": {"causality": "local", "variability": "discrete", "initial": "exact"},
+}
+
+
+def model_description(
+    model: Model, identifier: str, token: str, sources: Sequence[str] = (), fmi: int = 2
+) -> str:
+    """Return the XML text of a version of FMI; `token` is the GUID or instantiation token.
+
+    `sources` are the C files in the folder sources. FMI 3.0 lists them in another file.
+    """
+    second, table = fmi == 2, variable_table(model)
+    root = ET.Element(
+        "fmiModelDescription",
+        {
+            "fmiVersion": f"{fmi}.0",
+            "modelName": model.name,
+            "guid" if second else "instantiationToken": token,
+            "description": describe(model),
+            **published(model),
+            "generationTool": generation_tool(),
+            "variableNamingConvention": "structured",
+        },
+    )
+    if second:
+        root.set("numberOfEventIndicators", str(len(model.structure.switches)))
+    for tag in ("ModelExchange", "CoSimulation"):
+        interface = ET.SubElement(root, tag, {"modelIdentifier": identifier, **_FLAGS[fmi, tag]})
+        files = ET.SubElement(interface, "SourceFiles") if second else interface
+        for name in sorted(sources) if second else ():
+            ET.SubElement(files, "File", {"name": name})
+    _units(root, table)
+    _types(root, table, second=second)
+    categories = ET.SubElement(root, "LogCategories")
+    for name, meaning in LOG_CATEGORIES.items():
+        ET.SubElement(categories, "Category", {"name": name, "description": meaning})
+    span = default_span(model)
+    experiment = {"startTime": "0", "stopTime": number(span), "tolerance": "1e-05"}
+    ET.SubElement(root, "DefaultExperiment", {**experiment, "stepSize": number(span / 1000.0)})
+    variables = ET.SubElement(root, "ModelVariables")
+    for reference, variable in enumerate(table, start=1):
+        _variable(variables, reference, variable, second=second)
+    _structure(ET.SubElement(root, "ModelStructure"), model, table, second=second)
+    return xml_text(root)
+
+
+def _units(root: ET.Element, table: Iterable[Variable]) -> None:
+    """Append the UnitDefinitions: each unit in use and each display unit, sorted."""
+    displays: dict[str, set[str]] = {}
+    for variable in table:
+        if variable.unit:
+            shown = displays.setdefault(variable.unit, set())
+            shown |= {variable.display_unit} if variable.display_unit else set()
+    definitions = ET.SubElement(root, "UnitDefinitions")
+    for name in sorted(displays):
+        unit = parse_unit(name)
+        element = ET.SubElement(definitions, "Unit", {"name": name})
+        if all(isinstance(power, int) for power in unit.exponents):  # FMI has no m2.5
+            ET.SubElement(element, "BaseUnit", base_unit(unit))
+        for shown_name in sorted(displays[name]):
+            other = parse_unit(shown_name)  # value shown = factor * value + offset
+            factor = number(float(unit.ratio / other.ratio))
+            display = ET.SubElement(element, "DisplayUnit", {"name": shown_name, "factor": factor})
+            if unit.offset != other.offset:
+                display.set("offset", number((unit.offset - other.offset) / other.factor))
+
+
+def _type_name(unit: str) -> str | None:
+    """Return the name of the type that variables of a unit have; None for a compound unit."""
+    quantity = parse_unit(unit).quantity if unit else ""
+    return quantity.title().replace(" ", "") if quantity else None
+
+
+def _types(root: ET.Element, table: Iterable[Variable], *, second: bool) -> None:
+    definitions = ET.SubElement(root, "TypeDefinitions")
+    units = sorted({v.unit for v in table})
+    for name, unit in sorted((name, unit) for unit in units if (name := _type_name(unit))):
+        declared = {"quantity": name, "unit": unit}
+        if second:
+            simple = ET.SubElement(definitions, "SimpleType", {"name": name})
+            ET.SubElement(simple, "Real", declared)
+        else:
+            ET.SubElement(definitions, "Float64Type", {"name": name, **declared})
+
+
+def _variable(parent: ET.Element, reference: int, it: Variable, *, second: bool) -> None:
+    head = {
+        "name": it.name,
+        "valueReference": str(reference),
+        "description": it.description,
+        **_CAUSALITY[it.kind],
+    }
+    low, high = it.bounds or (-math.inf, math.inf)
+    stated = {
+        "unit": it.unit,
+        "declaredType": _type_name(it.unit),
+        "displayUnit": it.display_unit,
+        "min": number(low) if math.isfinite(low) else None,
+        "max": number(high) if math.isfinite(high) else None,
+        "nominal": None if it.nominal is None else number(abs(it.nominal)),
+        "start": None if it.start is None else number(it.start),
+    }
+    if not second and it.kind in ("state", "derivative", "input", "output"):
+        stated["intermediateUpdate"] = "true"
+    if it.kind == "derivative":
+        stated["derivative"] = str(it.index + 2)
+    value = {name: text for name, text in stated.items() if text}
+    if second:
+        ET.SubElement(ET.SubElement(parent, "ScalarVariable", head), "Real", value)
+    else:
+        ET.SubElement(parent, "Float64", {**head, **value})
+
+
+def _structure(
+    parent: ET.Element, model: Model, table: Sequence[Variable], *, second: bool
+) -> None:
+    """Append the unknowns by what they are, in the order of the standard.
+
+    An InitialUnknown knows no "tunable": there it is "dependent".
+    """
+    found, at_start = dependencies(model.structure), at_the_start(model)
+    places = {(v.kind, v.index): place for place, v in enumerate(table, start=1)}
+    outputs, rates, indicators = (
+        [key for key in places if key[0] == kind] for kind in ("output", "derivative", "indicator")
+    )
+    initial = sorted([*outputs, *rates], key=places.__getitem__)
+    groups = {"Outputs": outputs, "Derivatives": rates, "InitialUnknowns": initial}
+    if not second:
+        groups = {
+            "Output": outputs,
+            "ContinuousStateDerivative": rates,
+            "InitialUnknown": initial,
+            "EventIndicator": indicators,
+        }
+    for tag, unknowns in groups.items():
+        element = ET.SubElement(parent, tag) if second and unknowns else parent
+        initially = unknowns is initial
+        for unknown in unknowns:
+            listed = at_start[unknown] if initially else without_sampled(found[unknown])
+            known = sorted((places[key], kind) for key, kind in listed.items())
+            attributes = {
+                "index" if second else "valueReference": str(places[unknown]),
+                "dependencies": " ".join(str(place) for place, _ in known),
+            }
+            if not (second and initially):
+                kinds = [k if k == "constant" or not initially else "dependent" for _, k in known]
+                attributes["dependenciesKind"] = " ".join(kinds)
+            ET.SubElement(element, "Unknown" if second else tag, attributes)

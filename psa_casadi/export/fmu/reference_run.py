@@ -1,0 +1,256 @@
+"""A run inside the FMU to try an importer on: inputs, parameters and the outputs to expect.
+
+The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives alike. On this run
+is measured how short a communication step must be where an importer holds the inputs over it. A
+held signal is late by half a step h on average: an output that moves at the rate dy/dt errs by
+h/2 |dy/dt|. So the step for an error of a share e of the range R follows from the signal alone,
+
+    h = 2 e R / max |dy/dt|,  for a sine of frequency f over the whole range  h = 2 e / (pi f),
+
+as long as h is short against what the model adds of its own: lags, resonances, the slope of a loop.
+
+Sources: FMI Layered Standard References (FMI-LS-REF) 1.0.0-beta.1 and the Experiments Format of the
+Modelica Association; Astrom and Wittenmark 1997, Computer-Controlled Systems (a hold delays by half
+a period).
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.export.common.markup import number, time_scale, xml_text
+from psa_casadi.export.common.parameter_sets import parameter_set
+from psa_casadi.model.compose import Model
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import nominal_value
+
+FloatArray = npt.NDArray[np.float64]
+
+FOLDER = "extra/org.fmi-standard.fmi-ls-ref"
+NOTES = "documentation/fmi-ls-ref.txt"
+INPUTS, OUTPUTS, PARAMETERS, EXPERIMENTS = "in.csv", "ref.csv", "parameters.ssv", "smoke_test.exp"
+
+#: Relative tolerance that the experiment asks for, and the one the outputs were computed to.
+TOLERANCE = 1e-6
+OWN_TOLERANCE = 1e-12
+_NAMESPACE = "http://fmi-standard.org/fmi-ls-manifest"
+_SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
+_STEPS_PER_SEGMENT = 100
+_DIGITS = 7
+
+_NOTES = """\
+Reference run of '{name}'
+
+One smoke test: every input follows straight lines with kinks every {segment:g} s, from 0 to
+{stop:g} s, and starts at its start value; so does every state. {inputs} holds the inputs, linear
+between its rows; {outputs} the outputs to expect at the same times; {parameters} the parameter
+values, which are also the start values in modelDescription.xml. All in SI units.
+
+The outputs were computed by psa_casadi to a relative tolerance of {own:g} and rounded to {digits}
+digits of their largest value. An importer that stops at the kinks (model exchange), or passes on
+the slope of the inputs (co-simulation of FMI 2), meets them to its own tolerance. One that holds
+the inputs over a communication step of {step:g} s is late by half a step: up to a hundredth of
+the range of displacement, charge and force, and more for current and velocity, which jump at the
+kinks.
+"""
+
+
+@dataclass(frozen=True)
+class Related:
+    """What the manifest says of a file in the archive: MIME type, role and meaning."""
+
+    kind: str
+    role: str
+    meaning: str
+
+
+def reference_entries(model: Model, more: Mapping[str, Related] | None = None) -> dict[str, bytes]:
+    """Return the files of the reference run by their place in the archive.
+
+    The manifest lists the files `more` too, which it does not make. Raises SimulationError if the
+    model cannot be simulated with its own values.
+    """
+    times, inputs = reference_inputs(model)
+    start = np.array([s.start for s in model.structure.states])
+    outputs = rounded(run(model, times, inputs, start, rtol=OWN_TOLERANCE).y)
+    texts = {
+        INPUTS: csv_table(("time", *model.input_names), times, inputs),
+        OUTPUTS: csv_table(("time", *model.output_names), times, outputs),
+        PARAMETERS: parameter_set(model),
+        EXPERIMENTS: experiments("smoke test", [_experiment(model, times)]),
+    }
+    notes = _NOTES.format(
+        name=model.name, segment=_segment(model), stop=times[-1], step=times[1], inputs=INPUTS,
+        outputs=OUTPUTS, parameters=PARAMETERS, own=OWN_TOLERANCE, digits=_DIGITS,
+    )  # fmt: skip
+    texts["fmi-ls-manifest.xml"] = _manifest(more or {})
+    entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
+    return {**entries, NOTES: notes.encode("utf-8")}
+
+
+def _segment(model: Model) -> float:
+    """Return the length of a segment [s]: 10 ms, or the multiple of it that lets it settle."""
+    return 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
+
+
+def reference_inputs(model: Model) -> tuple[FloatArray, FloatArray]:
+    """Return times (n,) and inputs (n, nu): from start to start + nominal, each shape shifted.
+
+    A temperature moves by a tenth of its nominal.
+    """
+    count = _STEPS_PER_SEGMENT * (len(_SHAPE) - 1)
+    step = _segment(model) / _STEPS_PER_SEGMENT
+    times = np.array([round(k * step, 12) for k in range(count + 1)])
+    places = np.arange(count + 1) / _STEPS_PER_SEGMENT
+    columns = []
+    for i, declared in enumerate(model.structure.inputs):
+        shape = np.concatenate([[0.0], np.roll(_SHAPE[1:], 2 * i)])
+        size = nominal_value(declared.nominal, model.values) * (0.1 if declared.start else 1.0)
+        columns.append(declared.start + size * np.interp(places, range(len(_SHAPE)), shape))
+    return times, rounded(np.array(columns).T.reshape(count + 1, -1))
+
+
+def rounded(columns: FloatArray) -> FloatArray:
+    """Return columns (n, k) with `_DIGITS` digits of each one's largest value.
+
+    Digits below that differ from machine to machine.
+    """
+    peaks = np.max(np.abs(columns), axis=0, initial=0.0)
+    places = [_DIGITS - 1 - math.floor(math.log10(p)) if p > 0.0 else 0 for p in peaks]
+    rows = [[round(float(v), d) + 0.0 for v, d in zip(r, places, strict=True)] for r in columns]
+    return np.array(rows).reshape(columns.shape)
+
+
+def csv_table(names: Sequence[str], times: FloatArray, columns: FloatArray) -> str:
+    """Return a CSV table with a header."""
+    rows = [",".join(names)]
+    for time, values in zip(times, columns, strict=True):
+        rows.append(",".join(f"{v:.12g}" for v in (time, *values)))
+    return "\n".join([*rows, ""])
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One experiment: its name and meaning, its times (n,) [s], and files by what they are.
+
+    The files are those of "Parameters", "Stimuli" and "References", in this order.
+    """
+
+    name: str
+    description: str
+    times: FloatArray
+    files: Mapping[str, str]
+
+
+def _experiment(model: Model, times: FloatArray) -> Experiment:
+    files = {"Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS}
+    said = f"straight segments of every input of {model.name}"
+    return Experiment("segments", said, times, files)
+
+
+def experiments(name: str, listed: Iterable[Experiment]) -> str:
+    """Return a file of experiments."""
+    root = ET.Element("Experiments", {"name": name})
+    for e in listed:
+        attributes = {
+            "name": e.name,
+            "description": e.description,
+            "startTime": number(e.times[0]),
+            "stopTime": number(e.times[-1]),
+            "tolerance": number(TOLERANCE),
+            "stepSize": number(e.times[1] - e.times[0]),
+        }
+        experiment = ET.SubElement(root, "Experiment", attributes)
+        for tag, source in e.files.items():
+            ET.SubElement(experiment, tag, {"source": source})
+    return xml_text(root)
+
+
+#: MIME types of the files.
+CSV, SSV, EXP = "text/csv", "application/x-ssp-parameter-set", "application/x-ma-hs-experiments"
+
+#: What the manifest says of each file of the run.
+_RELATED = {
+    f"{FOLDER}/{PARAMETERS}": Related(SSV, "parameter", "values of all parameters"),
+    f"{FOLDER}/{EXPERIMENTS}": Related(
+        EXP, "experiment/smoke-test", "a run over straight segments of every input"
+    ),
+    f"{FOLDER}/{INPUTS}": Related(CSV, "other", "inputs of the smoke test"),
+    f"{FOLDER}/{OUTPUTS}": Related(CSV, "result", "outputs of the smoke test"),
+    NOTES: Related("text/plain", "document", "how the smoke test is meant"),
+}
+
+
+def _manifest(more: Mapping[str, Related]) -> str:
+    """Return fmi-ls-manifest.xml, which lists the files: their kind, role and meaning."""
+    ET.register_namespace("fmi-ls", _NAMESPACE)
+    said = "Layered Standard providing information on related files included in an FMU."
+    name = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-beta.1", "description": said}
+    attributes = {f"{{{_NAMESPACE}}}fmi-ls-{key}": value for key, value in name.items()}
+    root = ET.Element("fmiReferences", attributes)
+    for place, file in {**_RELATED, **more}.items():
+        inside = place.startswith(f"{FOLDER}/")
+        source = place.removeprefix(f"{FOLDER}/") if inside else f"../../{place}"
+        attributes = {
+            "type": file.kind, "source": source, "role": file.role, "description": file.meaning,
+        }  # fmt: skip
+        ET.SubElement(root, "Related", attributes)
+    return xml_text(root)
+
+
+#: Error that the step must meet, over the range of the output.
+SHARE = 1e-3
+#: Steps in a period of a sine over the whole range: pi / (2 SHARE), and a quarter more for a loop.
+STEPS_PER_PERIOD = 2000
+_FIRST, _MOST = 4, 64
+_HELD_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class HeldStep:
+    """The step [s] with which an output's error on the reference run is `error` of its range.
+
+    It is the longest one that divides the rows of the run and keeps the error within `SHARE`, or
+    the shortest one tried where none does. `rate` is the steepest motion in ranges per second.
+    """
+
+    output: str
+    step: float
+    error: float
+    rate: float
+
+
+def held_step(model: Model) -> HeldStep | None:
+    """Return the step for the displacement, or for the first output of a model that has none.
+
+    None if the model has no input or no output, or the output does not move.
+    """
+    if not (model.input_names and model.output_names):
+        return None
+    output = "displacement" if "displacement" in model.output_names else model.output_names[0]
+    column = model.output_names.index(output)
+    times, inputs = reference_inputs(model)
+    start = np.array([s.start for s in model.structure.states])
+    truth = run(model, times, inputs, start, rtol=_HELD_TOLERANCE).y[:, column]
+    span = float(np.ptp(truth))
+    if span == 0.0:
+        return None
+    rate = float(np.max(np.abs(np.diff(truth)))) / float(times[1]) / span
+
+    def error(parts: int) -> float:
+        grid = np.linspace(times[0], times[-1], parts * (len(times) - 1) + 1)
+        fine = np.array([np.interp(grid, times, c) for c in inputs.T]).T
+        found = run(model, grid, fine, start, rtol=_HELD_TOLERANCE, hold="zero").y[::parts, column]
+        return float(np.max(np.abs(found - truth))) / span
+
+    parts, worst = _FIRST, error(_FIRST)
+    wanted = min(_MOST, max(1, math.ceil(parts * worst / SHARE)))
+    while wanted != parts:
+        parts, worst = wanted, error(wanted)
+        if worst > SHARE and parts < _MOST:
+            wanted = min(_MOST, parts + max(1, parts // 8))
+    return HeldStep(output, float(times[1]) / parts, worst, rate)

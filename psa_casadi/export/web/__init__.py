@@ -1,1 +1,0 @@
-"""A model in a page: compiled to WebAssembly, and described for its sliders."""

@@ -1,1 +1,0 @@
-"""Models from one's own CasADi equations."""

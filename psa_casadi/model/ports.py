@@ -1,0 +1,153 @@
+"""The places of a model where something may be missing: its inputs, outputs and states' rates.
+
+A model with ports is the same model, written so that others may add to it:
+
+    applied_u = u + ...          what acts in the place of the input u
+    rate_x    = f_x(...) + ...   the rate of the state x
+    true_y    = h_y(...)         an output as the equations have it
+    shown_y   = true_y + ...     what the sensor shows of it
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Literal
+
+import casadi as ca
+
+from psa_casadi.component import Balance, Component, Equations, Expression, Symbols
+from psa_casadi.model.compose import Model
+from psa_casadi.units import rate_unit, si_unit
+
+Kind = Literal["input", "rate", "output"]
+_PREFIX: dict[Kind, str] = {"input": "applied_", "rate": "rate_", "output": "shown_"}
+
+
+@dataclass(frozen=True)
+class Port:
+    """A place where an effect may attach: which kind, of which variable, in which SI unit."""
+
+    kind: Kind
+    variable: str
+    unit: str
+
+    @property
+    def balance(self) -> str:
+        """Name of the sum that an effect adds to."""
+        return _PREFIX[self.kind] + self.variable
+
+    @property
+    def words(self) -> str:
+        """The place in words: "the input u", "the rate of x", "the output y"."""
+        if self.kind == "rate":
+            return f"the rate of {self.variable}"
+        return f"the {self.kind} {self.variable}"
+
+
+def true_output(name: str) -> str:
+    """Return the name of the sum that holds an output before its sensor."""
+    return f"true_{name}"
+
+
+def ports_of(model: Model) -> tuple[Port, ...]:
+    """Return the ports of a model: its inputs, the rates of its own physics' states, its outputs.
+
+    A rate that is nothing but another state (the position's is the velocity) is a definition and no
+    physics: it has no port. States of effects have none either.
+    """
+    s = model.structure
+    base = [c for c in model.components if c.gain is None]
+    states = [q for c in base for q in c.states]
+    return (
+        *(Port("input", i.name, _si(i.unit)) for c in base for i in c.inputs),
+        *(
+            Port("rate", q.name, rate_unit(_si(q.unit)))
+            for q in states
+            if not _is_definition(s.der[q.name])
+        ),
+        *(Port("output", o.name, _si(o.unit)) for c in base for o in c.outputs),
+    )
+
+
+def with_ports(model: Model, ports: Iterable[Port] | None = None) -> Model:
+    """Return the model with sums at its ports, or at some of them, that effects may add to.
+
+    Its values, starts and equations stay; it computes the same.
+    """
+    chosen = frozenset(ports_of(model) if ports is None else ports)
+    return model.with_components(ported(c, chosen) for c in model.components)
+
+
+@cache
+def ported(component: Component, ports: frozenset[Port]) -> Component:
+    """Return a component with sums at those of the ports that are its own; once for all."""
+    names = {
+        "input": [i.name for i in component.inputs],
+        "rate": [q.name for q in component.states],
+        "output": [o.name for o in component.outputs],
+    }
+    own = [p for p in sorted(ports, key=lambda p: p.balance) if p.variable in names[p.kind]]
+    if component.gain is not None or not own:
+        return component
+    balances = [b for p in own for b in _balances(p)]
+    return replace(component, equations=_opened(component, own), balances=tuple(balances))
+
+
+def state_unit(model: Model, name: str) -> str:
+    """Return the SI unit of a state."""
+    return next(_si(q.unit) for q in model.structure.states if q.name == name)
+
+
+def _si(unit: str) -> str:
+    return si_unit(unit) if unit else "1"
+
+
+def _balances(port: Port) -> list[Balance]:
+    about = {
+        "input": f"what acts in the place of {port.words}",
+        "rate": port.words,
+        "output": f"what is shown of {port.words}",
+    }
+    found = [Balance(port.balance, port.unit, about[port.kind])]
+    if port.kind == "output":
+        words = f"{port.words} before its sensor"
+        found.insert(0, Balance(true_output(port.variable), port.unit, words))
+    return found
+
+
+def _opened(component: Component, ports: list[Port]) -> Callable[[Symbols], Equations]:
+    """Return the component's equations with sums in the places of what the ports stand for."""
+
+    def equations(s: Symbols) -> Equations:
+        replaced = {p.variable: getattr(s, p.balance) for p in ports if p.kind == "input"}
+        plain = component.equations(_Replaced(s, replaced))
+        add: dict[str, Expression] = dict(plain.add)
+        der, out = dict(plain.der), dict(plain.out)
+        for p in ports:
+            if p.kind == "input":
+                add[p.balance] = getattr(s, p.variable)
+            elif p.kind == "rate":
+                add[p.balance], der[p.variable] = der[p.variable], getattr(s, p.balance)
+            else:
+                true = true_output(p.variable)
+                add[true], add[p.balance] = out[p.variable], getattr(s, true)
+                out[p.variable] = getattr(s, p.balance)
+        return replace(plain, der=der, add=add, out=out)
+
+    return equations
+
+
+class _Replaced(Symbols):
+    """The symbols of a model, some of them replaced."""
+
+    def __init__(self, symbols: Symbols, replaced: dict[str, Expression]) -> None:
+        super().__init__(replaced)
+        self._symbols = symbols
+
+    def __getattr__(self, name: str) -> Expression:
+        table = self.__dict__["_table"]
+        return table[name] if name in table else getattr(self.__dict__["_symbols"], name)
+
+
+def _is_definition(rate: Expression) -> bool:
+    return bool(ca.SX(rate).is_symbolic())

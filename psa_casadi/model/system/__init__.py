@@ -1,1 +1,0 @@
-"""Models wired to a system, and the nanopositioner made of them."""

@@ -1,1 +1,0 @@
-"""What a record is worth: its noise, repeats, resolution, stuck and suspect readings."""

@@ -1,0 +1,537 @@
+"""Files of other programs, read by the libraries that the field reads them with.
+
+Each reader returns the tables of the file at a path. It runs in a process of its own
+(`records.read.apart`), since what is damaged may crash a library or fill the memory.
+"""
+
+import math
+import re
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import date, datetime, time, timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.records.read.columns import (
+    MARKS,
+    SI_UNITS,
+    name_without_unit,
+    stated_unit,
+    understood,
+    unit_named,
+)
+from psa_casadi.records.read.file_bytes import check_size
+from psa_casadi.records.read.table import Cells, Columns, Table, unit_of_times
+from psa_casadi.records.read.text import text_tables
+
+#: The attributes and properties that state a unit, in lower case.
+UNITS = ("units", "unit", "unit_string")
+_BRACKETED = re.compile(r"(?P<name>.+?)\s*\[(?P<unit>[^\[\]]+)\]")
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One array of a file, by its name: `size` values, read on demand, in the unit it states."""
+
+    name: str
+    size: int
+    values: Callable[[], Cells]
+    unit: str | None = None
+
+
+def unit_stated(unit: object) -> str | None:
+    """Return the unit that a file states beside an array, None where it is none."""
+    return unit_named(unit, common=False) if isinstance(unit, str) else None
+
+
+def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator[Series]:
+    """Yield the series in an array: itself, its fields, or its columns counted from 1.
+
+    Series lie along the longer side of a matrix. What is neither is left out.
+    """
+    if numbers.dtype.names:
+        for field in numbers.dtype.names:
+            yield from series_in(f"{name}.{field}" if name else field, numbers[field], unit)
+        return
+    if numbers.dtype.kind not in "biufmM":
+        return
+    stated = unit_stated(unit)
+    numbers = np.atleast_1d(np.squeeze(numbers)) if numbers.size else numbers.ravel()
+    if numbers.ndim == 1:
+        yield Series(name or "1", numbers.size, lambda: numbers, stated)
+    elif numbers.ndim == 2:
+        upright = numbers if numbers.shape[0] >= numbers.shape[1] else numbers.T
+        for k in range(upright.shape[1]):
+            column = upright[:, k]
+            own = f"{name}.{k + 1}" if name else f"{k + 1}"
+            yield Series(own, column.size, lambda c=column: c, stated)  # type: ignore[misc]
+
+
+def array_tables(
+    path: str, found: Iterable[Series], steps: Iterable[float] = (), place: str = "sample"
+) -> list[Table]:
+    """Return the tables that series make: all of them, then those of each group with several.
+
+    A group is also what the columns of one number of several matrices are; what is in none, such as
+    a time, belongs to each.
+
+    The first of a name counts. `steps` [s] are the times between samples that the file states; they
+    count where they agree.
+    """
+    series: dict[str, Series] = {}
+    for one in found:
+        match = _BRACKETED.fullmatch(one.name.strip())
+        name = MARKS.sub("_", match["name"] if match else one.name.strip())
+        unit = one.unit or (match["unit"].strip() if match else None)
+        series.setdefault(name, replace(one, name=name, unit=unit))
+    scalars = {n.rpartition(".")[2]: s.values() for n, s in series.items() if s.size == 1}
+    stated = {*steps, *told_step(scalars)}
+    step = stated.pop() if len(stated) == 1 else None
+    texts = {name: _text(one) for name, one in series.items()}
+    whole = _table(path, "", list(series.values()), texts, step, place)
+    groups: dict[str, list[Series]] = {}
+    for name, one in series.items():
+        group, _, last = name.rpartition(".")
+        groups.setdefault(last if last.isdecimal() else group, []).append(one)
+    shared = groups.get("", [])
+    several = {n: [*shared, *own] for n, own in groups.items() if n and len(own) > 1}
+    parts = [_table(path, name, own, texts, step, place) for name, own in several.items()]
+    return [whole, *(parts if len(parts) > 1 else [])]
+
+
+def _table(
+    path: str, name: str, series: Sequence[Series], texts: Mapping[str, str], step: float | None,
+    place: str,
+) -> Table:  # fmt: skip
+    """Return the table of some series; `texts` are their names with units."""
+
+    def load(asked: Sequence[int], most: int | None, _: Problems) -> Columns:
+        check_size(path, 8 * sum(series[k].size for k in asked if most is None), "its columns hold")
+        cells = [series[k].values()[: most or series[k].size] for k in asked]
+        longest = max(map(len, cells), default=0)
+        return Columns(cells, np.arange(1, longest + 1))
+
+    numbered = all(one.name.isdecimal() for one in series) and bool(series)
+    kind = "column" if place == "row" else "array"
+    labels = [one.name for one in series]
+    return Table(
+        path=path, name=name, header=[texts[label] for label in labels], labels=labels,
+        where=f"{path}: {kind} names", place=place, load=load, step=step,
+        sizes=[one.size for one in series],
+        headless=", ".join(labels) if numbered else "",
+    )  # fmt: skip
+
+
+def _text(series: Series) -> str:
+    """Return the name of a series with its unit: the stated one, or that of a name of its own."""
+    last = series.name.rpartition(".")[2]
+    own = last if re.match(r"\w*[^\W\d]", last) else series.name
+    unit = series.unit
+    if unit is None and not stated_unit(own):
+        name = understood(own)
+        values = series.values()[:9] if name and name.column == "time" and series.size > 1 else []
+        if isinstance(values, np.ndarray) and len(values):
+            is_instant = values.dtype.kind in "mM"
+            unit = "s" if is_instant else unit_of_times(values.astype(np.float64))
+        unit = unit or SI_UNITS.get(own.lower())
+    return f"{series.name} [{unit}]" if unit else series.name
+
+
+def told_step(attributes: Mapping[str, Any]) -> Iterator[float]:
+    """Yield the times between samples [s] that attributes state, as a time or as a rate [Hz]."""
+    for key, value in attributes.items():
+        name = re.sub(r"[\W_]+", "", str(key).lower())
+        try:
+            number = float(np.asarray(value).reshape(-1)[0])
+        except (TypeError, ValueError, IndexError):
+            continue
+        if not 0.0 < number < 1e12:
+            continue
+        if name in ("sampletime", "samplingtime", "sampleinterval", "samplinginterval", "dt",
+                    "timestep", "increment", "xincrement", "wfincrement", "ts"):  # fmt: skip
+            yield number
+        elif name in ("samplerate", "samplingrate", "samplingfrequency", "samplefrequency", "fs",
+                      "rate", "samplefreq"):  # fmt: skip
+            yield 1.0 / number
+
+
+def hdf5_tables(path: str) -> list[Table]:
+    """Return the tables of an HDF5 file: datasets, fields of tables, units and time by attributes.
+
+    A dataset in a group is named `group.dataset`. The attribute `units` or `unit` says the unit; a
+    sample time [s] or rate [Hz] among the attributes the time where no dataset has it.
+    """
+    import h5py  # noqa: PLC0415
+
+    with h5py.File(path, "r") as file:
+        held = list(checked_datasets(path, file, set()))
+        found = [s for item in held for s in _of_dataset(path, item)]
+        about = [file, *held, *(item.parent for item in held)]
+        steps = {step for item in about for step in told_step(_attributes(item))}
+    return array_tables(path, found, steps)
+
+
+def _of_dataset(path: str, item: Any) -> Iterator[Series]:
+    import h5py  # noqa: PLC0415
+
+    name = item.name.strip("/").replace("/", ".")
+    unit = next((u for k, u in _attributes(item).items() if k in UNITS), None)
+    place, size = item.name, max(item.shape or (0,))
+
+    def read() -> Any:
+        with h5py.File(path, "r") as file:
+            found = file[place]
+            return found.asstr()[()].ravel().tolist() if found.dtype.kind == "O" else found[()]
+
+    if item.shape and sum(n != 1 for n in item.shape) == 1 and item.dtype.kind in "biuf":
+        yield Series(name, size, lambda: np.ravel(read()), unit_stated(unit))
+    elif item.shape and item.dtype.kind in "biufV":
+        check_size(path, item.size * item.dtype.itemsize, "its arrays hold")
+        yield from series_in(name, read(), unit)
+    elif item.shape and h5py.check_string_dtype(item.dtype):
+        yield Series(name, size, read)
+
+
+def checked_datasets(path: str, group: Any, seen: set[int]) -> list[Any]:
+    """Return the datasets below a group. Links are not followed, and none lies in another file."""
+    import h5py  # noqa: PLC0415
+
+    address = h5py.h5o.get_info(group.id).addr
+    if address in seen:
+        raise ValueError(f"the group '{group.name}' is reached twice")
+    seen.add(address)
+    found = []
+    for name in group:
+        if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            found += checked_datasets(path, item, seen)
+        elif isinstance(item, h5py.Dataset) and item.shape is not None:
+            if item.external or item.is_virtual:
+                raise InputError(
+                    f"{path}: the array '{item.name}' lies in another file; save the values"
+                    " themselves."
+                )
+            if item.chunks:
+                piece = math.prod(item.chunks) * item.dtype.itemsize
+                check_size(path, piece, f"a piece of the array '{item.name}' holds")
+            found.append(item)
+    return found
+
+
+def _attributes(item: Any) -> dict[str, Any]:
+    """Return the attributes with their keys in lower case, texts as such."""
+    found = {}
+    for key in item.attrs:
+        value = item.attrs[key]
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.reshape(-1)[0]
+        found[str(key).lower()] = (
+            value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+        )
+    return found
+
+
+def matlab_tables(path: str) -> list[Table]:
+    """Return the tables of a MATLAB file of any level, one of a Modelica tool, or of Simulink.
+
+    A field of a structure is named `log.u`, of the second of several `log.2.u`. Of a matrix the
+    series are named `m.1`, `m.2`, ...; they lie along its longer side.
+    """
+    import h5py  # noqa: PLC0415
+
+    if h5py.is_hdf5(path):
+        import pymatreader  # noqa: PLC0415
+
+        with h5py.File(path, "r") as file:
+            held = checked_datasets(path, file, set())
+            check_size(path, sum(d.size * d.dtype.itemsize for d in held), "its arrays hold")
+        tree = pymatreader.read_mat(path)
+    else:
+        from scipy.io import loadmat  # noqa: PLC0415
+
+        tree = loadmat(path, simplify_cells=True)
+    if {"Aclass", "name", "dataInfo"} <= set(tree):
+        return array_tables(path, _modelica(path))
+    return array_tables(path, [s for top, value in tree.items() for s in _of_tree(top, value)])
+
+
+def _of_tree(name: str, value: Any) -> Iterator[Series]:
+    value = _elements(value)
+    if isinstance(value, list):
+        value = {str(k): inner for k, inner in enumerate(value, 1)}
+    if isinstance(value, Mapping):
+        for field, inner, unit in _recorded(value) or ((k, v, None) for k, v in value.items()):
+            if isinstance(inner, np.ndarray) and unit is not None:
+                yield from series_in(f"{name}.{field}", inner, unit)
+            else:
+                yield from _of_tree(f"{name}.{field}", inner)
+    elif isinstance(value, np.ndarray | np.number | float | int):
+        yield from series_in(name, np.asarray(value))
+
+
+def _elements(value: Any) -> Any:
+    """Return several structures or cells as a list: they come as an array or by their fields."""
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return list(value.ravel())
+    if isinstance(value, Mapping) and len(value) > 1:
+        counts = {len(v) if isinstance(v, list) else 0 for v in value.values()}
+        if len(counts) == 1 and (count := counts.pop()) > 1:
+            return [{k: v[i] for k, v in value.items()} for i in range(count)]
+    return value
+
+
+def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]] | None:
+    """Return name, numbers and unit of what dSPACE ControlDesk records, None where it is another.
+
+    There `X` holds the time in seconds as `Data`, and each element of `Y` a signal with its `Name`.
+    Where there are several times, or signals of one name, they are counted.
+    """
+    times, signals = (_with_data(value.get(axis)) for axis in ("X", "Y"))
+    if not times or not any(_told(signal, "Name") for signal in signals):
+        return None
+    texts = [_told(signal, "Name") for signal in signals]
+    names = [name_without_unit(text) for text in texts]
+    if "" in names or len(set(names)) < len(names):
+        names = [f"Y.{k}" for k in range(1, len(names) + 1)]
+    clocks = ["time"] if len(times) == 1 else [f"X.{k}" for k in range(1, len(times) + 1)]
+    return [
+        *((own, x["Data"], _told(x, "Unit") or "s") for own, x in zip(clocks, times, strict=True)),
+        *(
+            (own, y["Data"], _told(y, "Unit") or stated_unit(text) or "")
+            for own, text, y in zip(names, texts, signals, strict=True)
+        ),
+    ]
+
+
+def _with_data(value: Any) -> list[Mapping[str, Any]]:
+    """Return the structures that hold numbers as `Data`, none where one does not."""
+    value = _elements(value)
+    several = value if isinstance(value, list) else [value]
+    found = [v for v in several if isinstance(v, Mapping) and isinstance(v.get("Data"), np.ndarray)]
+    return found if len(found) == len(several) else []
+
+
+def _told(signal: Mapping[str, Any], field: str) -> str:
+    text = signal.get(field)
+    return text.strip() if isinstance(text, str) else ""
+
+
+def _modelica(path: str) -> Iterator[Series]:
+    """Yield the trajectories of a result of Dymola or OpenModelica.
+
+    Source: Dymola User Manual, "Matlab interface" (class Atrajectory, dataInfo).
+    """
+    from scipy.io import loadmat  # noqa: PLC0415
+
+    found = loadmat(path, chars_as_strings=False)
+    upright = "".join(found["Aclass"][3]).strip("\0 ") != "binTrans"
+    name, info, units = (
+        found[k] if upright else found[k].T for k in ("name", "dataInfo", "description")
+    )
+    for text, (block, at, *_), about in zip(name, np.atleast_2d(info), units, strict=True):
+        data = found.get(f"data_{block or 2}")
+        if data is None or at == 0:
+            continue
+        row = (data.T if upright else data)[abs(int(at)) - 1]
+        unit = re.search(r"\[([^\]|]*)", "".join(about))
+        own = "".join(text).strip("\0 ")
+        is_time = own.lower() == "time"
+        stated = unit[1] if unit else "s" if is_time else None
+        yield from series_in("time" if is_time else own, np.sign(at) * row, stated)
+
+
+_MARKS = str.maketrans(dict.fromkeys('\t\r\n;"', " "))
+
+
+def excel_tables(path: str) -> list[Table]:
+    """Return the tables of a workbook (.xlsx, .xlsm, .xls, .ods), those of hidden sheets last."""
+    from python_calamine import CalamineWorkbook, SheetVisibleEnum  # noqa: PLC0415
+
+    book = CalamineWorkbook.from_path(path)
+    shown = sorted(
+        book.sheets_metadata, key=lambda sheet: sheet.visible != SheetVisibleEnum.Visible
+    )
+    found = []
+    for sheet in shown:
+        rows = book.get_sheet_by_name(sheet.name).to_python(skip_empty_area=False)
+        lines = [
+            "\t".join(map(_cell_text, row)) if any(c != "" for c in row) else "" for row in rows
+        ]
+        found += text_tables(path, _without_empty(lines), "row", sheet.name)
+    return found
+
+
+def _cell_text(cell: object) -> str:
+    """Return a cell as text without the marks that separate cells of a table."""
+    if isinstance(cell, float | int) and not isinstance(cell, bool):
+        return repr(float(cell))
+    if isinstance(cell, datetime | date | time):
+        return cell.isoformat(sep=" ") if isinstance(cell, datetime) else cell.isoformat()
+    if isinstance(cell, timedelta):
+        return f"{cell.total_seconds()!r} s"
+    return " ".join(str(cell).translate(_MARKS).split())
+
+
+def _without_empty(lines: list[str]) -> list[str]:
+    """Return rows of tab-separated cells without the columns that are empty in all of them."""
+    width = max((line.count("\t") + 1 for line in lines), default=0)
+    rows = [line.split("\t") + [""] * (width - 1 - line.count("\t")) for line in lines]
+    kept = [k for k in range(width) if any(row[k] for row in rows)]
+    return ["\t".join(row[k] for k in kept) if any(row) else "" for row in rows]
+
+
+def tdms_tables(path: str) -> list[Table]:
+    """Return the tables of a TDMS file: channels by their names, and groups where several are.
+
+    Units and time are as the properties of the channels state them.
+    """
+    import nptdms  # noqa: PLC0415
+    from nptdms.log import log_manager  # noqa: PLC0415
+
+    log_manager.set_level(50)  # it tells of damage on the terminal
+    file = nptdms.TdmsFile.read_metadata(path)
+    channels = [c for group in file.groups() for c in group.channels()]
+    if sum(len(c) * c.dtype.itemsize for c in channels) > 2 * Path(path).stat().st_size:
+        raise ValueError("it states more numbers than it has bytes for")
+    several = len(file.groups()) > 1
+    found, steps = [], set()
+    for channel in channels:
+        if channel.dtype.kind not in "biufM":
+            continue
+        name = f"{channel.group_name}.{channel.name}" if several else channel.name
+        unit = next((u for k, u in channel.properties.items() if k.lower() in UNITS), None)
+
+        def read(group: str = channel.group_name, own: str = channel.name) -> Cells:
+            with nptdms.TdmsFile.open(path) as whole:
+                return np.asarray(whole[group][own][:])
+
+        found.append(Series(name, len(channel), read, unit_stated(unit)))
+        steps |= {float(s) for k, s in channel.properties.items() if k == "wf_increment" and s > 0}
+    return array_tables(path, found, steps)
+
+
+def parquet_tables(path: str) -> list[Table]:
+    """Return the table of a Parquet or Feather file; only the columns of a record are read."""
+    from pyarrow import feather, parquet  # noqa: PLC0415
+
+    if path.lower().endswith((".feather", ".arrow")):
+        whole = feather.read_table(path)
+        schema, rows = whole.schema, whole.num_rows
+    else:
+        whole = None
+        file = parquet.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
+        schema, rows = file.schema_arrow, file.metadata.num_rows
+
+    def read(name: str) -> Cells:
+        return _arrow_cells((whole or file.read([name], use_threads=False)).column(name), rows)
+
+    found = []
+    for field in schema:
+        about = {k.decode().lower(): v.decode() for k, v in (field.metadata or {}).items()}
+        unit = next((u for k, u in about.items() if k in UNITS), None)
+        found.append(Series(field.name, rows, partial(read, field.name), unit))
+    return array_tables(path, found, place="row")
+
+
+def _arrow_cells(column: Any, rows: int) -> Cells:
+    """Return a column as numbers, null as nan, as instants, or as texts."""
+    import pyarrow  # noqa: PLC0415
+
+    if len(column) != rows:
+        raise ValueError(f"{len(column)} of the {rows} rows that it states")
+    kinds = pyarrow.types
+    if kinds.is_timestamp(column.type) or kinds.is_date(column.type):
+        column = column.cast(pyarrow.timestamp("ns"), safe=False)
+    elif kinds.is_time(column.type) or kinds.is_duration(column.type):
+        column = column.cast(pyarrow.duration(column.type.unit)).cast(pyarrow.duration("ns"))
+    elif kinds.is_integer(column.type) and not column.null_count:
+        pass
+    elif (
+        kinds.is_integer(column.type)
+        or kinds.is_floating(column.type)
+        or kinds.is_decimal(column.type)
+    ):
+        column = column.cast(pyarrow.float64(), safe=False)
+    else:
+        return ["" if v is None else str(v) for v in column.to_pylist()]
+    return np.asarray(column.to_numpy())
+
+
+def numpy_tables(path: str) -> list[Table]:
+    """Return the tables of a NumPy file: of a matrix the columns, of an archive all by name.
+
+    Nothing is unpickled.
+    """
+    found = np.load(path, allow_pickle=False, mmap_mode="r" if path.endswith(".npy") else None)
+    if isinstance(found, np.ndarray):
+        return array_tables(path, series_in("", found))
+    with zipfile.ZipFile(path) as archive:
+        check_size(path, sum(m.file_size for m in archive.infolist()), "its arrays hold")
+    return array_tables(path, [s for name in found.files for s in series_in(name, found[name])])
+
+
+def universal_tables(path: str) -> list[Table]:
+    """Return the tables of a universal file (UFF, data set 58, text or binary)."""
+    import pyuff  # noqa: PLC0415
+
+    found: list[Series] = []
+    steps = []
+    for k, one in enumerate(pyuff.UFF(path).read_sets() or []):
+        if one.get("type") != 58:
+            continue
+        name = str(one.get("id1") or "").strip()
+        name = name if name and name.upper() != "NONE" else f"channel {k + 1}"
+        unit = str(one.get("ordinate_axis_units_lab") or "").strip()
+        found += series_in(name, np.real(one["data"]), unit)
+        if one.get("abscissa_spacing") == 1:
+            steps.append(float(one["abscissa_inc"]))
+        elif not steps:
+            found += series_in("time", np.asarray(one["x"]), "s")
+    return array_tables(path, found, steps)
+
+
+#: What reads a file, by its ending, and the package that it needs.
+READERS: dict[str, tuple[Callable[[str], list[Table]], str]] = {
+    **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods"), (excel_tables, "python_calamine")),
+    ".mat": (matlab_tables, "pymatreader"),
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), (hdf5_tables, "h5py")),
+    ".tdms": (tdms_tables, "nptdms"),
+    **dict.fromkeys((".npy", ".npz"), (numpy_tables, "numpy")),
+    **dict.fromkeys((".parquet", ".pq", ".feather", ".arrow"), (parquet_tables, "pyarrow")),
+    **dict.fromkeys((".uff", ".unv", ".uf", ".bunv"), (universal_tables, "pyuff")),
+}
+#: Files whose makers' programs write something that is read, by their ending.
+EXPORTS = {
+    ".raw": "a result of SPICE", ".trc": "a LeCroy waveform", ".isf": "a Tektronix waveform",
+    ".wfm": "an oscilloscope's waveform", ".bin": "a binary waveform", ".ibw": "an Igor wave",
+    ".psdata": "a PicoScope file", ".svd": "a Polytec file", ".pvd": "a Polytec file",
+    ".mf4": "a measurement file", ".mdf": "a measurement file", ".opj": "an Origin project",
+    ".opju": "an Origin project", ".d7d": "a Dewesoft file", ".dxd": "a Dewesoft file",
+}  # fmt: skip
+_MAGIC = {
+    b"\x89HDF": ".h5", b"PK\x03\x04": ".xlsx", b"PAR1": ".parquet", b"TDSm": ".tdms",
+    b"\x93NUM": ".npy", b"MATL": ".mat", b"ARRO": ".feather", b"\xd0\xcf\x11\xe0": ".xls",
+}  # fmt: skip
+
+
+def ending_of(path: str) -> str:
+    """Return the ending that says how a file is read, "" for text.
+
+    Where the name has another, the first bytes of the file tell.
+    """
+    ending = Path(path).suffix.lower()
+    if ending in READERS or ending in (".csv", ".gz"):
+        return ending if ending in READERS else ""
+    try:
+        with Path(path).open("rb") as stream:
+            return _MAGIC.get(stream.read(4), "")
+    except OSError:
+        return ""

@@ -1,0 +1,403 @@
+"""Samples that a sensor, not the stack, has made: outliers, drop-outs, stuck or saturated ones.
+
+They are recognised from the record alone and masked; nothing is put in their place. What a stack
+can do (ring after a step, follow a jump of the voltage, turn sharply) is not suspect.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from psa_casadi.records.noise import high_frequency_noise, last_place_of, quantum_of, runs_of
+from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
+
+BoolArray = NDArray[np.bool_]
+
+#: Samples that no spike exceeds, and standard deviations of its surroundings that make an outlier.
+SPIKE, LIMIT = 3, 8.0
+#: Samples before a sudden change of voltage or load in which the stack may move fast, and by which
+#: share of what it may do at once it may still move so many samples after it.
+BEFORE, AFTER = 4, ((1.0, 24), (0.25, 48), (0.03, 96))
+#: Equal samples in a row that may be a sensor at rest, and the share of the range it missed.
+EQUAL, MISSED = 8, 0.05
+#: Share of fast changes of the voltage without a new reading from which on the stack is late.
+LATE = 0.3
+#: Runs of equal readings that chance may make where the voltage is fast, and that are none then.
+CHANCE = 0.05
+#: Share of readings that noise may repeat by chance, that a failing sensor repeats at most, and the
+#: probability below which more of them are no chance.
+BY_NOISE, RARELY, NO_CHANCE = 2e-3, 0.05, 1e-4
+#: Least noise over the record's range, and least ratio of the fourth to the third differences: that
+#: of white noise is 1.87, that of a motion below a fifth of the sampling rate at most 1.2.
+NOISY, ROUGH = 1e-5, 1.3
+#: Parts of a record's values, by size, in each of which its digits are told.
+BANDS = 4
+
+
+def equal_runs(
+    y: FloatArray, voltage: FloatArray, quantum: float | None
+) -> tuple[BoolArray, BoolArray]:
+    """Return where one value is repeated as by a stuck sensor, and where as in a drop-out."""
+    span, reach = float(np.ptp(y)), float(np.ptp(voltage))
+    stuck, dropped = (np.zeros(y.size, dtype=np.bool_) for _ in range(2))
+    edges = np.flatnonzero(~_repeated(y)) + 1
+    starts, stops = np.r_[0, edges], np.r_[edges, y.size]
+    lengths = stops - starts
+    usual = float(np.percentile(lengths, 95))
+    slope = span / reach if reach > 0 else 0.0
+    swing = slope * np.abs(np.diff(voltage, prepend=voltage[0]))
+    floor = max(20.0 * (quantum or 0.0), MISSED * span)
+    for start, stop in zip(starts, stops, strict=True):
+        if stop - start <= SPIKE:
+            continue
+        jumps = _jumps(y, start, stop)
+        expected = slope * float(np.ptp(voltage[start:stop]))
+        near = swing[max(0, start - AFTER[0][1]) : stop + BEFORE]
+        off = min(jumps) > max(floor, 3.0 * float(np.max(near)))
+        if off and _returns(y, start, stop, expected):
+            dropped[start:stop] = True
+        elif stop - start >= max(EQUAL, 4.0 * usual) and expected > floor:
+            sudden = np.abs(jumps) > 0.5 * MISSED * span
+            if sudden[0]:
+                dropped[start:stop] = True
+            elif sudden[1] or (usual <= 1.0 and quantum is None):
+                stuck[start + 1 : stop] = True
+    return stuck, dropped
+
+
+def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
+    """Return where a reading is repeated, however shortly, while the voltage moves the stack.
+
+    The motion that the voltage's change makes must stand out from the noise, and at the end of the
+    run the reading must make up for at least half of it at once; and runs of that length, from the
+    share of readings that are repeated, must not be expected where the voltage is fast. Where that
+    is how the record answers fast changes in general, the stack is late and no sensor stuck.
+    """
+    found = np.zeros(y.size, dtype=np.bool_)
+    centred = voltage - np.mean(voltage)
+    power = float(centred @ centred)
+    slope = float(centred @ y) / power if power > 0 else 0.0
+    least = LIMIT * max(high_frequency_noise(y), 0.5 * (quantum or 0.0))
+    same = _repeated(y)
+    fast = np.abs(slope * np.diff(voltage)) > least
+    by_chance = float(np.mean(same)) ** np.arange(same.size + 1) * float(np.count_nonzero(fast))
+    for start, stop in zip(*(ends.tolist() for ends in runs_of(same)), strict=True):
+        # y[start] ... y[stop] are equal, y[stop + 1] is the first new one
+        if stop + 1 >= y.size or by_chance[stop - start] > CHANCE:
+            continue
+        missed = slope * (voltage[stop] - voltage[start])
+        made_up = (y[stop + 1] - y[stop]) * np.sign(missed)
+        expected = abs(slope * (voltage[stop + 1] - voltage[start]))
+        if abs(missed) > least and made_up > max(least, 0.5 * expected):
+            found[start + 1 : stop + 1] = True
+    late = fast.any() and float(np.mean(same[fast])) > LATE
+    return np.zeros_like(found) if late else found
+
+
+def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
+    """Return where a reading is the last one to the last digit, which noise hardly ever makes.
+
+    Two readings with noise of standard deviation s are alike to a digit d with a chance of
+    d / (2 sqrt(pi) s). However slow or late the stack is, a sensor that repeats clearly more than
+    that while the voltage changes does not measure; one that repeats often is read more slowly than
+    it is sampled.
+    """
+    found = np.zeros(y.size, dtype=np.bool_)
+    span, noise, same = float(np.ptp(y)), high_frequency_noise(y), _repeated(y)
+    same &= np.diff(voltage) != 0.0
+    chance = max(quantum or 0.0, _digit(y)) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
+    if noise <= NOISY * span or not _rough(y) or not same.any():
+        return found
+    unlikely = scipy.special.pdtrc(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
+    if chance < BY_NOISE and unlikely and np.mean(same) < RARELY:
+        found[1:] = same
+    return found
+
+
+def _digit(y: FloatArray) -> float:
+    """Return the last digit of readings: the largest of what parts of them, by size, show."""
+    parts = np.array_split(np.unique(np.abs(y)), BANDS)
+    return max((float(np.min(np.diff(p))) for p in parts if p.size > 1), default=0.0)
+
+
+def _rough(y: FloatArray) -> bool:
+    """Whether the fast part of a signal is noise, not the bends of a smooth motion."""
+    third, fourth = (float(np.median(np.abs(np.diff(y, k)))) for k in (3, 4))
+    return fourth > ROUGH * third > 0.0
+
+
+def _repeated(y: FloatArray) -> BoolArray:
+    """Return which samples but the first repeat the one before, (n - 1,)."""
+    return np.asarray(np.abs(np.diff(y)) <= 1e-12 * float(np.ptp(y)), dtype=np.bool_)
+
+
+def _jumps(y: FloatArray, start: int, stop: int) -> tuple[float, float]:
+    """Return the jumps into and out of a run, both positive where it is off to one side."""
+    before = y[start] - y[start - 1] if start > 0 else 0.0
+    after = y[stop - 1] - y[stop] if stop < y.size else 0.0
+    sign = np.sign(before) or 1.0
+    return float(sign * before), float(sign * after)
+
+
+def _returns(y: FloatArray, start: int, stop: int, expected: float) -> bool:
+    """Whether the values before and after a run agree, but for what the voltage explains."""
+    into, out = _jumps(y, start, stop)
+    return abs(into - out) < 0.5 * min(into, out) + 1.5 * expected
+
+
+#: Readings at an end of the range that are few enough for a turn, and samples of a run that counts.
+FEWEST, LONGEST = 8, 3
+#: The motion that a run hides must exceed this share of the range, and so often the noise.
+HIDDEN = 0.02
+#: How many times what the voltage does a reading may move to an end and be no jump there.
+REACHED = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class FlatEnd:
+    """An end of a sensor's range that readings stay at: its `value`, and where they do, (n,)."""
+
+    value: float
+    where: BoolArray
+    upper: bool
+
+
+def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
+    """Return the ends of a signal's range (n,) where the sensor was saturated.
+
+    There the signal has one value, to the last digit, while the voltage moves the stack by what
+    other readings show: more than a turn does within the noise. It comes there as the stack moves;
+    what jumps there is a drop-out. Of a signal whose digits hide its noise no end is told, because
+    a drive that is saturated looks the same there.
+    """
+    span = float(np.ptp(y))
+    at = {upper: np.abs(y - (y.max() if upper else y.min())) <= 1e-12 * span for upper in (0, 1)}
+    inside = ~(at[0] | at[1])
+    slope = _slope(y, voltage, inside)
+    noise = high_frequency_noise(y[inside]) if inside.sum() >= FEWEST else 0.0
+    if noise <= last_place_of(y):  # digits that are as coarse make a drive's flat top as flat
+        return ()
+    least = max(HIDDEN * span, LIMIT * noise)
+    found = []
+    for upper, where in at.items():
+        if where.sum() < FEWEST:
+            continue
+        runs = [(a, b) for a, b in zip(*(e.tolist() for e in runs_of(where)), strict=True)]
+        moved = slope * np.array(
+            [float(np.ptp(voltage[a:b])) * (b - a >= LONGEST) for a, b in runs]
+        )
+        into = np.array([_jump(y, a) - REACHED * slope * _jump(voltage, a) for a, _ in runs])
+        jumped = sum(b - a for (a, b), j in zip(runs, into, strict=True) if j > LIMIT * noise)
+        if np.max(moved) > least and 2 * jumped < where.sum():
+            found.append(FlatEnd(float(y[where][0]), where, bool(upper)))
+    return tuple(found)
+
+
+def _jump(signal: FloatArray, at: int) -> float:
+    """Return the size of the step to a sample, 0 to the first one."""
+    return abs(float(signal[at] - signal[at - 1])) if at > 0 else 0.0
+
+
+def _slope(y: FloatArray, voltage: FloatArray, inside: BoolArray) -> float:
+    """Return the size of the regression slope of the readings that are at neither end.
+
+    Every run of them has its own centre: between two of them the stack was at its end and has come
+    back on another branch.
+    """
+    if inside.sum() < FEWEST:
+        inside = np.ones(y.size, dtype=np.bool_)
+    power = product = 0.0
+    for start, stop in zip(*(e.tolist() for e in runs_of(inside)), strict=True):
+        v, x = (s[start:stop] - np.mean(s[start:stop]) for s in (voltage, y))
+        power += float(v @ v)
+        product += float(v @ x)
+    return abs(product) / power if power > 0.0 else 0.0
+
+
+Kind = Literal["outlier", "drop-out", "stuck", "saturated"]
+
+#: Samples that a running line is laid through; no spike of up to `SPIKE` samples moves it.
+WINDOW = 13
+#: A sample is an outlier beyond `LIMIT` standard deviations of its surroundings, and beyond this
+#: share of the record's range, however quiet the sensor.
+SMALLEST = 1e-3
+#: Blocks in which the standard deviation of the surroundings is taken.
+BLOCK = 32
+_ROWS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Suspects:
+    """Samples of a record that should not count: `mask` (n,) is True for them.
+
+    `counts` holds the number of samples by kind; `quantum` the sensor's step, in `unit` as the
+    record is ("m" or "counts"), None where it shows none. `ends` are the values at which the sensor
+    was saturated.
+    """
+
+    mask: BoolArray
+    counts: dict[Kind, int]
+    quantum: float | None
+    unit: Literal["m", "counts"] = "m"
+    ends: tuple[FlatEnd, ...] = ()
+
+    def sentences(self, name: str) -> tuple[str, ...]:
+        """Return what was found in the record of that name, one sentence for each kind."""
+        said = [
+            f"{name}: {_samples(count)} {_WHAT[kind]}; masked, so that they count for nothing."
+            for kind, count in self.counts.items()
+            if count and kind != "saturated"
+        ]
+        said += self.saturation(name)
+        if self.quantum is not None:
+            scale, unit = (1e9, "nm") if self.unit == "m" else (1.0, self.unit)
+            step = f"{scale * self.quantum:.3g} {unit}"
+            said.append(f"{name}: the displacement is quantised in steps of {step}.")
+        return tuple(said)
+
+    def saturation(self, name: str) -> tuple[str, ...]:
+        """Say at which values the sensor was saturated, one sentence for each."""
+        scale, unit = (1e6, "um") if self.unit == "m" else (1.0, self.unit)
+        return tuple(
+            f"{name}: {_samples(int(end.where.sum()))} ({100.0 * float(end.where.mean()):.0f} %)"
+            f" stay at {scale * end.value:.6g} {unit}, the {'largest' if end.upper else 'smallest'}"
+            " value, while the voltage moves the stack: the sensor is saturated there; masked, so"
+            " that they count for nothing."
+            for end in self.ends
+        )
+
+
+_WHAT: dict[Kind, str] = {
+    "outlier": "stand out as spikes of at most three samples that return at once",
+    "drop-out": "belong to drop-outs, where the sensor jumps to one value and back",
+    "stuck": "repeat the last one to the last digit, as a stuck sensor does",
+}
+
+
+def suspects(record: Record) -> Suspects:
+    """Return the samples of a record that the sensor, not the stack, has made.
+
+    A record without displacement has none. Work and memory grow with the number of samples.
+    """
+    mask = np.zeros(record.n, dtype=np.bool_)
+    counts: dict[Kind, int] = {"outlier": 0, "drop-out": 0, "stuck": 0, "saturated": 0}
+    valid = np.flatnonzero(record.mask)
+    if record.displacement is None or valid.size < 2 * BLOCK:
+        return Suspects(mask, counts, None)
+    y = record.displacement[valid]
+    span = float(np.ptp(y))
+    if span <= 0:
+        return Suspects(mask, counts, None)
+    quantum = quantum_of(y)
+    stuck, dropped = equal_runs(y, record.voltage[valid], quantum)
+    stuck |= missed_a_move(y, record.voltage[valid], quantum) & ~dropped
+    stuck |= repeated_in_noise(y, record.voltage[valid], quantum) & ~dropped
+    ends = flat_ends(y, record.voltage[valid]) if quantum is None else ()
+    flat = np.any([np.zeros(valid.size, dtype=np.bool_), *(e.where for e in ends)], axis=0)
+    stuck, dropped = stuck & ~flat, dropped & ~flat
+    rest = ~(stuck | dropped)
+    outlying = np.zeros(valid.size, dtype=np.bool_)
+    outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
+    outlying &= ~flat
+    kinds: dict[Kind, NDArray[np.bool_]]
+    kinds = {"outlier": outlying, "drop-out": dropped, "stuck": stuck, "saturated": flat}
+    for kind, found in kinds.items():
+        counts[kind] = int(found.sum())
+        mask[valid[found]] = True
+    return Suspects(mask, counts, quantum, record.displacement_unit, ends)
+
+
+def cleaned(record: Record) -> Record:
+    """Return the record with suspect samples masked (nan); name and `sha256` are kept."""
+    return masked(record, suspects(record))
+
+
+def masked(record: Record, found: Suspects) -> Record:
+    """Return the record with the samples that were found suspect masked (nan)."""
+    if record.displacement is None or not found.mask.any():
+        return record
+    return replace(record, displacement=np.where(found.mask, np.nan, record.displacement))
+
+
+def _outliers(
+    record: Record, valid: NDArray[np.int64], y: FloatArray, quantum: float | None
+) -> BoolArray:
+    """Return which of the valid samples are spikes: Hampel's rule with the scale around them."""
+    away = _away_from_surroundings(y)
+    scale = np.maximum(_scale(away), 0.5 * (quantum or 0.0))
+    allowed = np.maximum(LIMIT * scale, SMALLEST * float(np.ptp(y)))
+    allowed = np.maximum(allowed, _explained(record)[valid])
+    found = np.abs(away) > allowed
+    for start, stop in zip(*(ends.tolist() for ends in runs_of(found)), strict=True):
+        sign = np.sign(away[start])
+        around = -sign * np.r_[away[max(0, start - SPIKE) : start], away[stop : stop + SPIKE]]
+        swings = around.size > 0 and float(np.max(around)) > 0.4 * abs(away[start])
+        if stop - start > SPIKE or swings:
+            found[start:stop] = False
+    return found
+
+
+def _away_from_surroundings(y: FloatArray) -> FloatArray:
+    """Return each sample's distance from the straight line through the samples around it, (n,).
+
+    The slope is the median of the slopes between samples `WINDOW // 2` apart, the height the median
+    of the window less that slope: neither is moved by a spike of up to `SPIKE` samples.
+    """
+    half = WINDOW // 2
+    steps = np.arange(-half, half + 1)
+    padded = np.pad(y, half, mode="reflect", reflect_type="odd")
+    away = np.empty(y.size)
+    for start in range(0, y.size, _ROWS):
+        part = padded[start : start + _ROWS + 2 * half]
+        window = np.lib.stride_tricks.sliding_window_view(part, WINDOW)
+        slope = np.median(window[:, half:] - window[:, : half + 1], axis=1) / half
+        level = np.median(window - slope[:, None] * steps, axis=1)
+        away[start : start + _ROWS] = window[:, half] - level
+    return away
+
+
+def _scale(away: FloatArray) -> FloatArray:
+    """Return the robust standard deviation around every sample: the largest of three blocks'."""
+    count = max(1, away.size // BLOCK)
+    blocks = np.array_split(np.abs(away), count)
+    each = np.array([1.4826 * np.median(b) for b in blocks])
+    each = np.maximum(scipy.ndimage.maximum_filter1d(each, 3, mode="nearest"), np.median(each))
+    return np.repeat(each, [b.size for b in blocks])
+
+
+def _explained(record: Record) -> FloatArray:
+    """Return how far the displacement may leave its surroundings after a sudden change, (n,).
+
+    Four times what the usual slope makes of a bend of the voltage that stands out from the bends
+    around it; without limit after a sudden change of the load force.
+    """
+    y, reach = record.displacement, float(np.ptp(record.voltage))
+    slope = float(np.nanmax(y) - np.nanmin(y)) / reach if y is not None and reach > 0 else 0.0
+    limits = 4.0 * slope * _sudden(record.voltage)
+    if record.load_force is not None:
+        limits[_sudden(record.load_force) > 0] = np.inf
+    limits[0] = max(limits[0], slope * reach)  # a record may begin while the stack still moves
+    fading = [share * _highest(limits, after) for share, after in AFTER]
+    return np.asarray(np.max(fading, axis=0), dtype=float)
+
+
+def _highest(limits: FloatArray, after: int) -> FloatArray:
+    """Return the largest limit from `after` samples before each one to BEFORE after it, (n,)."""
+    width, origin = BEFORE + after + 1, (after - BEFORE) // 2
+    return scipy.ndimage.maximum_filter1d(limits, width, mode="nearest", origin=origin)
+
+
+def _sudden(signal: FloatArray) -> FloatArray:
+    """Return the size of a signal's bends where they stand out from those around them, else 0."""
+    bend = np.zeros(signal.size)
+    bend[1:-1] = np.abs(np.diff(signal, 2))
+    around = _scale(bend) / 1.4826
+    return np.where(bend > np.maximum(6.0 * around, 1e-6 * np.ptp(signal)), bend, 0.0)
+
+
+def _samples(count: int) -> str:
+    return "1 sample" if count == 1 else f"{count} samples"

@@ -1,0 +1,311 @@
+"""The sentences of notes: what each code says, with the note's values in its places."""
+
+from collections.abc import Callable, Mapping, Sequence
+from string import Formatter
+from typing import Any
+
+from psa_casadi.notes import Note
+from psa_casadi.report.words.advice_words import IDENTIFICATION
+from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
+from psa_casadi.report.words.own_words import OWN_MODELS
+from psa_casadi.report.words.phrases import quantity, raised, with_unit
+
+Probable = Sequence[tuple[str, float]]
+
+#: What the places are called that effects belong to.
+PLACES = {
+    "drive": "the amplifier",
+    "sensor": "the sensor",
+    "plant": "the stack with its load",
+    "environment": "the surroundings",
+}
+#: Unnamed corrections by kind, and where that leaves it open by port.
+CORRECTIONS: Mapping[str, str] = {
+    "curve at drive voltage": "a bent curve of the drive voltage",
+    "curve at reading": "a bent curve of the displacement",
+    "curve at force": "a bent curve of the force",
+    "direction": "a difference between the branches",
+    "memory": "a memory of past reversals",
+    "relaxation": "a lag or creep over decades of time",
+    "modes": "further resonances",
+    "time": "a change with time that does not follow the voltage",
+    "gain in time": "a sensitivity that changes with time",
+}
+_SEEN = {
+    "correlation": "neighbouring samples are correlated",
+    "line": "its spectrum has a line",
+    "drive": "it depends on voltage, rate or time",
+    "size": "the size depends on voltage, rate or time",
+}
+_LACKING = {
+    "hold": "a hold of several seconds, which separates creep and drift",
+    "rates": "the same loop at three rates, which separate delay, lag and creep",
+    "amplitudes": "the loop at three amplitudes, which separate asymmetry and memory",
+    "repeats": "a voltage that repeats, which shows the noise",
+}
+
+
+def correction(kind: str, port: str) -> str:
+    """Return what an unnamed correction is."""
+    return CORRECTIONS.get(kind) or CORRECTIONS.get(f"{kind} at {port}", kind)
+
+
+def _structure(seen: str, output: str, excess: float) -> str:
+    of = f"Of {output}: in" if output else "In"
+    return (
+        f"{of} the residual {_SEEN[seen]}. {100.0 * excess:.0f} % of its power is above the noise."
+    )
+
+
+def _noise(
+    record: str,
+    level: tuple[float, str],
+    how: Note,
+    samples: int,
+    coloured: bool,
+    quantum: tuple[float, str] | None,
+    rounding: tuple[float, str],
+) -> str:
+    colour = "correlated from sample to sample" if coloured else "white"
+    said = (
+        f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples), and {colour}."
+    )
+    if quantum is None:
+        return said
+    return (
+        f"{said} The sensor counts in steps of {quantity(*quantum)}, which alone give"
+        f" {quantity(*rounding)} rms."
+    )
+
+
+def _withdrawn(names: Sequence[str], evidence: float, share: float, kept: bool, why: Note) -> str:
+    remove = "would remove"
+    if kept:
+        they = "it removes" if len(names) == 1 else "they remove"
+        remove = f"in the extended model, where {they}"
+    joint = ": " if why.code == "better_unnamed" else ", because "
+    return (
+        f"{', '.join(names)}: found with a ln of the Bayes factor over the base of {evidence:.0f},"
+        f" {remove} {100 * share:.0f} % of the held-out error above the noise; not"
+        f" named{joint}{why}."
+    )
+
+
+def _better_unnamed(each: Sequence[tuple[str, str, str, bool]]) -> str:
+    better = "; ".join(
+        f"{correction(kind, port)}, {'freer in form than' if freer else 'instead of'} {name}"
+        for kind, port, name, freer in each
+    )
+    return f"beside the model without it, an unnamed correction explains more ({better})"
+
+
+def _beaten(by: str, port: str, evidence: float, share: float) -> str:
+    return (
+        f"an unnamed correction explains more: {correction(by, port)}, with {evidence:.0f} and"
+        f" {100 * share:.0f} %"
+    )
+
+
+def _lacking(what: Sequence[str]) -> str:
+    *before, last = (_LACKING[w] for w in what)
+    joined = f"{'; '.join(before)}; and {last}" if before else last
+    return f"Record what these records lack: {joined}."
+
+
+def _before(then: Probable) -> str:
+    return ", ".join(f"{name} {100 * p:.0f} %" for name, p in then)
+
+
+def _rules_out(
+    column: str, places: Sequence[str], effects: Sequence[str], now: Sequence[str], before: Probable
+) -> str:
+    ruled = [PLACES[p] for p in places] or effects
+    verb = "is" if len(ruled) == 1 else "are"
+    return (
+        f"With {column} {' and '.join(ruled)} {verb} ruled out: what is left is"
+        f" {' or '.join(now)} (without it: {_before(before)})."
+    )
+
+
+DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
+    # what remains
+    "noise_only": "What remains cannot be distinguished from noise.",
+    "structure": _structure,
+    "held_out_error": (
+        "The held-out samples' error is {factor:.2f} times what the fitted ones let expect:"
+        " something matters there that these do not show."
+    ),
+    # what was done to the records
+    "coarse": (
+        "{record}: the sensor resolves {steps:.0f} steps over the whole range. They make up the"
+        " model's error: nothing smaller can be distinguished from them."
+    ),
+    "stuck": (
+        "{count} readings repeat the last one far from the model, as a stuck sensor does; masked."
+    ),
+    "smooth_voltage": (
+        "Between its samples the voltage follows a smooth curve, not straight lines, of whose"
+        " difference the base model's error held {share:.2f} ({low:.2f} to {high:.2f}): the model"
+        " is driven by the curve, and a simulation of such a record needs more samples for each"
+        " period."
+    ),
+    "noise": _noise,
+    "noise_fast": "from the fast part of what the model leaves",
+    "noise_repeats": "from what differs when the same voltage returns after {apart}",
+    "noise_holds": lambda count: (
+        f"from {'a held voltage' if count == 1 else f'{count} held voltages'} after smooth creep is"
+        " taken off"
+    ),
+    # does the displacement follow the voltage?
+    "flipped": (
+        "With the sign of the displacement flipped the base model explains {flipped:.2p} % of its"
+        " variance, as given {share:.2p} %: the sensor or the voltage is probably connected the"
+        " other way round."
+    ),
+    "filtered": (
+        "A linear filter of the voltage explains {linear:.0p} % of the displacement's variance, the"
+        " base model {share:.0p} %: the two belong together, but with dynamics that the base model"
+        " does not have (several resonances, a delay, perhaps the other sign). No causes were"
+        " sought."
+    ),
+    "not_driven": (
+        "The voltage explains {share:.0p} % of the displacement's variance, and no more with the"
+        " other sign: check that both columns are of the same device and the same time."
+    ),
+    # why held-out samples do not confirm a cause
+    "few_held_out": (
+        "only {count} of the readings that count are held out, and no model can be judged by fewer"
+        " than {least}"
+    ),
+    "saturated": (
+        "the sensor is saturated in {share:.0p} % of the readings, so that more of the motion is"
+        " hidden than shown"
+    ),
+    "gain_unknown": (
+        "the 95 % interval of the held-out gain, {low:.0f} to {high:.0f} %, reaches from an error"
+        " that doubles to noise alone, and most held-out samples lose by it"
+    ),
+    "no_such_voltage": (
+        "no stack bears such a voltage, and what depends on its level cannot be told"
+    ),
+    "other_quantity": "much would remain, and the displacement may be another quantity",
+    "held_out_says_little": lambda why: f"{raised(str(why))}: the held-out error says little.",
+    "extrapolates": (
+        "{share:.0p} % of the held-out samples are of a kind that no fitted sample shows"
+        " ({kinds: and }): there the held-out error extrapolates."
+    ),
+    "not_held_out": (
+        "{share:.0p} % of the fitted samples are of a kind that is not held out ({kinds: and }):"
+        " the held-out error says nothing of it."
+    ),
+    "voltages_beyond": (
+        "Held-out voltages go from {least:.4g} to {most:.4g} V, fitted ones from {low:.4g} to"
+        " {high:.4g} V: beyond these the held-out error extrapolates."
+    ),
+    # causes that are not named
+    "small": (
+        "{effect} is in the extended model and removes {share:.0p} % of the held-out error above"
+        " the noise. It is not named: structure remains, and so little may only correct the form of"
+        " what is named."
+    ),
+    "withdrawn": _withdrawn,
+    "vague": "{names}: in the extended model and not named: {why}.",
+    "better_unnamed": _better_unnamed,
+    "beaten": _beaten,
+    "little": "that is less than {least:.0p} % and much remains",
+    "correction": correction,
+    "blind_spot": (
+        "These records show {effect} only from {smallest:.3g} on ({gain}), while {ordinary:.3g} is"
+        " an ordinary size."
+    ),
+    "blind": (
+        "These records show {effect} at no size ({gain}), while {ordinary:.3g} is an ordinary size."
+    ),
+    # what a further column decided
+    "column_agrees": ("{column} agrees with the model: with it as without it nothing is named."),
+    "column_decides_nothing": ("{column} decides nothing: with it as without it nothing is named."),
+    "column_adds": (
+        "{column} changes no name; it adds {gained:.0f} to the ln of the Bayes factor."
+    ),
+    "column_holds": lambda column, effect, before: (
+        f"{column} explains by itself what without it is named ({_before(before)}): {effect} is in"
+        " the column."
+    ),
+    "column_names": lambda column, new, then: (
+        f"Only with {column} is there {' or '.join(new)}; without it"
+        f" {' or '.join(then) or 'nothing is named'}."
+    ),
+    "column_clears": lambda column, before: (
+        f"With {column} nothing is named; without it {_before(before)}."
+    ),
+    "column_rules_out": _rules_out,
+    # what to do next
+    "record_again": (
+        "Correct the record, or record again, so that what the verdict says of it no longer holds."
+    ),
+    "correct_columns": "Correct the record as the notes say, and diagnose it again.",
+    "no_next": "None is needed for this verdict.",
+    "lacking": _lacking,
+    "other_conditions": (
+        "These records hold what usually separates causes: a hold, several rates and amplitudes,"
+        " repeats. Record the same voltage with another load, mean voltage or sensor, or a further"
+        " column (current, charge, a second displacement)."
+    ),
+    "same_curve": (
+        "{effects: and } bend the same curve: no voltage below the resonances tells one from"
+        " another. Measure the displacement with a second sensor (column displacement_2) or the"
+        " load's force (load_force), elsewhere in the range of this sensor, or without the load;"
+        " or sample fast enough to excite and see the resonances."
+    ),
+}
+
+
+#: A code's sentence: a template with the values' names, or what makes it of the values.
+Sentence = str | Callable[..., str]
+SENTENCES: Mapping[str, Sentence] = {
+    **DIAGNOSIS,
+    **IDENTIFICATION,
+    **MISFIT,
+    **OWN_MODELS,
+}
+
+
+class _Words(Formatter):
+    """Formats quantities `(value, unit)` with their units, and names in a row.
+
+    What follows the colon is a number's format, ".0p" that of a percentage without its sign, or
+    what stands between names, ", " by default.
+    """
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, tuple):
+            if len(value) == 2 and isinstance(value[0], float) and isinstance(value[1], str):
+                if format_spec:
+                    return with_unit(format(value[0], format_spec), value[1])
+                return quantity(*value)
+            return (format_spec or ", ").join(map(str, value))
+        if format_spec.endswith("p"):
+            return format(100.0 * value, f"{format_spec[:-1]}f")
+        return format(str(value) if isinstance(value, Note) else value, format_spec)
+
+
+_WORDS = _Words()
+
+
+def note_text(said: Note) -> str:
+    """Return the sentence of a note; within a page its lengths are in the page's unit."""
+    return _head(said) + (ENDINGS[said.code](said.values["share"]) if said.code in ENDINGS else "")
+
+
+def brief_text(said: Note) -> str:
+    """Return the sentence of a finding in a residual, with the share it explains in brackets."""
+    if said.code not in ENDINGS:
+        return note_text(said)
+    return f"{_head(said)} ({100.0 * said.values['share']:.0f} % of the excess)."
+
+
+def _head(said: Note) -> str:
+    sentence = SENTENCES[said.code]
+    if isinstance(sentence, str):
+        return _WORDS.vformat(sentence, (), said.values)
+    return sentence(**said.values)
