@@ -12,8 +12,8 @@ from psa_casadi.diagnosis.remedy import example
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES
-from psa_casadi.report.page.playground_page import playground
-from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
+from psa_casadi.report.page.playground import playground
+from psa_casadi.report.plots.figures import save_signature, size_sentence
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size
 from psa_casadi.report.words.tables import Table, effect_parameter_table
 

@@ -21,6 +21,7 @@ first used, so that importing the package is quick.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import psa_casadi.shown  # where the reports are registered
 from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
@@ -76,12 +77,11 @@ if TYPE_CHECKING:
     )
     from psa_casadi.records.signals import Signals
     from psa_casadi.report.documents.findings import read_findings
-    from psa_casadi.report.documents.load_diagnosis import load_diagnosis
-    from psa_casadi.report.page.comparison_page import write_comparison
-    from psa_casadi.report.page.diagnosis import write_report
-    from psa_casadi.report.page.fit_page import write_fit_report
-    from psa_casadi.report.page.population_page import write_population
-    from psa_casadi.report.plots.figure import save_figure
+    from psa_casadi.report.documents.reading import load_diagnosis
+    from psa_casadi.report.page.devices import write_comparison, write_population
+    from psa_casadi.report.page.results import write_fit_report, write_report
+    from psa_casadi.report.plots.figures import save_figure
+    from psa_casadi.report.shown import report
     from psa_casadi.report.words.text import story
     from psa_casadi.simulation.history import memory_after, settled_at
     from psa_casadi.simulation.many import simulate_many
@@ -178,15 +178,13 @@ _HOMES = {
     "psa_casadi.diagnosis.verdict": ("patched_model",),
     "psa_casadi.diagnosis.result": ("Diagnosis",),
     "psa_casadi.report.words.text": ("story",),
-    "psa_casadi.report.plots.figure": ("save_figure",),
-    "psa_casadi.report.page.diagnosis": ("write_report",),
+    "psa_casadi.report.plots.figures": ("save_figure",),
+    "psa_casadi.report.page.results": ("write_report", "write_fit_report"),
     "psa_casadi.devices.batch": ("BatchRun", "batch"),
     "psa_casadi.devices.jobs": ("Job", "Options"),
     "psa_casadi.report.documents.findings": ("read_findings",),
-    "psa_casadi.report.documents.load_diagnosis": ("load_diagnosis",),
-    "psa_casadi.report.page.comparison_page": ("write_comparison",),
-    "psa_casadi.report.page.population_page": ("write_population",),
-    "psa_casadi.report.page.fit_page": ("write_fit_report",),
+    "psa_casadi.report.documents.reading": ("load_diagnosis",),
+    "psa_casadi.report.page.devices": ("write_comparison", "write_population"),
     "psa_casadi.export.fixed_step.export": ("CodeExport", "export_c"),
     "psa_casadi.export.fmu.archive": ("export_fmu",),
     "psa_casadi.export.modelica.package": ("export_modelica",),
@@ -260,6 +258,7 @@ __all__ = [
     "timed",
     "Timings",
     "story",
+    "report",
     "save_figure",
     "write_report",
     "write_fit_report",
@@ -296,8 +295,8 @@ __all__ = [
     "system",
     "__version__",
 ]
-#: Packages and modules that are public as such.
-_SPACES = ("datasets", "design", "online", "system")
+#: Packages and modules that are public as such; `report` is called too.
+_SPACES = ("datasets", "design", "online", "report", "system")
 
 
 def __getattr__(name: str) -> Any:
@@ -309,6 +308,14 @@ def __getattr__(name: str) -> Any:
     value = getattr(import_module(_HOME_OF[name]), name)
     globals()[name] = value
     return value
+
+
+def _show(what: str, *given: Any, **options: Any) -> Any:
+    """Make what a result shows of itself."""
+    return getattr(import_module("psa_casadi.report.shown"), what)(*given, **options)
+
+
+psa_casadi.shown.register(_show)
 
 
 def __dir__() -> list[str]:

@@ -89,7 +89,7 @@ class Equations:
 class Remedy:
     """What to do about an effect, as a code, and the test that shows how large the effect is.
 
-    The words of a code are in `report.words.remedies`, the tests in `diagnosis.remedy.trials`.
+    The words of a code are in `report.words.remedy_words`, the tests in `diagnosis.remedy`.
     """
 
     code: str

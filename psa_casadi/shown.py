@@ -1,11 +1,7 @@
-"""How a result shows itself: made on the floor of reports, asked for where the result lives.
-
-Imports point down, and a picture or a page stands above what it shows. A result only knows the
-name of what makes it.
-"""
+"""What results show of themselves: how is made by the reports, which stand above them."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,7 +9,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_HOME = "psa_casadi.report.shown"
 _WORDS = "psa_casadi.report.words.advice_words"
 
 
@@ -24,6 +19,15 @@ class Worded:
     def sentence(self) -> str:
         """The result in words."""
         return str(import_module(_WORDS).sentence_of(self))
+
+
+_made: Callable[..., Any]
+
+
+def register(make: Callable[..., Any]) -> None:
+    """Register what makes the "line", "cell", "plot" or "report" of a result."""
+    global _made  # noqa: PLW0603 - one function for all results
+    _made = make
 
 
 class Celled:
@@ -67,24 +71,12 @@ class Reported(Shown):
     def report(self, path: str | os.PathLike[str], *, still: bool = False) -> None:
         """Write the page, one HTML file below 3 MB that needs no network.
 
-        The model runs in the page unless it is to be `still`.
+        The model of a stack runs in the page unless it is to be `still`.
 
         Raises:
             InputError: `path` cannot be written to.
         """
-        _made("page", self, path, still)
-
-
-class StillReported(Shown):
-    """What a result can show of itself whose page holds no model that runs."""
-
-    def report(self, path: str | os.PathLike[str]) -> None:
-        """Write the page, one HTML file below 3 MB that needs no network.
-
-        Raises:
-            InputError: `path` cannot be written to.
-        """
-        _made("page", self, path, True)
+        _made("report", self, path, still=still)
 
 
 def with_units(columns: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, Any]:
@@ -101,7 +93,3 @@ def frame(columns: dict[str, Any]) -> Any:
             "A data frame needs pandas: run `pip install 'psa-casadi[pandas]'`."
         ) from error
     return pandas.DataFrame(columns)
-
-
-def _made(what: str, *given: Any) -> Any:
-    return getattr(import_module(_HOME), what)(*given)

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.diagnosis.evidence import diagnosis_evidence
+from psa_casadi.diagnosis.evidence import diagnosed_model
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
@@ -40,10 +38,7 @@ def evident_model() -> Model:
     start = stack_model("demo")
     begun = {n: 1.05 * start.values[n] for n in ("k_L", "A", "tau")}
     found = fit(start, experiments, list(begun), sigma=[NOISE], start=begun)
-    told = determinacy(found, experiments)
-    predicted = found.predicted(experiments)
-    evidence = diagnosis_evidence(found, told, experiments, predicted)
-    return with_provenance(found.model, told, [record], False, evidence=evidence)
+    return diagnosed_model(found, experiments, found.predicted(experiments), False)
 
 
 @cache

@@ -13,7 +13,7 @@ import numpy as np
 
 from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
-from psa_casadi.report.page.live_data import doubles, live_data
+from psa_casadi.report.page.live import doubles, live_data
 from psa_casadi.units import FloatArray
 from tests.browser import Browser
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.page.fit_page import write_fit_report
+from psa_casadi.report.page.results import write_fit_report, write_report
 from tests.browser import DARK, MOUSE, Browser, find_browser
 from tests.report_cases import diagnosis, identification
 from tests.tiers import slow

@@ -9,7 +9,6 @@ from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.components import BASE
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.screening import levelled
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
@@ -25,14 +24,6 @@ from tests.tiers import slow
 
 TABLE = tuple(EFFECTS.values())
 BENDS = ("load_stiffness", "sensor_nonlinearity")
-
-
-def test_the_best_evidence_counts_for_all_of_a_group() -> None:
-    given = {"a": 3.0, "b": 7.0, "c": 5.0}
-    assert levelled(given, [("a", "b"), ("d",)]) == {"a": 7.0, "b": 7.0, "c": 5.0}
-    assert levelled(given, []) == given
-    # of effects fitted in full the best one counts, whatever a linear estimate of another says
-    assert levelled(given, [("a", "b")], judged=["a"]) == {"a": 3.0, "b": 3.0, "c": 5.0}
 
 
 @pytest.mark.parametrize(

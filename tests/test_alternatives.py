@@ -76,10 +76,3 @@ def test_the_command_writes_the_other_model_beside_the_extended_one(tmp_path: Pa
     )
     assert again.exit_code == 2
     assert "could overwrite it" in " ".join(again.output.split())
-
-
-def test_sensor_and_environment_stay_out_of_a_plant() -> None:
-    assert not EFFECTS["sensor_nonlinearity"].in_plant
-    assert not EFFECTS["mains_hum"].in_plant
-    assert EFFECTS["load_stiffness"].in_plant
-    assert EFFECTS["drive_lag"].in_plant

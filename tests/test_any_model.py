@@ -20,12 +20,11 @@ from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.predict import Sizes, sizes_of
 from psa_casadi.any_model.runs import runs_of
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.ports import ports_of, with_ports
+from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.own_words import own_verdict_sentence
 from tests import own_plants as plants
 from tests.browser import DARK, find_browser
-from tests.fmu_models import model_named
 from tests.html_page import Page, figures, numbers
 from tests.modelica_runs import load
 from tests.own_models import motor, oscillator, pair, tanks
@@ -209,18 +208,6 @@ def _is_adequate_without_friction(model: psa.Model) -> None:
 
 
 @pytest.mark.slow
-def test_a_bent_sensor_and_an_overflow_of_tanks_are_told_apart() -> None:
-    unlike = ["lag", "delay", "loss", "drag", "dead_zone", "drift"]
-    bent = psa.diagnose(tanks(), plants.tanks(3, "sensor"), leave_out=unlike)
-    assert _only(bent, "bend_of_level")
-    assert bent.causes[0].belongs_to == "sensor"
-    over = psa.diagnose(tanks(), plants.tanks(3, "overflow"), leave_out=unlike)
-    assert over.verdict in ("cause_named", "partly_explained")
-    assert [c.effect for c in over.causes] == ["stop_of_h1_in_h1"]
-    assert over.causes[0].explained_share > 0.95
-
-
-@pytest.mark.slow
 @shares_hysteresis
 def test_a_cause_that_no_effect_has_is_unexplained() -> None:
     d = psa.diagnose(oscillator(), plants.breathing(4))
@@ -267,11 +254,6 @@ def _quiet(model: psa.Model) -> Signals:
     )
 
 
-def test_a_rate_that_is_another_state_is_no_port() -> None:
-    places = {(p.kind, p.variable) for p in ports_of(oscillator())}
-    assert places == {("input", "force"), ("rate", "v"), ("output", "position")}
-
-
 def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
     x, v, u, k = (ca.SX.sym(n) for n in ("x", "v", "u", "k"))
     model = psa.ode_model(
@@ -299,13 +281,6 @@ def test_the_help_of_both_faces_tells_of_own_models() -> None:
     for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
         assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
         assert str(face.__doc__).count(word) >= 2  # in the signature and in words
-
-
-def test_the_stiffness_of_an_own_model_is_not_that_of_a_stack() -> None:
-    assert "of the stack" not in modelica_text(oscillator(), name="Oscillator")
-    assert "static stiffness of the stack" in modelica_text(
-        model_named("single_mass"), name="Stack"
-    )
 
 
 def test_records_that_do_not_fit_are_refused_in_sentences(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.model.model_file import load_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import write_record
+from psa_casadi.report.documents.files import identification_file
 from psa_casadi.report.documents.findings import read_findings
-from psa_casadi.report.documents.identification_file import identification_file
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.strict_json import json_text

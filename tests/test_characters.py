@@ -27,7 +27,7 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record
-from psa_casadi.report.page.document import Document
+from psa_casadi.report.page.document import render
 from psa_casadi.report.words.tables import Table
 from psa_casadi.variables import Parameter
 from tests.record_files import HEADER, ROWS, write
@@ -114,7 +114,7 @@ def test_the_name_of_a_file_may_be_any_bytes(tmp_path: Path) -> None:
 
 
 def test_a_page_shows_a_mark_for_what_html_cannot_carry() -> None:
-    page = Document("a\0b", ()).text()
+    page = render("base.html", "a\0b")
     assert "\0" not in page
     assert "<title>a\ufffdb</title>" in page
     assert plain(CARRIED) == CARRIED

@@ -17,7 +17,7 @@ from psa_casadi.identification import identify
 from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.records import read_record, sine, time_grid, write_record
-from psa_casadi.report.page import playground_page
+from psa_casadi.report.page import playground
 from psa_casadi.report.words.tables import Table, effects_table
 from psa_casadi.simulation.simulate import simulate_record
 from tests.record_files import HEADER, ROWS, write
@@ -132,7 +132,7 @@ def test_the_playground_and_a_posterior_take_a_model(
 ) -> None:
     file, played = tmp_path / "model.json", []
     save_model(stack_model("demo"), file)
-    monkeypatch.setattr(playground_page, "write_playground", lambda *given: played.append(given))
+    monkeypatch.setattr(playground, "write_playground", lambda *given: played.append(given))
     assert psa("web", *way, file, "-o", tmp_path / "p.html").exit_code == 0
     ((path, model),) = played
     assert path == tmp_path / "p.html"

@@ -16,10 +16,9 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps
 from psa_casadi.population.finding import Finding, Found, replayed
 from psa_casadi.population.population import population
+from psa_casadi.report.documents.files import identification_file
 from psa_casadi.report.documents.findings import read_findings
-from psa_casadi.report.documents.identification_file import identification_file
-from psa_casadi.report.page.comparison_page import MOST, write_comparison
-from psa_casadi.report.page.population_page import write_population
+from psa_casadi.report.page.devices import MOST, write_comparison, write_population
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot
 from psa_casadi.strict_json import json_text
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone
@@ -169,13 +168,13 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
     spread = next(s for s in found.spreads if s.estimates.name == "k_L")
     for plot in (spread_plot(found, spread), drift_plot(found, spread)):
         others, apart = plot.data
-        assert apart.name == "stands out"
-        assert [t.strip() for t in apart.text] == list(apart.hovertext) == ["d5"]
-        assert (len(others.x), set(others.text)) == (39, {""})
+        assert apart["name"] == "stands out"
+        assert [t.strip() for t in apart["text"]] == apart["hovertext"] == ["d5"]
+        assert (len(others["x"]), set(others["text"])) == (39, {""})
     # found in this parameter by itself, and not among all tests
     assert spread.far.found.sum() == 1
     (only,) = spread_plot(replace(found, outliers=()), spread).data
-    assert (only.name, len(only.x)) == ("belongs to the others", 40)
+    assert (only["name"], len(only["x"])) == ("belongs to the others", 40)
 
 
 @slow

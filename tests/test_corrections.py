@@ -1,16 +1,14 @@
 """Unnamed corrections find their own kind and port, keep silent on noise, and weigh on names."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.corrections import Correction, corrections
+from psa_casadi.diagnosis.corrections import corrections
 from psa_casadi.diagnosis.held_out import budget, held_out_rms
-from psa_casadi.diagnosis.judgement import Weighed
 from psa_casadi.diagnosis.patch import patch_of, with_patch
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -127,33 +125,6 @@ def test_noise_gets_no_correction(clean: FloatArray) -> None:
     seen = corrections(found, experiments, colour)
     assert max(c.evidence for c in seen) < 3.0
     assert patch_of(seen, experiments, _held(found, experiments), colour) is None
-
-
-def test_a_correction_takes_names_away_only_where_it_clearly_explains_more(
-    clean: FloatArray,
-) -> None:
-    found, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
-    first, second, *_ = corrections(found, experiments, colour)
-    first, second = (
-        replace(c, evidence=e, copies=s) for c, e, s in ((first, 900.0, 0.5), (second, 500.0, 0.9))
-    )
-
-    def beaten(evidence: float, share: float, given: tuple[Correction, ...]) -> Correction | None:
-        return Weighed(evidence, 1, share, given, [0.9] * len(given)).beaten_by()
-
-    assert beaten(700.0, 0.8, (first, second)) is first
-    assert beaten(895.0, 0.8, (first, second)) is None
-    own_kind = (replace(first, copies=0.95), second)
-    assert beaten(700.0, 0.8, own_kind) is None
-    assert beaten(700.0, 0.3, own_kind) is own_kind[0]
-    assert Weighed(700.0, 1, 0.8, (first,), [-0.1]).beaten_by() is None
-    # held-out data know of no more that it explains, whatever its evidence: by 5 % at least
-    assert beaten(700.0, 0.87, (first, second)) is None
-    # two that can add nearly all that the names add: both only have more freedom
-    both = tuple(replace(c, evidence=900.0, copies=s) for c, s in ((first, 0.96), (second, 0.99)))
-    assert beaten(500.0, 0.7, both) is None
-    assert beaten(500.0, 0.4, both) is both[0]
-    assert Weighed(0.0, 0, 0.0, (), ()).beaten_by() is None
 
 
 def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:

@@ -31,7 +31,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record
-from psa_casadi.report.page.experiment_part import sentences
+from psa_casadi.report.words.design_words import sentences
 from psa_casadi.units import FloatArray
 
 STACK = "P-885.51"

@@ -1,16 +1,14 @@
 """The parts of a diagnosis: noise colour, omnibus, drive harmonics, choice, blind spots, JSON."""
 
-import json
 from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.colour import colour_of, omnibus
 from psa_casadi.diagnosis.held_out import gain_of, lost_elsewhere
-from psa_casadi.records.drive import among_harmonics, drive_frequency, mains_line
+from psa_casadi.records.drive import among_harmonics, mains_line
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -30,32 +28,6 @@ def ar1(correlation: float, rng: np.random.Generator) -> FloatArray:
     for k in range(1, N):
         out[k] = correlation * out[k - 1] + white[k]
     return out
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.7])
-def test_colour_is_estimated_and_removed(correlation: float) -> None:
-    noise = ar1(correlation, np.random.default_rng(3))
-    colour = colour_of(noise, [N])
-    assert sum(colour.autoregression[0]) == pytest.approx(correlation, abs=0.05)
-    assert colour.inflation == pytest.approx((1 + correlation) / (1 - correlation), rel=0.2)
-    assert colour.level == pytest.approx(1.0, rel=0.05)
-    white = colour.whiten(noise)
-    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.05
-
-
-def test_a_known_colour_is_taken_and_the_level_follows() -> None:
-    """Two records, one of known second-order colour: the other's is estimated from itself."""
-    rng = np.random.default_rng(8)
-    a = np.array([0.9, -0.5])
-    coloured = np.asarray(lfilter([1.0], [1.0, -a[0], -a[1]], rng.standard_normal(N)))
-    both = np.concatenate([coloured, ar1(0.6, rng)])
-    colour = colour_of(both, [N, N], [a, None])
-    assert colour.autoregression[1] == pytest.approx([0.6], abs=0.05)
-    assert colour.level == pytest.approx(1.0, rel=0.03)
-    white = colour.whiten(both[:, None])[:, 0]
-    for part in (white[:N], white[N:]):
-        r = [np.corrcoef(part[k:], part[:-k])[0, 1] for k in (1, 2, 3)]
-        assert max(np.abs(r)) < 0.05
 
 
 def _test(residual: FloatArray) -> float:
@@ -84,18 +56,6 @@ def test_omnibus_is_quiet_on_noise(correlation: float) -> None:
 def test_omnibus_sees_structure(structure: Callable[[FloatArray], FloatArray]) -> None:
     time = grid(1e-3)
     assert _test(np.random.default_rng(1).standard_normal(N) + structure(time)) < 1e-3
-
-
-def test_harmonics_of_a_periodic_drive_are_known_and_those_of_noise_are_not() -> None:
-    time = grid(5e-3)
-    sine = Record(name="sine", time=time, voltage=1.8 - 1.8 * np.cos(2 * np.pi * time))
-    assert drive_frequency(sine) == pytest.approx(1.0, rel=0.02)
-    assert among_harmonics(2.02, sine)
-    assert among_harmonics(6.6, sine)
-    assert not among_harmonics(57.9, sine)
-    noise = Record(name="noise", time=time, voltage=np.random.default_rng(0).standard_normal(N))
-    assert drive_frequency(noise) is None
-    assert not among_harmonics(2.0, noise)
 
 
 def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> None:
@@ -156,39 +116,6 @@ def test_what_the_other_parts_lose_is_counted_without_the_one_that_gains_most() 
     lost = lost_elsewhere([experiment], [base], [after], 2.0)
     assert lost == pytest.approx(875 / 2.0 * np.log(1.1))
     assert lost_elsewhere([experiment], [base], [np.ones(N)], 2.0) == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> psa.Diagnosis:
-    path = tmp_path_factory.mktemp("clean") / "clean.csv"
-    make_record(None, 11, path)
-    return psa.diagnose([psa.read_record(path)])
-
-
-@slow
-def test_diagnosis_json_has_every_field_of_the_promise(clean: psa.Diagnosis) -> None:
-    content = json.loads(clean.to_json())
-    assert content["format"] == "psa_casadi.diagnosis/1"
-    assert {"verdict", "causes", "candidates", "errors", "gain", "blind_to", "remaining"} <= set(
-        content
-    )
-    assert set(content["errors"]["base"]) == {
-        "train_rms_m",
-        "holdout_rms_m",
-        "holdout_max_m",
-        "holdout_nrmse_percent",
-    }
-    shown = {n for n, e in psa.EFFECTS.items() if not e.needs_column} - {"temperature"}
-    assert {c["effect"] for c in content["candidates"]} == shown
-    assert content["columns"] == []
-    assert content["next_experiment"]["why"]
-
-
-@slow
-def test_held_out_samples_are_never_used(clean: psa.Diagnosis) -> None:
-    experiment = clean.experiments[0]
-    assert not np.any(experiment.used & experiment.held_out)
-    assert 0.15 < np.mean(experiment.held_out) < 0.35
 
 
 def test_a_single_slow_triangle_is_said_to_be_blind_to_fast_effects(

@@ -8,18 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import psa_casadi as psa
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.evidence import evidence_of
-from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.records.decimate import decimated
-from psa_casadi.records.record import Record
-from psa_casadi.records.split import divided, whole
+from psa_casadi.records.split import divided
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Interval
@@ -70,45 +64,6 @@ def test_a_record_is_played_again_from_what_is_said_of_it() -> None:
     found = y[:, model.output_names.index("measured_displacement")] + said.offset_m
     error = np.concatenate([(measured(record) - found)[a:b] for a, b in said.held_out])
     assert np.sqrt(np.mean(error**2)) == pytest.approx(said.held_out_m, rel=1e-4)
-
-
-def test_the_reference_run_tells_the_voltage_in_few_samples() -> None:
-    """A record of 6000 samples, whose voltage moves for a moment only: every eighth tells it."""
-    time = np.asarray(np.arange(6000) * 1e-3, dtype=np.float64)
-    voltage = 50.0 - 50.0 * np.cos(6.0 * time)
-    record = Record(name="long", time=time, voltage=voltage, displacement=1e-7 * voltage)
-    model = psa.stack_model("demo")
-    experiments = (whole(record),)
-    found = fit(model, experiments, ["k_L"], sigma=[1e-8])
-    told = evidence_of(
-        found, determinacy(found, experiments), experiments, found.predicted(experiments), by="test"
-    )
-    reference = told.reference
-    assert reference is not None
-    assert told.held_out is None
-    assert len(reference.time) == 300
-    step = reference.time[1] - reference.time[0]
-    assert step >= 8e-3
-    known = time <= reference.time[-1]
-    lines = np.interp(time[known], reference.time, reference.inputs["voltage"])
-    assert np.max(np.abs(lines - voltage[known])) <= 2e-3 * 100.0 + 1e-4
-
-
-def test_averaged_records_are_said_to_be() -> None:
-    time = np.asarray(np.arange(8000) * 1e-4, dtype=np.float64)
-    voltage = 50.0 - 50.0 * np.cos(8.0 * time)
-    noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
-    record = Record(name="fast", time=time, voltage=voltage, displacement=1e-7 * voltage + noise)
-    shorter, factor = decimated(record, 1e-7, 1e-7)
-    assert factor > 1
-    experiments = (whole(shorter),)
-    found = fit(psa.stack_model("demo"), experiments, ["k_L"], sigma=[1e-7])
-    told = evidence_of(
-        found, determinacy(found, experiments), experiments, found.predicted(experiments),
-        by="test", sampled=[record],
-    )  # fmt: skip
-    (said,) = told.runs
-    assert (said.averaged, said.samples) == (factor, shorter.n)
 
 
 def test_a_file_keeps_it_exactly() -> None:

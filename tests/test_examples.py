@@ -91,7 +91,7 @@ FIGURES: dict[str, Callable[[Any], None]] = {
 
 @pytest.mark.parametrize(
     "name",
-    slow_but(["use_in_fmpy", "use_in_casadi", "minimum_time"], EXAMPLES),
+    slow_but(["use_in_fmpy", "use_in_casadi"], EXAMPLES),
 )
 def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path.parent)

@@ -8,11 +8,15 @@ import pytest
 from psa_casadi.errors import InputError
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
-from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.page.fit_page import fit_page, write_fit_report
-from psa_casadi.report.page.record_part import MOST_RECORDS, points_each
-from psa_casadi.report.plots.residual_plots import time_plot
-from psa_casadi.report.plots.theme import DARK
+from psa_casadi.report.page.results import (
+    MOST_RECORDS,
+    fit_page,
+    points_each,
+    write_fit_report,
+    write_report,
+)
+from psa_casadi.report.plots.panel import DARK
+from psa_casadi.report.plots.records import time_plot
 from psa_casadi.report.words.fit_words import (
     Grade,
     determined_sentence,
@@ -207,7 +211,7 @@ def test_every_column_of_pixels_keeps_its_extremes() -> None:
 def test_a_short_record_is_drawn_whole_and_a_gap_stays_a_gap() -> None:
     _, (s,) = long_fit(1, 900)
     trace = time_plot(s, "measured", points_each(1)).data[0]
-    assert np.array_equal(np.isnan(trace.y), np.isnan(s.measured))
+    assert np.array_equal(np.isnan(trace["y"]), np.isnan(s.measured))
     assert extremes([np.arange(10.0)], np.array([0, 5, 10])).tolist() == [0, 4, 5, 9]
 
 

@@ -27,7 +27,7 @@ from psa_casadi.notes import texts
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
-from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.page.results import write_report
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.ways import Way
 from tests.plants import further_columns as plants

@@ -16,11 +16,10 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.model_file import loads
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.report.page import live_part
-from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.page.live_data import live_data
-from psa_casadi.report.page.live_part import live_design, thinned
+from psa_casadi.report.page import live
+from psa_casadi.report.page.designs import write_design_page
+from psa_casadi.report.page.live import live_data, live_design, thinned
+from psa_casadi.report.page.results import write_report
 from psa_casadi.simulation.simulate import simulate_record
 from psa_casadi.variables import Interval, Parameter, Provenance
 from tests.browser import DARK, Browser, driven, find_browser
@@ -69,7 +68,8 @@ def rms_of(d: Diagnosis, values: dict[str, float]) -> float:
 MOVES = """
 var box = document.querySelector('.live'), found = {};
 function text() { return box.querySelector('output').textContent; }
-function drawn() { return box.querySelector('canvas').toDataURL(); }
+function drawn() { return JSON.stringify(box.querySelector('.plot').data.map(function (t) {
+  return Array.from(t.y); })); }
 function row() { return Array.prototype.map.call(box.querySelectorAll('.budget td'), function (c) {
   return c.textContent; }); }
 function knob(name) { return Array.prototype.find.call(box.querySelectorAll('.knob'), function (k) {
@@ -94,11 +94,10 @@ setTimeout(function () {
       return b.textContent === 'Reset'; }).click();
     setTimeout(function () {
       found.reset = text(); found.again = drawn() === found.picture;
-      var canvas = box.querySelector('canvas');
-      canvas.focus();
-      canvas.dispatchEvent(new KeyboardEvent('keydown', {key: '+'}));
+      var plot = box.querySelector('.plot');
+      plot.dispatchEvent(new KeyboardEvent('keydown', {key: '+'}));
       setTimeout(function () {
-        found.reach = canvas.place.reach.x;
+        found.reach = plot.layout.xaxis.range;
         found.images = document.querySelectorAll('img:not(.still)').length;
         found.options = Array.prototype.map.call(box.querySelectorAll('option'), function (o) {
           return o.textContent; });
@@ -222,8 +221,10 @@ def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -
     played = respond(model, t, 60.0 - 50.0 * np.cos(2.0 * np.pi * 100.0 * t))
     record = (t, played.voltage, played.displacement)
     path = played.displacement + 50e-9
-    live = live_design(model, record, path, rest=True)
-    write_design_page(tmp_path / "d.html", title="A design", summary=["It moves."], live=live)
+    played_again = live_design(model, record, path, rest=True)
+    write_design_page(
+        tmp_path / "d.html", title="A design", summary=["It moves."], live=played_again
+    )
     said = driven(browser, tmp_path / "d.html", """
       var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
       box.psa.set('k_L', 8);
@@ -246,7 +247,7 @@ def test_without_compiler_a_page_says_so(
     shown: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("psa_casadi.export.web.has_zig", lambda: False)
-    monkeypatch.setattr(live_part, "has_zig", lambda: False)
+    monkeypatch.setattr(live, "has_zig", lambda: False)
     write_report(shown, tmp_path / "page.html")
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
     assert "the model does not run. It takes a compiler" in text

@@ -15,22 +15,19 @@ from psa_casadi.diagnosis.search.hypothesis import (
     examine,
     held_out_confirms,
     hypothesis,
-    in_character,
     scale_of,
 )
-from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.task import STEPS, Method, Task, Thresholds, thresholds, using
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
 from psa_casadi.records import Record
-from psa_casadi.records.split import Experiment, judging, split
+from psa_casadi.records.split import Experiment, split
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import simulate
 from tests.benchmarks.ablation import (
     ablation_table,
     moved_constants,
-    several_table,
     without_steps,
 )
 from tests.benchmarks.hidden_cases import Case, Found
@@ -107,28 +104,6 @@ def test_the_score_is_the_evidence_less_the_price_of_the_causes(creeping: Creepi
         assert fitted_alone.score(creep) == pytest.approx(scale.evidence(creep) - 8.0)
 
 
-def test_a_fit_that_will_stay_above_the_goal_is_not_final(
-    fitted: tuple[Fit, tuple[Experiment, ...]], creeping: Creeping
-) -> None:
-    """It may be taken up again, and ends where it would have ended."""
-    _, creep, _, experiments = creeping
-    seen = _seen(fitted, names=("slow_creep",))
-    quick = with_cause(seen.of, experiments, seen.starts_of("slow_creep"))
-    assert quick is not None
-    assert creep.final
-    assert to_end(quick, experiments, 1.01 * creep.fit.cost).final
-    behind = to_end(quick, experiments, 0.5 * creep.fit.cost)
-    assert not behind.final
-    assert to_end(behind, experiments).fit.cost == pytest.approx(creep.fit.cost, rel=1e-3)
-
-
-def test_records_that_are_held_out_whole_judge_and_do_not_choose(creeping: Creeping) -> None:
-    plain, _, scale, experiments = creeping
-    whole = judging(experiments[0].record)
-    assert not scale.judge_only
-    assert scale_of(plain, scale.colour, 8.0, [*experiments, whole]).judge_only
-
-
 def test_held_out_data_speak_against_what_they_do_not_show(creeping: Creeping) -> None:
     """They must show what they can show, and all samples together must favour a cause."""
     plain, creep, scale, experiments = creeping
@@ -143,104 +118,11 @@ def test_held_out_data_speak_against_what_they_do_not_show(creeping: Creeping) -
     assert not held_out_confirms(hardly, plain, experiments, dear)
 
 
-def test_what_held_out_data_reject_is_not_the_answer_but_may_lack_a_cause(
-    creeping: Creeping,
-) -> None:
-    plain, creep, _, experiments = creeping
-    known = Known(plain.fit, Task(experiments, (EFFECTS["slow_creep"],)))
-    assert known.rejected() == []
-    known.note(creep)
-    assert known.best().names == creep.names
-    assert known.rejected() == []
-    known.found[creep.names] = worse = replace(creep, holdout_rms=1.02 * plain.holdout_rms)
-    assert known.best().names == plain.names
-    assert known.rejected() == [worse]
-
-
-def test_held_out_data_choose_where_fitted_ones_cannot(creeping: Creeping) -> None:
-    """They count as the fitted ones do, in what ranks first and between minima of one set."""
-    plain, creep, _, experiments = creeping
-    known = Known(plain.fit, Task(experiments, (EFFECTS["slow_creep"],)))
-    other = replace(creep, causes=(EFFECTS["ageing"],), holdout_rms=1.1 * creep.holdout_rms)
-    known.note(other)
-    known.note(creep)
-    assert known.scale.of_fitted(creep) == known.scale.of_fitted(other)
-    assert [h.names for h in known.ranked()][:2] == [creep.names, other.names]
-    known.note(replace(creep, holdout_rms=0.9 * creep.holdout_rms))
-    kept = known.get(creep.names)
-    assert kept is not None  # the same minimum
-    assert kept.holdout_rms == creep.holdout_rms
-    worse = replace(plain, causes=creep.causes)
-    assert known.replaces(creep, worse)
-    assert not known.replaces(worse, creep)
-    samples = known.scale.held / known.scale.colour.inflation
-    factor = float(np.exp(1.1 * known.scale.evidence(creep) / samples))
-    assert not known.replaces(replace(creep, holdout_rms=factor * plain.holdout_rms), worse)
-
-
-def test_a_parameter_at_its_bound_is_out_of_character(creeping: Creeping) -> None:
-    _, creep, _, experiments = creeping
-    (cause,) = creep.causes
-    assert in_character(creep.fit, cause, experiments)
-    low, _ = creep.fit.model.parameter("creep_time").bounds
-    model = creep.fit.model.with_values({"creep_time": low})
-    assert not in_character(replace(creep.fit, model=model), cause, experiments)
-
-
-def test_an_end_that_is_a_limit_of_the_law_is_in_character(creeping: Creeping) -> None:
-    """One pole of a lag, a sharp jump, a thermometer on the ceramic: lower ends, not upper ones."""
-    _, creep, _, experiments = creeping
-    limits = {("drive_lag", "drive_lag_shape"), ("sensor_jump", "jump_width")}
-    limits |= {("temperature", "temperature_lag")}
-    assert {(e.name, p.name) for e in EFFECTS.values() for p in e.parameters if p.limit} == limits
-    for name, parameter in limits:
-        effect = EFFECTS[name]
-        extended = creep.fit.model.with_effect(effect)
-        for end, fits in zip(extended.parameter(parameter).bounds, (True, False), strict=True):
-            model = extended.with_values({parameter: end})
-            assert in_character(replace(creep.fit, model=model), effect, experiments) is fits
-
-
-def test_a_hum_where_the_stack_rings_is_out_of_character(creeping: Creeping) -> None:
-    """Within the width of a sharp resonance, 2 % of its frequency on each side at a ratio of 0.01;
-    a damped one hides no line of the mains.
-    """
-    _, creep, _, experiments = creeping
-    hum, omega = EFFECTS["mains_hum"], 2.0 * np.pi * 1600.0
-    stiffness = creep.fit.model.values["k_P"]
-    for ratio, frequency, fits in (
-        (0.01, 1601.0, False), (0.01, 1625.0, False), (0.01, 1640.0, True), (0.2, 1601.0, True),
-    ):  # fmt: skip
-        ringing = {"m_P": stiffness / omega**2, "c_P": 2.0 * ratio * stiffness / omega}
-        model = creep.fit.model.with_values(ringing)
-        model = model.with_effect(hum, {"hum_gain": 1e-9, "hum_frequency": frequency})
-        assert in_character(replace(creep.fit, model=model), hum, experiments) is fits
-
-
-def test_a_ripple_that_hardly_repeats_is_out_of_character(creeping: Creeping) -> None:
-    """With less than two periods over the displacement it is a bent curve."""
-    _, creep, _, experiments = creeping
-    ripple = EFFECTS["sensor_ripple"]
-    widest = max(e.record.range_m for e in experiments)
-    for periods, fits in ((1.5, False), (3.0, True)):
-        values = {"ripple_gain": 1e-9, "ripple_period": widest / periods}
-        model = creep.fit.model.with_effect(ripple, values)
-        assert in_character(replace(creep.fit, model=model), ripple, experiments) is fits
-
-
 def test_without_finite_steps_an_effect_with_a_threshold_is_not_seen(
     fitted: tuple[Fit, tuple[Experiment, ...]],
 ) -> None:
     assert "current_limit" in _scores(fitted)
     assert "current_limit" not in _scores(fitted, "finite steps")
-
-
-def test_the_residual_alone_takes_what_is_missing_for_the_colour_of_noise(
-    fitted: tuple[Fit, tuple[Experiment, ...]],
-) -> None:
-    own, alone = _scores(fitted), _scores(fitted, "remainder")
-    assert alone["correlation"] > own["correlation"] + 0.3
-    assert alone["slow_creep"] < 0.5 * own["slow_creep"]
 
 
 def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1) -> Found:
@@ -281,20 +163,6 @@ def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
             assert rows[f"without {step}"] == (*right, "0 of 4")
     wrong = ("0 of 3", "0 of 3", "3 of 4", "0 of 0", "75 % of 1", "1.0", "3 of 4")
     assert rows["without finite steps"] == wrong
-
-
-def test_what_sets_of_causes_are_good_for_shows_in_the_ablation() -> None:
-    """Cases that do not show their causes do not count."""
-    case = Case("two", NAMES[0], 1, (1.0, 3.0), (NAMES[1],))
-    both = replace(_found(NAMES[0], NAMES[:2]), case=case, rho=2.0)
-    one = replace(both, named=NAMES[:1], within=NAMES[:1], ratio=2.0)
-
-    def diagnosed(_: Sequence[Case], method: Method) -> list[Found]:
-        return [both, one if method.without else both, replace(both, rho=0.5, ratio=9.0)]
-
-    rows = [row[1:] for row in several_table([], diagnosed).table.rows]
-    every = ("100 % (2 of 2)", "100 % (2 of 2)", "1.000, 1.00", "1")
-    assert rows == [every, ("50 % (1 of 2)", "50 % (1 of 2)", "1.500, 2.00", "1")]
 
 
 def test_every_constant_is_moved_and_a_diagnosis_uses_them(

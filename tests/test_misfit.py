@@ -1,17 +1,14 @@
 """What is seen in a residual: what was put in, and nothing in noise."""
 
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from psa_casadi.diagnosis.misfit import misfit
 from psa_casadi.diagnosis.noise import noise_floor
-from psa_casadi.diagnosis.views import drive_of
 from psa_casadi.errors import InputError
-from psa_casadi.records import Record, excitation, read_record
-from psa_casadi.records.drive import reversals
+from psa_casadi.records import Record, excitation
 from tests.misfit_cases import (
     LEVELS,
     MULTISINE,
@@ -42,27 +39,6 @@ def test_a_function_of_the_voltage() -> None:
     assert m.rms == pytest.approx(np.hypot(np.std(error), NOISE), rel=0.02)
     assert m.excess == pytest.approx(1.0 - (NOISE / m.rms) ** 2, abs=0.02)
     assert m.sentences[0].startswith("The residual of r is 21 nm rms, 2.1 times the noise of")
-
-
-def test_a_function_of_the_rate() -> None:
-    rate = np.gradient(MULTISINE, TIME)
-    error = 3e-11 * rate
-    m = seen(MULTISINE, error)
-    found = shares(m)
-    assert found["rate"] > 0.97
-    assert found["rate"] == max(found.values())
-    assert found["voltage"] == found["time"] == 0.0
-    view = next(v for v in m.views if v.name == "rate")
-    assert view.mean == pytest.approx(3e-11 * view.x, abs=3e-9)
-    assert m.sentences[1].startswith("The residual follows the voltage rate: ")
-    assert "V/s" in m.sentences[1]
-
-
-def test_a_drift() -> None:
-    m = seen(MULTISINE, 4e-8 * (TIME / TIME[-1]) ** 2)
-    assert shares(m)["time"] > 0.95
-    assert m.sentences[1].startswith("The residual follows time: ")
-    assert shares(m)["voltage"] == 0.0
 
 
 def test_creep_after_every_step() -> None:
@@ -187,23 +163,6 @@ def test_counts_stay_counts() -> None:
     assert "+3 counts at" in m.sentences[1] or "-3 counts at" in m.sentences[1]
 
 
-def test_a_constant_voltage_is_no_trouble() -> None:
-    m = seen(np.full(2_000, 30.0), 2e-8 * np.linspace(-1.0, 1.0, 2_000) * 3.0)
-    assert shares(m)["time"] > 0.9
-    assert shares(m)["voltage"] == 0.0
-    assert m.split is None
-
-
-def test_rate_and_turns_of_a_noisy_voltage() -> None:
-    measured = SINE + 0.05 * np.random.default_rng(0).standard_normal(TIME.size)
-    drive = drive_of(Record(name="r", time=TIME, voltage=measured))
-    assert len(drive.turns) == len(reversals(SINE))
-    inner = slice(50, -50)
-    assert np.std((drive.rate - np.gradient(SINE, TIME))[inner]) < 0.15 * np.std(drive.rate)
-    raw = np.std((np.gradient(measured, TIME) - np.gradient(SINE, TIME))[inner])
-    assert np.std((drive.rate - np.gradient(SINE, TIME))[inner]) < 0.6 * raw
-
-
 @slow
 def test_a_million_samples() -> None:
     n = 1_000_000
@@ -216,19 +175,3 @@ def test_a_million_samples() -> None:
     # 1 s where nothing else runs; the limit leaves room for a busy machine
     assert time.process_time() - before < 6.0
     assert shares(m)["voltage"] > 0.95
-
-
-@pytest.mark.parametrize("file", ["sine_1hz.csv", "minor_loops.csv"])
-def test_the_micromanipulator_is_viewed(measured_data: Path, file: str) -> None:
-    r = read_record(measured_data / "micromanipulator" / file)
-    assert r.displacement is not None
-    u = (r.voltage - np.mean(r.voltage)) / np.ptp(r.voltage)
-    x = np.column_stack([u**k for k in range(6)])
-    residual = r.displacement - x @ np.linalg.lstsq(x, r.displacement)[0]
-    m = misfit(r, residual, noise_floor([r], [residual])[0])
-    found = shares(m)
-    # a curve of the voltage alone leaves the loop: the branches are told apart by the rate
-    assert found["rate"] > 0.5
-    assert found["voltage"] < 0.1
-    assert m.excess > 0.9
-    assert any(s.startswith("The residual follows the voltage rate") for s in m.sentences)

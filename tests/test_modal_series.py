@@ -9,15 +9,10 @@ from numpy.typing import NDArray
 from scipy.signal import lsim
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.search.hypothesis import hypothesis, root_of
-from psa_casadi.diagnosis.search.moves import one_mode
 from psa_casadi.effects.mechanics import MODAL_SERIES
-from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.start.linear_response import Shaken, modes_of
-from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine
-from psa_casadi.records.split import split
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack
 from tests.plants.structural_mode import contribution
@@ -63,24 +58,9 @@ def test_modes_are_read_off_a_residual() -> None:
         assert abs(mode.ahead) < 0.03 * share
 
 
-def test_records_of_other_sample_times_count_together() -> None:
-    (drive, time), fine = drive_and_time(), 2
-    coarse = Shaken(drive, response(*HIDDEN[0][:2], drive, time), np.ones(COUNT, bool), 1.0 / RATE)
-    own = np.arange(COUNT) / (fine * RATE)
-    other = Shaken(drive, response(*HIDDEN[0][:2], drive, own), np.ones(COUNT, bool), own[1])
-    (mode,) = modes_of([coarse, other], np.ones((2 * COUNT, 1)), most=1, better=0.95)
-    assert mode.frequency == pytest.approx(HIDDEN[0][0], rel=1e-3)
-    assert mode.share == pytest.approx(1.0, rel=1e-2)
-
-
 def test_noise_has_no_modes() -> None:
     drive, _ = drive_and_time()
     shaken = Shaken(drive, noise(COUNT, 3), np.ones(COUNT, bool), 1.0 / RATE)
-    assert modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95) == []
-
-
-def test_what_is_not_driven_has_no_modes() -> None:
-    shaken = Shaken(np.zeros(COUNT), noise(COUNT, 3), np.ones(COUNT, bool), 1.0 / RATE)
     assert modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95) == []
 
 
@@ -106,21 +86,6 @@ def test_its_equations_are_those_of_modal_superposition() -> None:
     added = sum(share * response(f, z, rest, time) for f, z, share in HIDDEN[:2])
     size = np.ptp(added)
     np.testing.assert_allclose(own.displacement - base.displacement, added, atol=2e-3 * size)
-
-
-def test_without_its_gain_nothing_is_added() -> None:
-    time = np.arange(500) / 20_000.0
-    voltage = 40.0 * (1.0 - np.cos(2.0 * np.pi * 100.0 * time))
-    none = with_two_modes().with_values({"series_gain": 0.0})
-    base = psa.simulate(stack_model("P-885.51"), time, voltage).displacement
-    np.testing.assert_allclose(psa.simulate(none, time, voltage).displacement, base, rtol=1e-6)
-
-
-def test_a_model_with_modes_is_saved_and_read() -> None:
-    model = with_two_modes()
-    again = loads(dumps(model))
-    assert again.values == model.values
-    assert again.components[-1] is MODAL_SERIES[2]
 
 
 def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN) -> Record:
@@ -155,48 +120,10 @@ def test_several_modes_are_found_together_and_again_from_what_was_found() -> Non
     assert [c.effect.startswith("modal_series") for c in again.causes] == [True]
 
 
-@pytest.fixture(scope="module")
-def healthy() -> psa.Diagnosis:
-    """Of a fast record without modes."""
+@slow
+def test_a_fast_record_without_modes_has_none() -> None:
     effects = [psa.EFFECTS[n] for n in ("structural_mode", "drive_lag", "sensor_delay", "backlash")]
-    return psa.diagnose([shaken_stack(14, ())], effects=effects)
-
-
-@slow
-@pytest.mark.xdist_group("healthy")
-def test_a_fast_record_without_modes_has_none(healthy: psa.Diagnosis) -> None:
-    assert healthy.verdict == "adequate"
-
-
-@slow
-@pytest.mark.xdist_group("healthy")
-def test_one_mode_is_enough_where_a_series_stands_for_one(healthy: psa.Diagnosis) -> None:
-    """The base alone has bent itself to the mode; the series has led it back.
-
-    The plant's mode is driven by the force, the effect by the displacement behind it.
-    """
-    frequency, damping, share = HIDDEN[0]
-    straight = healthy.base_fit
-    record = shaken_stack(14, HIDDEN[:1])
-    experiments = [split(record)]
-    names, sigma = straight.unknowns.names, straight.sigma
-    bent = fit(straight.model, experiments, names, sigma=sigma)
-    modes = {1: (1.08 * frequency, damping, share), 2: (0.9 * frequency, 0.2, 0.5 * share)}
-    values = {
-        f"series_{name}_{k}": value
-        for k, mode in modes.items()
-        for name, value in zip(("frequency", "damping", "share"), mode, strict=True)
-    }
-    model = straight.model.with_effect(MODAL_SERIES[2], {**values, "series_gain": 1.0})
-    led = fit(model, experiments, [*names, *MODAL_SERIES[2].fitted], sigma=sigma, evaluations=20)
-    series = hypothesis((MODAL_SERIES[2],), led, experiments)
-    assert series is not None
-    root = root_of(bent, experiments)
-    single = min(one_mode(series, root, experiments), key=lambda h: h.fit.rms)
-    assert single.names == {"structural_mode"}
-    assert single.final
-    assert single.fit.model.values["mode_frequency"] == pytest.approx(frequency, rel=5e-3)
-    assert single.holdout_rms < 1.2e-3 * record.range_m  # the noise is 1e-3
+    assert psa.diagnose([shaken_stack(14, ())], effects=effects).verdict == "adequate"
 
 
 @slow

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.colour import (
@@ -21,7 +20,7 @@ from psa_casadi.records.noise import first_order_noise, high_frequency_noise
 from psa_casadi.units import FloatArray
 from tests.plants.make import make_record
 from tests.plants.noise import coloured
-from tests.tiers import slow, slow_but
+from tests.tiers import slow_but
 
 N = 6000
 TIME = np.linspace(0.0, 6.0, N, endpoint=False)
@@ -54,12 +53,6 @@ def test_white_noise_stays_white_whatever_is_slow_beside_it() -> None:
             assert rms == pytest.approx(1.0, rel=0.06)
 
 
-def test_a_short_or_constant_signal_has_a_level_too() -> None:
-    short = noise(0.0)[:100]
-    assert first_order_noise(short) == (high_frequency_noise(short), 0.0)
-    assert first_order_noise(np.zeros(N)) == (0.0, 0.0)
-
-
 def test_what_is_above_coloured_noise_is_its_excess() -> None:
     e = noise(0.7)
     colour = colour_of(e, [N])
@@ -88,32 +81,6 @@ def test_a_colour_survives_the_projection_of_slow_directions(correlation: float)
     assert left_correlation(correlation, halves) == pytest.approx(np.mean(plain), abs=0.015)
 
 
-def test_a_colour_is_not_told_where_most_of_it_was_taken_out() -> None:
-    """Of 0.8 and of 0.95 a hundred waves leave 0.51 and 0.55 in 1,000 samples, of 300 nothing."""
-    rng = np.random.default_rng(7)
-
-    def waves(n: int) -> FloatArray:
-        return np.linalg.qr(np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, n), np.arange(100))))[0]
-
-    basis = waves(1000)
-    for size, most in ((0.0, 0.05), (0.5, 0.45)):  # white noise, alone and beside a slow misfit
-        e = rng.standard_normal(1000) + size * np.sin(2.0 * np.pi * 0.13 * np.arange(1000))
-        left = e - basis @ (basis.T @ e)
-        assert np.sum(colour_of(left, [1000], None, basis).autoregression[0]) <= most
-    e = coloured(rng.standard_normal(1200), 0.8)[200:]
-    left = e - basis @ (basis.T @ e)
-    found = float(colour_of(left, [1000], None, basis).autoregression[0][0])
-    assert 0.55 < found < 0.85
-    short = waves(300)
-    e = coloured(rng.standard_normal(300), 0.5)
-    left = e - short @ (short.T @ e)
-    plain = float(left[1:] @ left[:-1] / (left @ left))
-    own = colour_of(left, [300], None, short).autoregression[0]
-    assert np.sum(own) == pytest.approx(max(plain, 0.0), abs=1e-12)
-    every = np.eye(100)
-    assert np.isfinite(colour_of(1e-3 * e[:100], [100], None, every).level)
-
-
 @pytest.mark.parametrize(("correlation", "n"), [(0.0, 4000), (0.6, 5000), (0.75, 3000)])
 def test_the_power_of_noise_is_as_uncertain_as_draws_of_it_show(correlation: float, n: int) -> None:
     rng = np.random.default_rng(8)
@@ -137,28 +104,6 @@ def test_noise_of_one_size_is_no_misfit_and_noise_after_reversals_only_is() -> N
     after = 1.0 + np.exp(-((TIME % 0.5) / 0.05))
     assert _size_test(after * noise(0.0)) < 1e-6
     assert _size_test(after * noise(0.0), even=False) > 1e-3
-
-
-def test_records_may_differ_in_the_size_of_their_noise() -> None:
-    two = np.repeat([1.0, 3.0], N // 2) * noise(0.0)
-    assert _size_test(two) < 1e-6
-    assert _size_test(two, lengths=(N // 2, N // 2)) > 1e-3
-
-
-@slow
-def test_a_cause_is_named_beside_coloured_noise(tmp_path: Path) -> None:
-    """It removes a fifth of the residual; the rest looks like excess if noise were white."""
-    path = tmp_path / "record.csv"
-    truth = make_record("field_dependent_gain", 110, path, noise="ar", visible=(0.3, 3.0))
-    table = [EFFECTS[n] for n in ("field_dependent_gain", "saturation_of_strain", "slow_creep")]
-    found = psa.diagnose([psa.read_record(path)], effects=table)
-    assert found.verdict == "cause_named"
-    assert [c.effect for c in found.causes] == ["field_dependent_gain"]
-    assert found.noise_floor_rms_m == pytest.approx(truth.sigma, rel=0.1)
-    white = np.asarray(
-        lfilter([1.0, -truth.noise.correlation], [1.0], found.extended_fit.residuals)
-    )
-    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 0.1
 
 
 @pytest.mark.slow

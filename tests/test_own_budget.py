@@ -78,23 +78,6 @@ def test_intervals_cover_the_known_shares(records: int) -> None:
         assert low <= _covered(shares, truth) <= high
 
 
-def test_an_output_that_no_held_out_sample_shows_is_judged_by_its_fitted_ones() -> None:
-    runs, one, _ = _drawn(np.random.default_rng(1), 1)
-    (run,) = runs
-    run.outputs[run.held_out, 1] = np.nan
-    none = [np.zeros((SAMPLES, 2))]
-    s = removed_from(runs, (0, 1), one, NOISE.tolist()).share("one", one, none)
-    y, seen = run.outputs, run.fitted(1)
-    powers = [
-        np.mean((y - m)[rows, j] ** 2)
-        for j, rows in ((0, run.held_out), (1, seen))
-        for m in (one[0], none[0])
-    ]
-    gone = [(powers[2 * j] - powers[2 * j + 1]) / NOISE[j] ** 2 for j in (0, 1)]
-    above = powers[0] / NOISE[0] ** 2 + powers[2] / NOISE[1] ** 2 - 2.0
-    assert s.share == pytest.approx(sum(gone) / above, rel=1e-12)
-
-
 def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power() -> None:
     assert Share("worse", -0.2, (-0.5, 0.1)).shown == (0.0, 0.0, 0.1)
     assert Share("all", 1.01, (0.9, 1.2)).shown == (1.0, 0.9, 1.0)

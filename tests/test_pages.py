@@ -13,9 +13,14 @@ from plotly.offline import get_plotlyjs
 import psa_casadi as psa
 from psa_casadi.command_line import typed
 from psa_casadi.diagnosis.held_out import Errors
-from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.fit_page import write_fit_report
-from psa_casadi.report.words.phrases import handy_scale, length_scale, one_unit, quantity
+from psa_casadi.report.page.designs import write_design_page
+from psa_casadi.report.page.results import write_fit_report
+from psa_casadi.report.words.phrases import (
+    handy_scale,
+    length_scale,
+    one_unit,
+    quantity,
+)
 from tests.html_page import Page
 from tests.report_cases import diagnosis, identification
 

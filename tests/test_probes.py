@@ -1,13 +1,10 @@
 """The trial sizes at which effects are looked for stand close enough to find every size."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.probes import directions, residual_jumps, residual_periods
-from psa_casadi.diagnosis.search.hypothesis import root_of, shows_memory
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import compose
@@ -72,22 +69,3 @@ def test_the_place_of_a_jump_is_read_off_the_residual(share: float) -> None:
     experiments = (whole(Record(name="r", time=t, voltage=voltage, displacement=reading)),)
     places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
     assert min(abs(p - place) for p in places) < 0.01 * np.ptp(x)
-
-
-def test_a_memory_that_adds_a_static_curve_shows_none() -> None:
-    model = compose(BASE)
-    t, voltage = _loops()
-    x = simulate(model, t, voltage).displacement
-    experiments = (whole(Record(name="r", time=t, voltage=voltage, displacement=x)),)
-    before = root_of(fit(model, experiments, ["k_L", "A", "beta"], sigma=[1e-8]), experiments)
-
-    def shown(added: FloatArray) -> bool:
-        of = replace(before, predicted=(before.predicted[0] + added,))
-        return shows_memory(of, before, experiments)
-
-    over = voltage / 120.0
-    assert not shown(1e-7 * over**2)
-    assert not shown(1e-7 * np.sin(3.0 * x / x.max()))
-    loop = 1e-7 * np.gradient(voltage) / np.abs(np.gradient(voltage)).max()
-    assert shown(loop * over)
-    assert shown(1e-7 * over**2 + loop)

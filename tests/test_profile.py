@@ -17,7 +17,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
-from psa_casadi.report.plots.profile_plot import profile_plot
+from psa_casadi.report.plots.findings import profile_plot
 from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.simulation.simulate import simulate
 
@@ -166,14 +166,14 @@ def test_sentence_and_plot_show_profile_limit_and_interval() -> None:
     assert sentence.startswith("tau lies between 2.")
     assert sentence.endswith("ms.")
     plot = profile_plot(closed)
-    assert plot.layout.xaxis.title.text == "tau [ms]"
-    np.testing.assert_allclose(plot.data[0].x, 1e3 * closed.values)
-    np.testing.assert_allclose(plot.data[0].y, closed.increase)
-    line, interval = plot.layout.shapes
-    assert line.y0 == line.y1 == PROFILE_LIMIT
+    assert plot.layout["xaxis"]["title"]["text"] == "tau [ms]"
+    np.testing.assert_allclose(plot.data[0]["x"], 1e3 * closed.values)
+    np.testing.assert_allclose(plot.data[0]["y"], closed.increase)
+    line, interval = plot.layout["shapes"]
+    assert line["y0"] == line["y1"] == PROFILE_LIMIT
     assert closed.low is not None
     assert closed.high is not None
-    assert (interval.x0, interval.x1) == pytest.approx((1e3 * closed.low, 1e3 * closed.high))
+    assert (interval["x0"], interval["x1"]) == pytest.approx((1e3 * closed.low, 1e3 * closed.high))
     # where the cost is quadratic the dotted parabola passes through the profile's points
-    parabola = np.interp(plot.data[0].x, plot.data[1].x, plot.data[1].y)
+    parabola = np.interp(plot.data[0]["x"], plot.data[1]["x"], plot.data[1]["y"])
     np.testing.assert_allclose(parabola, closed.increase, atol=0.3)

@@ -23,7 +23,7 @@ NAMES = ("time", "voltage", "displacement")
 #: What is asked of a diagnosis, whether it was just made or is read back.
 ANSWERS = (
     "verdict", "causes", "candidates", "base_errors", "extended_errors", "gain",
-    "noise_floor_rms_m", "blind_to", "remaining", "kept", "doubt", "notes",
+    "noise_floor_rms_m", "kept", "doubt", "notes",
 )  # fmt: skip
 
 
@@ -189,6 +189,9 @@ def test_a_diagnosis_is_loaded_back(verdict: Verdict, tmp_path: Path) -> None:
     for other in (again, pickle.loads(pickle.dumps(again)), pickle.loads(pickle.dumps(d))):
         for name in ANSWERS:
             assert getattr(other, name) == getattr(d, name), name
+        assert [b.why for b in other.blind_to] == [b.why for b in d.blind_to]
+        assert other.remaining.where == d.remaining.where
+        assert other.next_experiment.why == d.next_experiment.why
         assert other.to_json() == d.to_json()
         assert repr(other) == repr(d)
     assert verdict in again._repr_html_()

@@ -15,7 +15,7 @@ from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Covariance, Evidence, SeenRange
 from psa_casadi.records import Record
-from psa_casadi.report.page.diagnosis import write_report
+from psa_casadi.report.page.results import write_report
 from psa_casadi.report.words.phrases import handy_scale
 from psa_casadi.report.words.remedy_words import DO, RECORDS, size_text, what_now
 from psa_casadi.report.words.text import effect_page

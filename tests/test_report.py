@@ -13,9 +13,9 @@ from psa_casadi.diagnosis.result import Cause, Estimate, Verdict
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport, CheckRow
-from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.plots.figure import save_figure
-from psa_casadi.report.plots.finding_plots import evidence_plot
+from psa_casadi.report.page.results import write_report
+from psa_casadi.report.plots.figures import save_figure
+from psa_casadi.report.plots.findings import evidence_plot
 from psa_casadi.report.words.phrases import length_scale, listing, number, plain, share_text
 from psa_casadi.report.words.series import noise_density, series_of, spectrum, telling_window
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
@@ -143,9 +143,9 @@ def test_the_bars_of_named_causes_come_first_with_their_confidence() -> None:
     last = d.candidates[-1].effect
     d = replace(d, causes=(*d.causes, replace(d.causes[0], effect=last, confidence=0.5)))
     bars, figures_ = evidence_plot(d, 2).data
-    assert list(bars.y)[::-1] == [plain(n) for n in (d.candidates[0].effect, last)]
-    assert [t.split("; ")[1] for t in figures_.text][::-1] == ["named, 97 %", "named, 50 %"]
-    shares = evidence_plot(diagnosis("unexplained"), 2).data[1].text
+    assert bars["y"][::-1] == [plain(n) for n in (d.candidates[0].effect, last)]
+    assert [t.split("; ")[1] for t in figures_["text"]][::-1] == ["named, 97 %", "named, 50 %"]
+    shares = evidence_plot(diagnosis("unexplained"), 2).data[1]["text"]
     assert not any("named" in t for t in shares)
 
 

@@ -12,8 +12,7 @@ import pytest
 from matplotlib.image import imread
 
 from psa_casadi.identification.advice import Advice
-from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.page.fit_page import write_fit_report
+from psa_casadi.report.page.results import write_fit_report, write_report
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone
 from tests.report_cases import diagnosis, identification
 from tests.tiers import slow, slow_but

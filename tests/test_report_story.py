@@ -11,8 +11,7 @@ from psa_casadi.cli.diagnosis_files import models
 from psa_casadi.diagnosis.held_out import Budget, Share
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, Verdict
 from psa_casadi.effects import EFFECTS
-from psa_casadi.report.page.diagnosis import write_report
-from psa_casadi.report.page.misfit_part import drawn, split_table
+from psa_casadi.report.page.results import drawn, split_table, write_report
 from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.phrases import probability_text
 from psa_casadi.report.words.tables import blindest, candidate_table

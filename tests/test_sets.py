@@ -66,31 +66,3 @@ def test_two_causes_are_found_where_one_at_a_time_is_led_astray() -> None:
     alone, pair = (best_sets(fit, own, COLOUR, size)[0] for size in (1, 2))
     assert alone.names == {"mains_hum"}
     assert pair.names == {"slow_creep", "sensor_delay"}
-
-
-def test_gains_have_the_sign_that_makes_sense() -> None:
-    fit, own, _, _ = case(1)
-    turned = [
-        direction(d.effect.name, -d.column if k in (0, 1) else d.column, one_sided=k in (0, 1))
-        for k, d in enumerate(own)
-    ]
-    for each in best_sets(fit, turned, COLOUR, 2):
-        if "slow_creep" in each.names and each.promise > 0.0:
-            gains = dict(zip((d.effect.name for d in each.directions), each.gains, strict=True))
-            assert gains["slow_creep"] > 0.0
-
-
-def test_of_effects_that_are_alike_one_stands_for_the_others() -> None:
-    fit, own, _, _ = case(2)
-    same = [("load_stiffness", "sensor_nonlinearity")]
-    found = best_sets(fit, own, COLOUR, 2, same)
-    assert len({s.names for s in found}) == len(found) == 6
-    assert all(not {"load_stiffness", "sensor_nonlinearity"} <= s.names for s in found)
-
-
-def test_a_direction_that_the_base_can_follow_is_left_out() -> None:
-    fit, own, base, _ = case(3)
-    none = direction("load_stiffness", base @ np.array([1.0, 2.0, 3.0]))
-    followed = [*own[:2], none]
-    assert [s.names for s in best_sets(fit, followed, COLOUR, 1)] == [{"slow_creep"}]
-    assert best_sets(fit, followed, COLOUR, 2) == []

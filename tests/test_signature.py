@@ -9,11 +9,10 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
-from psa_casadi.diagnosis.signature import signature, standard_voltage
+from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.report.plots.signature_figure import save_signature, size_sentence
+from psa_casadi.report.plots.figures import save_signature, size_sentence
 
 #: Coordinates along which physics says that an effect is to be seen.
 TOLD = {
@@ -72,23 +71,6 @@ def test_creep_grows_during_holds_and_hum_is_a_line_at_its_frequency() -> None:
     slope = np.polyfit(delay.telling.x, delay.telling.mean, 1)[0]
     gain = delay.stroke / np.ptp(delay.voltage)
     assert slope == pytest.approx(-delay.size * gain, rel=0.25)
-
-
-def test_a_signature_is_that_of_the_stack_given() -> None:
-    stack = stack_model("PTBS200")
-    seen = signature(EFFECTS["sensor_nonlinearity"], stack)
-    assert seen.stack == stack.name
-    assert np.ptp(seen.voltage) == pytest.approx(200.0)
-    assert seen.telling.name == "displacement"
-
-
-def test_the_standard_voltage_has_two_amplitudes_two_rates_and_holds() -> None:
-    time, voltage = standard_voltage(0.25, 120.0)
-    assert 1.0 < time[-1] < 2.5
-    assert voltage.min() == 0.0
-    assert voltage.max() == pytest.approx(120.0)
-    still = np.count_nonzero(np.diff(voltage) == 0.0) / voltage.size
-    assert 0.3 < still < 0.6
 
 
 @pytest.mark.parametrize("name", ["slow_creep", "mains_hum"])

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.probes import Direction, Span, combined, directions, spans
-from psa_casadi.diagnosis.screening import Score, Screening, best_sets, copies, screen
+from psa_casadi.diagnosis.screening import Score, Screening, screen
 from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -105,39 +105,6 @@ def test_noise_passes_the_threshold_no_more_often_than_along_one_direction() -> 
             assert np.mean(drawn > level) < 0.0065
         assert np.mean(Span(unit.T @ unit, np.full(size, 30.0)).decrease(
             rng.standard_normal((40_000, 50)) @ unit) > level) > 0.0035  # fmt: skip
-
-
-def test_sets_hold_a_span_as_a_whole() -> None:
-    of, own, base, residual = _case(2)
-    pair = best_sets(of, own, COLOUR, 2)[0]
-    assert pair.names == {"hysteresis_memory", "slow_creep"}
-    memory = next(d for d in pair.directions if d.effect is MEMORY)
-    assert memory.values["memory_threshold"] == 0.015
-    span = np.column_stack([d.column for d in own[: len(WEIGHTS)]])
-    gains = np.linalg.lstsq(
-        COLOUR.whiten(np.column_stack([base, span, own[-1].column])),
-        COLOUR.whiten(residual),
-        rcond=None,
-    )[0]
-    assert memory.values["memory_square_2"] / _sizes()["memory_square_2"] == pytest.approx(
-        0.0, abs=0.02
-    )
-    assert memory.values["memory_cube_1"] / _sizes()["memory_cube_1"] == pytest.approx(
-        gains[9], abs=2e-3
-    )
-    creep = dict(zip((d.effect.name for d in pair.directions), pair.gains, strict=True))[
-        "slow_creep"
-    ]
-    assert creep == pytest.approx(0.03 * gains[-1], rel=1e-3)
-
-
-def test_a_copy_is_the_best_of_a_span() -> None:
-    of, own, _, _ = _case(4)
-    added = 0.5 * own[2].column - own[5].column
-    _, found = copies(of, added, own, COLOUR)
-    copy = found["hysteresis_memory"]
-    assert copy.share > 0.999
-    assert copy.direction.column * copy.gain == pytest.approx(added, abs=2e-2)
 
 
 def test_directions_of_weights_are_what_the_weights_add() -> None:

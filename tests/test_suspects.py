@@ -1,6 +1,5 @@
 """What a sensor has made is told from what a stack has made."""
 
-import time as clock
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,7 +11,7 @@ from scipy.signal import lfilter
 from psa_casadi.records import Record, multisine, read_record, sine, steps, time_grid, triangle
 from psa_casadi.records.noise import quantum_of
 from psa_casadi.records.suspects import cleaned, suspects
-from tests.tiers import slow, slow_but
+from tests.tiers import slow_but
 
 FloatArray = NDArray[np.float64]
 RANGE = 20e-6
@@ -148,23 +147,6 @@ def test_a_stuck_sensor_is_found(noise: str) -> None:
     assert set(np.flatnonzero(found.mask)) <= set(range(3295, 3702))
 
 
-def test_a_flat_dwell_after_a_reversal_and_a_held_voltage_are_not_stuck() -> None:
-    u = VOLTAGES["triangle"]
-    play, y = 0.0, np.empty(u.size)
-    for k, v in enumerate(u):
-        play = min(max(play, v - 12.0), v + 12.0)
-        y[k] = play
-    for step in (0.5, 1e-9):
-        levels = np.asarray(np.round(y / step) * (step * RANGE / 100.0), dtype=float)
-        assert not suspects(
-            Record(name="backlash", time=T, voltage=u, displacement=levels)
-        ).mask.any()
-    held = steps(T, [0.0, 100.0, 50.0])
-    assert not suspects(
-        Record(name="held", time=T, voltage=held, displacement=1e-7 * held)
-    ).mask.any()
-
-
 def test_cleaned_masks_and_makes_nothing_up() -> None:
     base = record("sine", "white")
     assert base.displacement is not None
@@ -209,18 +191,6 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
         )
     )
     assert found.sentences("c") == ("c: the displacement is quantised in steps of 1 counts.",)
-
-
-@slow
-def test_a_million_samples_are_looked_at_quickly() -> None:
-    t = time_grid(100.0, 1e-4)
-    u = sine(t, 0.0, 100.0, 0.1)
-    y = 1e-7 * u + 2e-8 * np.random.default_rng(5).standard_normal(t.size)
-    y[[200, 500_000, t.size - 5]] += 5e-6
-    started = clock.process_time()
-    found = suspects(Record(name="long", time=t, voltage=u, displacement=y))
-    assert clock.process_time() - started < 10.0
-    assert list(np.flatnonzero(found.mask)) == [200, 500_000, t.size - 5]
 
 
 def test_a_reading_repeated_shortly_while_the_stack_moves_is_masked() -> None:

@@ -7,9 +7,7 @@ import pytest
 
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import steps, time_grid
-from tests.benchmarks import verification
-from tests.benchmarks.table import Progress
-from tests.benchmarks.verification import picture, run, verification_tables
+from tests.benchmarks.verification import verification_tables
 from tests.benchmarks.verification_cases import (
     FITTED_LOOPS,
     KEPT_LOOPS,
@@ -23,7 +21,6 @@ from tests.benchmarks.verification_cases import (
     matches,
     plant_response,
     synthetic,
-    tables,
     with_single_mass,
 )
 from tests.tiers import slow
@@ -46,10 +43,6 @@ def shown() -> list[Comparison]:
 def ringing() -> list[Match]:
     values = {name: figure.value for name, figure in STACKS["PTBS200"].values.items()}
     return matches(values, silent, ("reciprocal",), starts=2)
-
-
-def of_kind(shown: list[Comparison], kind: str) -> list[Comparison]:
-    return [c for c in shown if c.kind == kind]
 
 
 def made_up(kind: str = LOOPS, error: float = 1e-8) -> Comparison:
@@ -79,33 +72,6 @@ def test_a_stack_is_predicted_to_its_noise(shown: list[Comparison]) -> None:
         assert c.voltage.max() <= RATED
 
 
-@slow
-def test_the_step_is_normalised_by_its_end(shown: list[Comparison]) -> None:
-    (step,) = of_kind(shown, STEPS)
-    assert step.voltage[1] == pytest.approx(0.6 * RATED)
-    assert np.mean(step.measured[-50:]) / step.range_m == pytest.approx(1.0, abs=1e-3)
-    assert abs(step.measured[0]) < 0.01 * step.range_m
-
-
-def test_the_other_voltage_is_not_periodic_and_decays(shown: list[Comparison]) -> None:
-    (other,) = of_kind(shown, OTHER)
-    swing = other.voltage - 0.5 * RATED
-    early, late = swing[300:1500], swing[-1000:]
-    assert np.ptp(early) > 0.4 * RATED
-    assert np.ptp(late) < 0.5 * np.ptp(early)
-    likeness = [
-        np.corrcoef(early[:-shift], early[shift:])[0, 1] for shift in range(100, len(early) - 300)
-    ]
-    assert max(likeness) < 0.9
-
-
-def test_errors_count_only_samples_that_no_fit_has_seen() -> None:
-    c = made_up()
-    assert np.isnan(c.error[:3]).all()
-    assert c.largest == pytest.approx(1e-8)
-    assert c.rms == pytest.approx(1e-8)
-
-
 def test_a_table_for_each_of_the_papers_figures() -> None:
     shown = [made_up(LOOPS), made_up(STEPS, 2e-8), made_up(OTHER)]
     loops, steps, other = verification_tables(shown)
@@ -116,17 +82,6 @@ def test_a_table_for_each_of_the_papers_figures() -> None:
     assert len(other.table.rows) == 2
     assert "synthetic: the independent reference" in loops.note
     assert "left out" not in loops.note
-
-
-def test_the_picture_has_a_pair_of_panels_for_everything_shown(shown: list[Comparison]) -> None:
-    figure = picture([*shown, made_up(OTHER)])
-    assert len(figure.axes) == 6
-    titles = [axes.get_title(loc="left") for axes in figure.axes[::2]]
-    assert [t.split(": ")[0] for t in titles] == ["P-885.51"] * 3
-    loops = figure.axes[0].get_lines()
-    assert len(loops) == 4
-    assert np.nanmax(loops[0].get_ydata()) == pytest.approx(1e6 * shown[0].measured.max())
-    assert np.isfinite(figure.axes[5].get_lines()[-2].get_ydata()).sum() == 8
 
 
 @slow
@@ -143,15 +98,6 @@ def test_only_a_wrong_number_of_masses_shows_in_a_step(ringing: list[Match]) -> 
     assert next(m.mass for m in ringing if m.model == "single_mass") < 0.8
 
 
-def test_the_tables_of_the_mechanics_give_rms_and_largest_in_percent() -> None:
-    errors = np.array([0.01, -0.02, 0.0, 0.0])
-    found = [Match("cascade", n, errors, errors, 0.5) for n in ("cascade", "reciprocal")]
-    found.append(Match("cascade", "single_mass", 2 * errors, errors, 1.5))
-    fitted, predicted = tables(found, "PTBS200")
-    assert fitted.table.rows == (("one-way cascade", "1.1 / 2", "1.1 / 2", "2.2 / 4"),)
-    assert predicted.table.rows[0][3] == "1.1 / 2, mass x 1.50"
-
-
 def test_the_three_plants_are_three() -> None:
     """One stiffness to a voltage or to a load for each: series, or the wafers' or the layers'."""
     p = with_single_mass({n: f.value for n, f in STACKS["WYDS0808020"].values.items()})
@@ -165,28 +111,6 @@ def test_the_three_plants_are_three() -> None:
         assert x == pytest.approx(force / stiffness, rel=1e-4), plant
         y = plant_response(plant, p, time, none, push)[-1]
         assert y == pytest.approx(100.0 / hard[plant], rel=1e-4), plant
-
-
-@slow
-def test_run_puts_the_parts_together(
-    shown: list[Comparison], ringing: list[Match], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[str] = []
-
-    def one_stack(name: str, _: Progress) -> list[Comparison]:
-        asked.append(name)
-        return shown
-
-    monkeypatch.setattr(verification, "synthetic", one_stack)
-    monkeypatch.setattr(verification, "instrument", lambda _: [])
-    monkeypatch.setattr(verification, "matches", lambda *_: ringing)
-    quick = run(silent, quick=True)
-    assert asked == ["P-885.51"]
-    assert len(quick.tables) == 5
-    assert quick.picture is not None
-    assert len(quick.picture().axes) == 6
-    run(silent, quick=False)
-    assert asked[1:] == ["PTBS200", "WYDS0808020", "P-885.51"]
 
 
 @slow

@@ -11,7 +11,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.report.page.live_data import live_data
+from psa_casadi.report.page.live import live_data
 from psa_casadi.simulation.simulate import input_samples, simulate
 from psa_casadi.simulation.start import initial_slope, start_on
 from psa_casadi.simulation.ways import accurate

@@ -1,5 +1,6 @@
 """The local page's rules: who may ask, how much is taken, one run at a time, an end for all."""
 
+import base64
 import http.client
 import io
 import json
@@ -16,10 +17,9 @@ import pytest
 
 from psa_casadi.cli import web
 from psa_casadi.errors import InputError
-from psa_casadi.workbench.desk import Desk
+from psa_casadi.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
-from psa_casadi.workbench.uploads import Limits, stored_name
 from tests.test_ended_commands import runs
 from tests.test_own_effects import RIPPLE, install
 
@@ -141,7 +141,8 @@ def test_a_file_is_read_and_its_columns_are_mapped(tab: Tab) -> None:
     assert tab.post("/settings", {"columns": "displacement=pos:10um"}) == 200
     seen = tab.state()["items"][0]["seen"]
     assert seen["problems"] == []
-    assert max(seen["record"]["x"]) == pytest.approx(49 * 10e-6)
+    assert seen["record"]["reached"] == pytest.approx([0.0, 49 * 10e-6])
+    assert base64.b64decode(seen["record"]["picture"]).startswith(b"\x89PNG")
     assert seen["record"]["seconds"] == pytest.approx(0.099)
     assert tab.post("/settings", {"columns": "displacement=pas:um"}) == 200
     assert "'pas'" in tab.state()["items"][0]["seen"]["problems"][0]

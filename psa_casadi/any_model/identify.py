@@ -24,7 +24,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise import first_order_noise
 from psa_casadi.records.signals import Hold, signals_given
-from psa_casadi.shown import StillReported, frame
+from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Parameter, Provenance
 from psa_casadi.version import __version__
@@ -138,7 +138,7 @@ _ALL = 0.8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OdeIdentification(StillReported):
+class OdeIdentification(Reported):
     """A model with fitted values, how sure they are, and remarks, which `warnings` tells.
 
     `errors` are the parameters' standard errors, `intervals` their 95 % intervals in

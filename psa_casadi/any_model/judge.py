@@ -23,7 +23,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict
+from psa_casadi.diagnosis.result import Candidate, Remaining, Verdict, estimates
 from psa_casadi.diagnosis.screening import probabilities, temperature
 from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
@@ -231,7 +231,7 @@ def _diagnosis(
     free: Sequence[Free],
 ) -> OdeDiagnosis:
     root = known.found[frozenset()]
-    sure = certainty(named.fit)
+    model = with_told(named.fit.model, known.runs, certainty(named.fit))
     runs, noise = _noise(known, named)
     partly = known.view(named).test.alarm
     shares = {c.name: _own_share(known, named, c, removed) for c in named.causes}
@@ -244,14 +244,7 @@ def _diagnosis(
             belongs_to=c.belongs_to,
             description=c.description,
             confidence=float(min(0.99, told[c.name].get(c.name, 1.0))),
-            parameters={
-                p.name: Estimate(
-                    named.fit.model.values[p.name], p.unit,
-                    (sure.intervals[p.name].low, sure.intervals[p.name].high),
-                )
-                for p in c.parameters
-                if p.name in sure.intervals
-            },
+            parameters=estimates(c, model),
             cannot_be_told_from=rivals(told[c.name], c.name),
             explained_share=shares[c.name].shown[0],
             remedy=c.what_now.code,
@@ -277,7 +270,7 @@ def _diagnosis(
         ),
         remaining=left[named.names],
         remarks=(*notes, *(note("small", effect=n, share=shares[n].shown[0]) for n in small)),
-        model=with_told(named.fit.model, known.runs, sure),
+        model=model,
         base_fit=root.fit,
         extended_fit=named.fit,
         runs=runs,

@@ -124,7 +124,7 @@ def _page(done: "BatchRun", report: Path | None) -> Path | None:
         return None
     from psa_casadi.errors import InputError
     from psa_casadi.population.population import population
-    from psa_casadi.report.page.population_page import write_population
+    from psa_casadi.report.page.devices import write_population
 
     try:
         found = population(done.findings)

@@ -69,7 +69,7 @@ def check(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.export.check.check import check_fmu
     from psa_casadi.files import atomic_write
-    from psa_casadi.report.documents.check_file import check_file
+    from psa_casadi.report.documents.files import check_file
     from psa_casadi.report.documents.junit import check_cases
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence

@@ -32,8 +32,7 @@ def compare(
     from psa_casadi.devices.batch import read_results
     from psa_casadi.population.population import population
     from psa_casadi.report.documents.findings import read_findings
-    from psa_casadi.report.page.comparison_page import write_comparison
-    from psa_casadi.report.page.population_page import write_population
+    from psa_casadi.report.page.devices import write_comparison, write_population
     from psa_casadi.report.words.population_words import difference_sentence, population_sentences
 
     given = Given(effects)

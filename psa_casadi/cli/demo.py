@@ -63,8 +63,8 @@ def demo(
     from psa_casadi.identification.identify import identify
     from psa_casadi.model.model_file import save_model
     from psa_casadi.records import read_record
-    from psa_casadi.report.page.diagnosis import write_report
-    from psa_casadi.report.plots.figure import save_figure
+    from psa_casadi.report.page.results import write_report
+    from psa_casadi.report.plots.figures import save_figure
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence, story
     from psa_casadi.simulation.ahead import compiled_ahead

@@ -158,17 +158,26 @@ def _write(
     output: Path | None,
     page: tuple[Path | None, bool],
 ) -> None:
-    from psa_casadi.report.page.experiment_part import write_experiment_page, write_voltage
+    from psa_casadi.records import write_record
+    from psa_casadi.report.page.designs import write_experiment_page
+    from psa_casadi.report.page.live import live_design
+    from psa_casadi.simulation.simulate import simulate
 
+    time, voltage = design.record.time, design.record.voltage
     if output is not None:
-        write_voltage(output, design.record)
+        write_record(output, {"time [s]": time, "voltage [V]": voltage})
     report, still = page
-    if report is not None:
-        write_experiment_page(report, design, model, {r.name: r for r in rivals}, still=still)
+    if report is None:
+        return
+    live = None
+    if not still:
+        live = live_design(model, (time, voltage, simulate(model, time, voltage).displacement))
+    responses = {r.name: r.predict(design.record, r.truth) for r in rivals}
+    write_experiment_page(report, design, model, responses, live)
 
 
 def _tell(design: "Informative | Separated", model: "Model", quiet: bool) -> None:
-    from psa_casadi.report.page.experiment_part import design_tables, sentences
+    from psa_casadi.report.words.design_words import design_tables, sentences
 
     for sentence in sentences(design, model.values.get("C_p")):
         show(sentence, quiet)

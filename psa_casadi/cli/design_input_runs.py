@@ -26,21 +26,19 @@ from psa_casadi.design.tracking.tracking import TrackedInput
 from psa_casadi.design.tracking.tracking import track as tracked
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record, write_record
-from psa_casadi.report.page.design_input_part import (
-    Titled,
-    error_table,
+from psa_casadi.report.page.designs import (
     inversion_pictures,
-    limits_table,
     move_pictures,
     tracking_pictures,
     trial_pictures,
+    write_design_page,
 )
-from psa_casadi.report.page.design_page import write_design_page
-from psa_casadi.report.page.live_part import LiveModel, live_design
+from psa_casadi.report.page.live import LiveModel, live_design
+from psa_casadi.report.words.design_words import Titled, error_table, limits_table
 from psa_casadi.report.words.phrases import number
 
 if TYPE_CHECKING:
-    from psa_casadi.report.page.packed import Picture
+    from psa_casadi.report.page.document import Picture
 
 _Rows = list[tuple[str, TrackingError]]
 

@@ -82,7 +82,7 @@ def mechanism(
         port_model,
     )
     from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.page.mechanism_page import write_mechanism_page
+    from psa_casadi.report.page.designs import write_mechanism_page
 
     given = Given(effects)
     given.outputs({"--output": output, "--port": port, "--report": report}, [model])
@@ -111,7 +111,7 @@ def mechanism(
 
 
 def _tell(design: "MechanismDesign", quiet: bool) -> None:
-    from psa_casadi.report.page.mechanism_page import (
+    from psa_casadi.report.words.design_words import (
         mechanism_sentences,
         mechanism_table,
         pole_table,

@@ -104,7 +104,8 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
     from psa_casadi.diagnosis.result import NextExperiment
     from psa_casadi.diagnosis.search.steps import one_of_each
     from psa_casadi.errors import PsaError
-    from psa_casadi.report.page.experiment_part import sentences, write_voltage
+    from psa_casadi.records import write_record
+    from psa_casadi.report.words.design_words import sentences
 
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
@@ -119,7 +120,8 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
     if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
         reasons = (*before.reasons, *each[:-1], *same)
         return replace(d, next_experiment=replace(before, reasons=reasons))
-    write_voltage(path, design.record)
+    played = design.record
+    write_record(path, {"time [s]": played.time, "voltage [V]": played.voltage})
     reasons = (f"Apply {path} and diagnose all records together.", *each, *same)
     following = NextExperiment(str(path), design.names, reasons, dict(design.chance))
     return replace(d, next_experiment=following)

@@ -89,6 +89,6 @@ def _seen(effect: "Component", stack: "Model | None") -> "tuple[Model, tuple[Siz
 
 def _draw(effect: "Component", path: Path) -> None:
     from psa_casadi.diagnosis.signature import signature
-    from psa_casadi.report.plots.signature_figure import save_signature
+    from psa_casadi.report.plots.figures import save_signature
 
     save_signature(effect, signature(effect), path)

@@ -134,8 +134,8 @@ def _finish(
     from psa_casadi.files import atomic_write
     from psa_casadi.identification.profile import profile
     from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.documents.identification_file import identification_file
-    from psa_casadi.report.page.fit_page import write_fit_report
+    from psa_casadi.report.documents.files import identification_file
+    from psa_casadi.report.page.results import write_fit_report
     from psa_casadi.strict_json import json_text
 
     json, report, still = more

@@ -76,9 +76,8 @@ def sample(
     from psa_casadi.cli.inputs import Given
     from psa_casadi.files import atomic_path, atomic_write
     from psa_casadi.posterior.sample import sample as run
-    from psa_casadi.report.documents.posterior_file import posterior_file
-    from psa_casadi.report.plots.figure import DPI
-    from psa_casadi.report.plots.posterior_figure import posterior_figure
+    from psa_casadi.report.documents.files import posterior_file
+    from psa_casadi.report.plots.figures import DPI, posterior_figure
     from psa_casadi.report.words.text import posterior_text
     from psa_casadi.strict_json import json_text
 

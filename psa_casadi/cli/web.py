@@ -73,7 +73,7 @@ def web(
         _serve(port or 0, no_browser, effects or [])
         return
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.report.page.playground_page import write_playground
+    from psa_casadi.report.page.playground import write_playground
 
     given, path = Given(effects), output or Path("playground.html")
     if port is not None or no_browser:

@@ -43,15 +43,10 @@ from psa_casadi.identification.refitting import Progress
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding
-from psa_casadi.report.documents.device_file import (
-    FORMAT,
-    DeviceFile,
-    DeviceRecord,
-    damage,
-    hash_of,
-)
+from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
+from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of
 from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding, finding_content
-from psa_casadi.report.documents.read_document import read_document
+from psa_casadi.report.documents.reading import read_document
 from psa_casadi.strict_json import json_text, parse_json, read_json_text
 from psa_casadi.version import __version__
 

@@ -14,8 +14,7 @@ from psa_casadi.interruption import Work, interruptible_work
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.records import Record, read_records
-from psa_casadi.report.documents.device_file import Status
-from psa_casadi.report.documents.identification_file import identification_file
+from psa_casadi.report.documents.files import Status, identification_file
 from psa_casadi.simulation.ahead import compiled
 from psa_casadi.simulation.side_by_side import one_thread
 from psa_casadi.strict_json import json_text

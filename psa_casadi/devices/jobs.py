@@ -24,7 +24,7 @@ from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.records.read.formats import READERS
-from psa_casadi.report.documents.device_file import Status, Work
+from psa_casadi.report.documents.files import Status, Work
 from psa_casadi.version import __version__
 
 COLUMNS = ("device", "batch", "date", "files")

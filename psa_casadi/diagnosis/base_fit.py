@@ -293,7 +293,7 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     if "k_P" not in base.model.values:
         return None
     records = [e.record for e in fitted(experiments)]
-    progress("resonances and lags that the records show")
+    progress("resonances and lags")
     linear = linear_start(records, base.model.values)
     fastest = min(r.sample_time for r in records)
     if linear is None or not resolved(base.model, linear.candidates, fastest):
@@ -338,7 +338,7 @@ def instead_of_mode(
     damping ratio times its frequency is the same. None where no mass explains the data about as
     well as the mode.
     """
-    progress("base fit, with the mode as a resonance of the stack's own")
+    progress("base fit, mode as resonance")
     values = found.model.values
     tone, damping = values[mode.tone or ""], values["mode_damping"]
     rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
@@ -410,7 +410,7 @@ def _with_ringing(
     tone = ringing(fit, experiments)
     if tone is None or tone.decrease < seen:
         return None
-    progress(f"base fit, with a resonance that may be seen at {tone.tone:.3g} Hz")
+    progress(f"base fit, resonance at {tone.tone:.3g} Hz")
     starts = [m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z)]
     return _with_masses(fit, starts, experiments, least)
 

@@ -92,7 +92,7 @@ def driven(
     notes = tuple(s for doubt in doubts if (s := doubt(records)))
     if share >= thresholds().follows and correlation(records) > thresholds().falling:
         return Driven(follows=True, notes=notes)
-    progress("with the sign flipped")
+    progress("the displacement with flipped sign")
     other = _flipped(model, experiments)
     shown = max(share, 0.0)
     if other > max(share, thresholds().follows):

@@ -1,4 +1,4 @@
-"""The evidence of a diagnosed model: that of its fit, the held-out error, and where it goes."""
+"""The model of a diagnosis with its evidence: its fit, the held-out error, where that goes."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,30 +7,34 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.held_out import Budget, Share, errors_of, held_out_parts, jackknife
-from psa_casadi.identification.determinacy import Determinacy
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.model.evidence import ErrorBudget, ErrorShare, Evidence, HeldOut
+from psa_casadi.identification.identify import with_provenance
+from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import ErrorBudget, ErrorShare, HeldOut
 from psa_casadi.records.split import Experiment
 from psa_casadi.variables import Interval
 
 FloatArray = npt.NDArray[np.float64]
 
 
-def diagnosis_evidence(
+def diagnosed_model(
     fit: Fit,
-    found: Determinacy,
     experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
+    stiffness_given: bool,
     spent: Budget | None = None,
-) -> Evidence:
-    """Return what stands behind a model of a diagnosis; `spent` is the budget of its error."""
-    told = evidence_of(fit, found, experiments, predicted, by="psa diagnose")
-    return replace(
-        told,
+) -> Model:
+    """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
+    found = determinacy(fit, experiments)
+    told = replace(
+        evidence_of(fit, found, experiments, predicted, by="psa diagnose"),
         held_out=_held_out(experiments, predicted),
         budget=None if spent is None else _budget(spent),
     )
+    records = [e.record for e in experiments]
+    return with_provenance(fit.model, found, records, stiffness_given, evidence=told)
 
 
 def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> HeldOut | None:

@@ -11,8 +11,7 @@ All powers are mean squares over the held-out samples, above that of the noise:
 
     share of a cause = (P_without - P_all) / (P_base - noise^2)
 
-P_without is that of the model fitted again without the cause. Its interval:
-`psa_casadi.diagnosis.held_out`.
+P_without is that of the model fitted again without the cause.
 """
 
 from collections.abc import Callable, Sequence

@@ -27,9 +27,9 @@ FloatArray = npt.NDArray[np.float64]
 class Patch:
     """An unnamed correction: its kind and port, what else it may be, evidence and predictions.
 
-    `open_to` are other kinds and ports that explain the data
-    as well; `predicted` [m] are whole records with it, `added` [m] its own part of them,
-    `weights` [m] those of its terms, `moved` how far the model's own theta follows.
+    `open_to` are other kinds and ports that explain the data as well; `predicted` [m] are whole
+    records with it, `added` [m] its own part of them, `weights` [m] those of its terms, `moved` how
+    far the model's own theta follows.
     """
 
     kind: str

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
@@ -37,6 +38,16 @@ class Estimate:
     value: float
     unit: str
     interval: tuple[float, float]
+
+
+def estimates(effect: Component, model: Model) -> dict[str, Estimate]:
+    """Return what a fitted model's provenance says of an effect's own parameters."""
+    known = model.provenance.intervals
+    return {
+        p.name: Estimate(model.values[p.name], p.unit, (known[p.name].low, known[p.name].high))
+        for p in effect.parameters
+        if p.name in known
+    }
 
 
 @dataclass(frozen=True)

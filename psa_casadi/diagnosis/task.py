@@ -114,26 +114,25 @@ _MASSES = ("m_P", "m_B", "m")
 #: Further columns that show the displacement.
 _TELL_BENDS = ("displacement_2", "strain")
 
-#: The steps of the method that a diagnosis can go without, to show what each is good for, and what
-#: is done in their place.
-STEPS = {
-    "one clock": "readings stay on a clock of their own, whatever the data say",
-    "remainder": "the noise's colour is that of the residual, not of what nothing explains",
-    "finite steps": "effects whose derivative vanishes at their null are not looked for by a step",
-    "fits afresh": "no fits from an ordinary base beside those from the fitted one",
-    "other parents": "a set is fitted from one of its parents only",
-    "begun again": "a cause that comes near the end of its range does not begin once more",
-    "base again": "the base is not fitted again from where a cause has led",
-    "resonances": "no resonances that the base has missed are tried",
-    "several modes": "no series of modes is fitted where one leaves structure",
-    "several at once": "causes are found one by one only",
-    "exchange": "causes are not exchanged beside the later ones",
-    "all afresh": "effects far behind in the screening are never fitted",
-    "rejected": "no neighbours of what held-out data reject are fitted",
-    "held out": "held-out data are not asked",
-    "between samples": "the voltage between two samples is a straight line, whatever the data say",
-    "form": "a further cause may be smaller than the first one's form is known",
-}
+#: The steps of the method that a diagnosis can go without, to show what each is good for.
+STEPS = (
+    "one clock",  # readings stay on a clock of their own, whatever the data say
+    "remainder",  # the noise's colour is that of the residual, not of what nothing explains
+    "finite steps",  # effects whose derivative vanishes at their null are not sought by a step
+    "fits afresh",  # no fits from an ordinary base beside those from the fitted one
+    "other parents",  # a set is fitted from one of its parents only
+    "begun again",  # a cause that comes near the end of its range does not begin once more
+    "base again",  # the base is not fitted again from where a cause has led
+    "resonances",  # no resonances that the base has missed are tried
+    "several modes",  # no series of modes is fitted where one leaves structure
+    "several at once",  # causes are found one by one only
+    "exchange",  # causes are not exchanged beside the later ones
+    "all afresh",  # effects far behind in the screening are never fitted
+    "rejected",  # no neighbours of what held-out data reject are fitted
+    "held out",  # held-out data are not asked
+    "between samples",  # the voltage between two samples is a straight line, whatever the data say
+    "form",  # a further cause may be smaller than the first one's form is known
+)
 
 
 @dataclass(frozen=True)

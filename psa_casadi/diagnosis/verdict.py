@@ -13,7 +13,7 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import corrections
-from psa_casadi.diagnosis.evidence import diagnosis_evidence
+from psa_casadi.diagnosis.evidence import diagnosed_model
 from psa_casadi.diagnosis.held_out import (
     Budget,
     budget,
@@ -40,19 +40,17 @@ from psa_casadi.diagnosis.result import (
     Candidate,
     Cause,
     Diagnosis,
-    Estimate,
     NextExperiment,
     Remaining,
     Verdict,
+    estimates,
 )
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
 from psa_casadi.diagnosis.task import same_curves, thresholds
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
@@ -173,12 +171,7 @@ def alternatives(
                 differs = _difference(final, fitted.fit, experiments)
             except PsaError:
                 continue
-            told = determinacy(fitted.fit, experiments)
-            records = [e.record for e in experiments]
-            evidence = diagnosis_evidence(fitted.fit, told, experiments, fitted.predicted)
-            model = with_provenance(
-                fitted.fit.model, told, records, stiffness_given, evidence=evidence
-            )
+            model = diagnosed_model(fitted.fit, experiments, fitted.predicted, stiffness_given)
             found.append(
                 Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
             )
@@ -277,7 +270,6 @@ def conclude(
         final.view.of.holdout_rms,
         colour,
     )
-    found = determinacy(final.fit, experiments)
     missed = _misfits(experiments, base_errors, noise)
     spent = budget(
         experiments,
@@ -287,18 +279,12 @@ def conclude(
         None if patch is None else (patch.name, patch.predicted),
         floor,
     )
-    model = with_provenance(
-        final.fit.model,
-        found,
-        [e.record for e in experiments],
-        stiffness_given,
-        evidence=diagnosis_evidence(final.fit, found, experiments, final.predicted, spent),
-    )
+    model = diagnosed_model(final.fit, experiments, final.predicted, stiffness_given, spent)
     named = kept if verdict in NAMING else []
     small = too_small([c for c in spent.causes if c.what not in vague]) if partly and named else ()
     unnamed = {*vague, *(c.what for c in small)}
     causes = tuple(
-        _cause(s, model, found, spent, experiments) for s in named if s.cause.name not in unnamed
+        _cause(s, model, spent, experiments) for s in named if s.cause.name not in unnamed
     )
     return Diagnosis(
         verdict=verdict,
@@ -356,10 +342,7 @@ def patched_model(d: Diagnosis) -> Model:
         raise InputError("No unnamed correction removes more than the extended model does.")
     found = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
     given = d.model.provenance.force_scale == "given"
-    told = determinacy(found, d.experiments)
-    evidence = diagnosis_evidence(found, told, d.experiments, found.predicted(d.experiments))
-    records = [e.record for e in d.experiments]
-    return with_provenance(found.model, told, records, given, evidence=evidence)
+    return diagnosed_model(found, d.experiments, found.predicted(d.experiments), given)
 
 
 def _misfits(
@@ -374,26 +357,15 @@ def _misfits(
     )
 
 
-def _cause(
-    s: Step, model: Model, found: Determinacy, spent: Budget, experiments: Sequence[Experiment]
-) -> Cause:
+def _cause(s: Step, model: Model, spent: Budget, experiments: Sequence[Experiment]) -> Cause:
     """State a cause: its probability, the share of the error that it removes, what it changes."""
     records = [e.record for e in experiments]
-    estimates = {
-        p.name: Estimate(
-            model.values[p.name],
-            p.unit,
-            (found.intervals[p.name].low, found.intervals[p.name].high),
-        )
-        for p in s.cause.parameters
-        if p.name in found.intervals
-    }
     own = next((c for c in spent.causes if c.what == s.cause.name), None)
     return Cause(
         effect=s.cause.name,
         belongs_to=s.cause.belongs_to,
         confidence=float(min(0.99, s.probability[s.cause.name])),
-        parameters=estimates,
+        parameters=estimates(s.cause, model),
         cannot_be_told_from=told_from(s),
         explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
         remedy=s.cause.what_now.code,

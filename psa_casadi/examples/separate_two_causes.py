@@ -18,8 +18,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records.record import Record
-from psa_casadi.report.page.experiment_part import write_voltage
+from psa_casadi.records import Record, write_record
 from psa_casadi.simulation.simulate import simulate
 
 EFFECT, RIVAL = "field_dependent_gain", "sensor_nonlinearity"
@@ -35,7 +34,8 @@ def main(folder: Path) -> dict[str, str]:
     effects = [EFFECTS[EFFECT], EFFECTS[RIVAL]]
     before = diagnose([first], effects=effects)
     design = resolving_experiment(before, limits=LIMITS, effort=Effort(draws=2, starts=1, steps=3))
-    write_voltage(folder / "voltage.csv", design.record)
+    time, voltage = design.record.time, design.record.voltage
+    write_record(folder / "voltage.csv", {"time [s]": time, "voltage [V]": voltage})
     played = {n: measured(r, seed=2) for n, r in {**usual, "designed": design.record}.items()}
     after = {n: diagnose([first, r], effects=effects) for n, r in played.items()}
     _draw(folder / "separate_two_causes.png", design, played, after)

@@ -1,5 +1,5 @@
 // What all scripts of the page share: elements made of text alone, never of markup.
-var psaLive = {}, desk = {told: JSON.parse(document.getElementById('told').textContent)};
+var desk = {told: JSON.parse(document.getElementById('told').textContent)};
 
 desk.el = function (id) { return document.getElementById(id); };
 

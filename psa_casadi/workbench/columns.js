@@ -106,19 +106,13 @@ desk.columns = (function () {
         make('table', {className: 'mapping'}, make('thead', {}, top), body)), use);
   }
 
-  function draw(items) {
-    desk.el('curves').replaceChildren.apply(desk.el('curves'), items.map(function (item) {
-      var r = item.seen.record, scale = r.unit === 'm' ? 1e6 : 1, x = r.x.map(function (v) { return v === null ? NaN : scale * v; });
-      var unit = r.unit === 'm' ? 'µm' : 'counts', t = make('canvas'), loop = make('canvas');
-      [t, loop].forEach(function (c, k) { c.setAttribute('role', 'img'); c.ariaLabel = item.name + (k ? ': displacement over voltage' : ': voltage over time'); });
-      requestAnimationFrame(function () {
-        psaLive.plot(t, {x: 'time [s]', y: 'voltage [V]', curves: [{x: r.t, y: r.v, colour: '--model'}]});
-        psaLive.plot(loop, {x: 'voltage [V]', y: 'displacement [' + unit + ']', curves: [{x: r.v, y: x, colour: '--measured', dots: true}]});
-      });
-      var more = r.others.length ? '; also ' + r.others.map(desk.words).join(', ') : '';
-      return make('figure', {}, make('figcaption', {}, item.name),
-        make('p', {className: 'note'}, r.n + ' samples in ' + +r.seconds.toPrecision(4) + ' s' + more), t, loop);
-    }));
+  function record(item) {
+    var r = item.seen.record, more = r.others.length ? '; also ' + r.others.map(desk.words).join(', ') : '';
+    var ends = r.reached.map(function (x) { return r.unit === 'm' ? desk.length(x) : x + ' counts'; });
+    var reached = ends.length ? ', displacement ' + ends.join(' to ') : '';
+    return make('figure', {}, make('figcaption', {}, item.name),
+      make('p', {className: 'note'}, r.n + ' samples in ' + +r.seconds.toPrecision(4) + ' s' + reached + more),
+      make('img', {className: 'still', src: 'data:image/png;base64,' + r.picture, alt: item.name + ': voltage over time, displacement over voltage'}));
   }
 
   return function (items, text) {
@@ -138,8 +132,8 @@ desk.columns = (function () {
       });
     });
     var drawn = items.filter(function (i) { return i.seen && i.seen.record; });
-    var key = JSON.stringify(drawn.map(function (i) { return [i.key, i.name, i.seen.record]; }));
-    if (desk.el('curves').shown !== key) { desk.el('curves').shown = key; draw(drawn); }
-    desk.curves = function () { draw(drawn); };
+    desk.filled(desk.el('curves'), JSON.stringify(drawn.map(function (i) { return [i.key, i.name, i.seen.record]; })), function () {
+      return drawn.map(record);
+    });
   };
 })();

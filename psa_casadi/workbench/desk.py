@@ -1,24 +1,86 @@
-"""What lies on the workbench: files, settings, one run; the same for every tab that looks at it."""
+"""The files of the page and its runs; what lies there is the same for every tab."""
 
+import re
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
 
+from psa_casadi.characters import plain, visible
 from psa_casadi.errors import InputError
+from psa_casadi.records.read.file_bytes import MOST_BYTES
 from psa_casadi.workbench import run as runs
 from psa_casadi.workbench.previews import preview
-from psa_casadi.workbench.run import Run, Settings
-from psa_casadi.workbench.uploads import (
-    Limits,
-    Upload,
-    received,
-    removed,
-    shown_name,
-    stored_name,
-)
+from psa_casadi.workbench.run import Run, Settings, removed
+
+#: The most files, and the most bytes of all of them together.
+MOST_FILES, MOST_TOGETHER = 32, 2 * MOST_BYTES
+#: The longest name, in letters.
+_LONGEST = 80
+_BLOCK = 2**20
+#: What a name of a file may not have, on any system, in a command line or in --columns.
+_BARRED = re.compile(r"[^\w.+() -]")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The most that is taken: bytes of one file, of all together, and files."""
+
+    one: int = MOST_BYTES
+    together: int = MOST_TOGETHER
+    files: int = MOST_FILES
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A file that was given: the name that it had, and where it lies by a name without marks."""
+
+    key: int
+    name: str
+    path: Path
+    size: int
+
+
+def stored_name(name: str, taken: Collection[str]) -> str:
+    """Return a name to store a file by: without paths and marks, and unlike those that are taken.
+
+    The ending is kept, as it says how a file is read.
+    """
+    last = re.split(r"[\\/]", plain(name))[-1]
+    clean = _BARRED.sub("_", last).strip(" .").lstrip("-").strip(" .") or "record"
+    stem, dot, ending = clean.rpartition(".")
+    stem, ending = (stem, dot + ending) if dot else (ending, "")
+    stem, ending = stem[:_LONGEST].rstrip(" ."), ending[:16]
+    there = {n.casefold() for n in taken}
+    names = (f"{stem}{f'_{k + 1}' if k else ''}{ending}" for k in range(len(there) + 1))
+    return next(n for n in names if n.casefold() not in there)  # there is one more than are taken
+
+
+def shown_name(name: str) -> str:
+    """Return a file's name as the page shows it."""
+    return plain(visible(name))[: 2 * _LONGEST] or "record"
+
+
+def received(stream: BufferedIOBase, size: int, target: Path, admit: Callable[[int], None]) -> None:
+    """Write so many bytes of a stream to a new file; `admit` is asked with how many there are.
+
+    Raises:
+        InputError: the stream ends before, or the file cannot be written.
+    """
+    left = size
+    try:
+        with target.open("xb") as file:
+            while left and (block := stream.read(min(left, _BLOCK))):
+                left -= len(block)
+                admit(size - left)
+                file.write(block)
+    except OSError as error:
+        raise InputError(f"The file cannot be kept ({error.strerror or error}).") from error
+    if left:
+        raise InputError("The file did not arrive whole; give it again.")
+
 
 #: What is said of what a run forbids.
 BUSY = "A diagnosis runs; stop it first, or wait until it has ended."

@@ -1,10 +1,12 @@
-"""What a file looks like: first rows, columns, a small curve. Read in a process of its own.
+"""What a file looks like: first rows, columns, a small picture. Read in a process of its own.
 
 A damaged file may end the process that reads it, and a large one fills its memory; neither is to
 end the page.
 """
 
+import base64
 import contextlib
+import io
 import json
 import subprocess
 import sys
@@ -12,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, MachineError
@@ -20,15 +23,15 @@ from psa_casadi.records.read.columns import TABLE, columns_of, parse_columns
 from psa_casadi.records.read.reading import read_records
 from psa_casadi.records.record import Record
 
-#: Time [s] that a file may take, and the stretches a curve is drawn in.
-_LIMIT_S, _STRETCHES = 120.0, 300
+#: Time [s] that a file may take.
+_LIMIT_S = 120.0
 _MODULE = "psa_casadi.workbench.previews"
 
 
 def preview(
     folder: Path, path: Path, columns: str | None, sample_time: float | None, *, held: bool
 ) -> dict[str, Any]:
-    """Return the head of a file, the problems that it is read with, and the record as a curve.
+    """Return the head of a file, the problems that it is read with, and the record in a picture.
 
     `folder` is where the process runs that reads it: none that holds files of others. `columns` is
     the text of --columns, `sample_time` [s] that of --sample-time; a file that is `held` out needs
@@ -68,7 +71,7 @@ def looked_at(
     return {
         "head": None if head is None else _head(head),
         "problems": problems,
-        "record": None if record is None else _curve(record),
+        "record": None if record is None else _told(record),
     }
 
 
@@ -86,27 +89,40 @@ def _head(head: Head) -> dict[str, Any]:
     }
 
 
-def _curve(record: Record) -> dict[str, Any]:
-    """Return times [s], voltages [V] and displacements [m] that show every turn of a record."""
-    measured = record.displacement
-    x = np.full(record.n, np.nan) if measured is None else measured
-    kept = {0, record.n - 1}
-    for part in np.array_split(np.arange(record.n), min(_STRETCHES, record.n)):
-        for values in (record.voltage[part], x[part]):
-            if np.isfinite(values).any():
-                kept |= {int(part[np.nanargmin(values)]), int(part[np.nanargmax(values)])}
-    chosen = np.array(sorted(kept))
+def _told(record: Record) -> dict[str, Any]:
+    """Return how long a record is, what it reaches, and its picture."""
+    x = record.displacement
+    reached = [] if x is None else [float(np.nanmin(x)), float(np.nanmax(x))]
     others = ("load_force", "current", "temperature", "monitor_voltage", "charge",
               "displacement_2", "strain")  # fmt: skip
     return {
         "n": record.n,
         "seconds": float(record.time[-1] - record.time[0]),
         "unit": record.displacement_unit,
+        "reached": reached,
         "others": [name for name in others if getattr(record, name) is not None],
-        "t": record.time[chosen].tolist(),
-        "v": record.voltage[chosen].tolist(),
-        "x": [float(v) if np.isfinite(v) else None for v in x[chosen]],
+        "picture": _picture(record),
     }
+
+
+def _picture(record: Record) -> str:
+    """Return a small PNG: the voltage over time, and where there is one the loop."""
+    figure = Figure(figsize=(8.4, 2.5), dpi=100, layout="constrained")
+    over_time, loop = figure.subplots(1, 2)
+    over_time.plot(record.time, record.voltage, color="#0072b2", linewidth=0.9)
+    over_time.set(xlabel="time [s]", ylabel="voltage [V]")
+    if record.displacement is None:
+        loop.set_axis_off()
+    else:
+        scale, unit = (1e6, "µm") if record.displacement_unit == "m" else (1.0, "counts")
+        x = scale * record.displacement
+        loop.plot(record.voltage, x, color="#3a3a3a", linewidth=0.7)
+        loop.set(xlabel="voltage [V]", ylabel=f"displacement [{unit}]")
+    for axes in (over_time, loop):
+        axes.grid(color="#e4e7ea")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def main() -> None:

@@ -1,20 +1,156 @@
 """The local page's server: this machine only, whoever has the address, nothing from outside."""
 
+import base64
 import contextlib
+import hashlib
+import hmac
 import json
+import secrets
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
 from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
+from jinja2 import Environment
+from markupsafe import Markup
+
 from psa_casadi.errors import InputError, MachineError
+from psa_casadi.records.read.columns import COLUMNS
+from psa_casadi.units import units_of
+from psa_casadi.version import __version__
 from psa_casadi.workbench.desk import BUSY, BusyError, Desk
-from psa_casadi.workbench.gate import HOST, Gate
-from psa_casadi.workbench.page import PAGE_POLICY, REPORT_POLICY, door, page
+
+#: The name of the machine for itself, as addresses have it.
+HOST = "127.0.0.1"
+#: What a browser says of a request that the page itself, or nobody else's page, has caused.
+_OWN = ("same-origin", "none")
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What opens a page at a port: a token in the address, then a cookie.
+
+    The cookie is no part of an address, no script can read it, and a browser sends it with nothing
+    that another site has caused. The names of the machine are a fixed list, so that a name of
+    somebody else which leads to this machine (DNS rebinding) opens nothing.
+    """
+
+    port: int
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+    _session: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+
+    @property
+    def address(self) -> str:
+        """The address that opens the page."""
+        return f"http://{HOST}:{self.port}/?token={self.token}"
+
+    @property
+    def cookie(self) -> str:
+        """What a browser is given to keep."""
+        return f"{self._name}={self._session}; HttpOnly; SameSite=Strict; Path=/"
+
+    @property
+    def _name(self) -> str:
+        return f"psa_{self.port}"  # browsers have one set of cookies for all ports
+
+    def opens(self, token: str) -> bool:
+        """Whether an address's token is the right one."""
+        return _same(token, self.token)
+
+    def refused(self, method: str, headers: Mapping[str, str]) -> tuple[HTTPStatus, str] | None:
+        """Return why a request is refused, before its cookie is looked at; None where it is not."""
+        hosts = [f"{name}:{self.port}" for name in (HOST, "localhost")]
+        host = headers.get("Host", "")
+        if host not in hosts:
+            return HTTPStatus.MISDIRECTED_REQUEST, "This page has another address."
+        if method == "POST" and headers.get("Origin", "") != f"http://{host}":
+            return HTTPStatus.FORBIDDEN, "Only the page itself may ask for this."
+        return None
+
+    def knows(self, headers: Mapping[str, str]) -> bool:
+        """Whether a request has the cookie and is not caused by another site."""
+        if headers.get("Sec-Fetch-Site", "none") not in _OWN:
+            return False
+        try:
+            found = SimpleCookie(headers.get("Cookie", "")).get(self._name)
+        except CookieError:
+            return False
+        return found is not None and _same(found.value, self._session)
+
+
+def _same(one: str, other: str) -> bool:
+    return hmac.compare_digest(one.encode(), other.encode())
+
+
+_PAGE, _REPORT = "psa_casadi.workbench", "psa_casadi.report.page"
+_STYLES = ((_REPORT, "page.css"), (_REPORT, "live.css"), (_PAGE, "workbench.css"))
+_SCRIPTS = (
+    (_PAGE, "begin.js"), (_PAGE, "columns.js"), (_PAGE, "files.js"),
+    (_PAGE, "search.js"), (_PAGE, "workbench.js"),
+)  # fmt: skip
+#: What stands at the address with the token, and its only script: it leads to the page, which
+#: asks for all that follows, so that the token is in no address.
+_ENTER = "location.replace('/');"
+_DOOR = (
+    '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Diagnose records</title>'
+    f"</head><body><p><a href='/'>Open the page</a></p><script>{_ENTER}</script></body></html>\n"
+)
+
+
+def page(effects: Sequence[str]) -> str:
+    """Return the page; `effects` are those that a person may leave out of the search."""
+    told = {
+        "effects": list(effects),
+        "columns": {n: [u for q in c.quantities for u in units_of(q)] for n, c in COLUMNS.items()},
+    }
+    return Environment(autoescape=True).from_string(_source(_PAGE, "workbench.html")).render(
+        style=Markup(_style()), script=Markup(_script()), version=__version__,
+        told=Markup(json.dumps(told).replace("<", "\\u003c")),
+    )  # fmt: skip
+
+
+@cache
+def _style() -> str:
+    return "".join(_source(*place) for place in _STYLES)
+
+
+@cache
+def _script() -> str:
+    return "\n".join(_source(*place) for place in _SCRIPTS)
+
+
+def _source(package: str, name: str) -> str:
+    return files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+#: What a browser is told to refuse: scripts and styles but the page's own, requests to others, a
+#: frame around the page.
+PAGE_POLICY = {
+    "Content-Security-Policy": (
+        f"default-src 'none'; script-src {_hash(_script())} {_hash(_ENTER)};"
+        f" style-src {_hash(_style())}; img-src data:; connect-src 'self'; frame-src 'self';"
+        " frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    )
+}
+#: A report is a page of its own that runs its scripts and can reach nothing here, not even by the
+#: cookie; beside this its own policy holds.
+REPORT_POLICY = {
+    "Content-Security-Policy": "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"
+}
+
 
 #: The most bytes of a request that is not a file, and how long a connection may be silent [s].
 _MOST_ASKED, _SILENT_S = 2**16, 60.0
@@ -108,7 +244,7 @@ class _Handler(BaseHTTPRequestHandler):
         if refused is not None:
             self._refuse(*refused)
         elif parts.path == "/" and self.server.gate.opens(asked.get("token", "")):
-            self._send(door(), _HTML, {"Set-Cookie": self.server.gate.cookie, **PAGE_POLICY})
+            self._send(_DOOR, _HTML, {"Set-Cookie": self.server.gate.cookie, **PAGE_POLICY})
         elif not self.server.gate.knows(dict(self.headers)):
             self._refuse(
                 HTTPStatus.FORBIDDEN,

@@ -110,9 +110,5 @@
     return asked;
   };
 
-  var again = 0;
-  function redraw() { clearTimeout(again); again = setTimeout(function () { if (desk.curves) { desk.curves(); } }, 150); }
-  window.addEventListener('resize', redraw);
-  window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redraw);
   desk.look();
 })();

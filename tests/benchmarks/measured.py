@@ -19,7 +19,7 @@ from psa_casadi.identification.refitting import refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.split import Experiment, split
-from psa_casadi.report.plots.narrow_figure import narrow_figure
+from psa_casadi.report.plots.figures import narrow_figure
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.table import Outcome, Progress, TitledTable
 

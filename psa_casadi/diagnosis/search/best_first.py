@@ -83,7 +83,7 @@ class _Search:
     def result(self) -> Searched:
         best = self.known.best()
         if len(best.causes) > 1 and self.known.view(best).test.alarm:
-            self.task.progress("all causes together, to the end")
+            self.task.progress("all causes to the end")
             self.known.note(together(best, self.task.experiments))
         return self.known.result()
 
@@ -278,7 +278,7 @@ class _Search:
                     self.known.note(without(h, cause, task.experiments, less))
         before = self.known.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
-            task.progress(f"without {h.causes[-1].name}, with one mode in its place")
+            task.progress(f"without {h.causes[-1].name}, one mode instead")
             for one in one_mode(h, before, task.experiments):
                 self.known.note(one)
             self.known.remember(before, STRUCTURAL_MODE.name)

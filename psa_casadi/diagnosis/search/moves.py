@@ -271,7 +271,7 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     apart = [s for s in ranked if not s.names & h.names]
     starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
     said = ", ".join("+".join(sorted(s.names)) for s in starts)
-    task.progress(f"several causes at once: fitting {said}")
+    task.progress(f"several causes: fitting {said}")
     goal = cost_beside(known.best().fit, root.fit, task.experiments)
     ways = [with_causes]
     if "fits afresh" not in task.method.without:
@@ -304,7 +304,7 @@ def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
             other = known.get(child.names - {cause.name})
             if other is not None and evidence(other) + gained > evidence(child):
                 added = child.causes[-1].name
-                task.progress(f"cause {len(child.causes)}: {added} as beside fewer causes")
+                task.progress(f"cause {len(child.causes)}: {added} once more")
                 known.note(in_place(child, other, other.fit, h.fit, cause, task.experiments))
 
 

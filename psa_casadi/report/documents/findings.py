@@ -21,12 +21,10 @@ from psa_casadi.population.finding import (
     NamedCause,
     replayed,
 )
-from psa_casadi.report.documents.device_file import FORMAT as DEVICE
-from psa_casadi.report.documents.device_file import DeviceFile, damage
-from psa_casadi.report.documents.diagnosis_file import DiagnosisFile
-from psa_casadi.report.documents.identification_file import FORMAT as IDENTIFICATION
-from psa_casadi.report.documents.identification_file import IdentificationFile
-from psa_casadi.report.documents.read_document import read_document
+from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
+from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
+from psa_casadi.report.documents.files import DeviceFile, DiagnosisFile, IdentificationFile, damage
+from psa_casadi.report.documents.reading import read_document
 from psa_casadi.strict_json import parse_json, read_json_text
 
 #: The file in a device's folder that says how its work ended.

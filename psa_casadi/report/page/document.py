@@ -1,197 +1,194 @@
-"""One self-contained HTML page: style, script, sections, tables and plots, nothing from the net."""
+"""One self-contained HTML page: a template filled in, with its scripts and plots packed inside."""
 
 import base64
+import gzip
+import hashlib
 import io
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
+from html import escape
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
+from plotly.offline import get_plotlyjs
 
+from psa_casadi.characters import plain
 from psa_casadi.command_line import typed
-from psa_casadi.report.page import blocks
-from psa_casadi.report.page.blocks import Bar
-from psa_casadi.report.page.packed import Drawings, Picture, library_hash, script_hash
-from psa_casadi.report.page.packed import words as _text
-from psa_casadi.report.plots.theme import DARK
+from psa_casadi.report.plots.panel import DARK, Panel, plotly_figure
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
 
+_HOME = "psa_casadi.report.page"
+_FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
+_HASH = re.compile(r"[0-9a-f]{64}")
+_WIDE = 28
 #: Levels of red, green and blue of a still picture: lines on paper take few, and it is small.
 _LEVELS = 16
 #: The scripts of a model that runs in a page, by what it does there, in their order.
-_LIVE = ("live_model.js", "live_plot.js", "live_zoom.js", "live_knobs.js")
+_LIVE = ("live_model.js", "live_plot.js", "live_knobs.js")
 LIVE_SCRIPTS = {
     "report": (*_LIVE, "live_budget.js", "live.js", "live_start.js"),
     "playground": (*_LIVE, "live_fmu.js", "voltages.js", "playground.js", "live_start.js"),
 }
 
 
-class Document:
-    """Collects the parts of a page in their order and returns its text."""
+@dataclass(frozen=True)
+class Picture:
+    """A plot with its caption and, below it, what the reader must know to read it."""
 
-    def __init__(self, title: str, badges: Sequence[str]) -> None:
-        self._title, self._alive, self._drawings = title, "", Drawings()
-        marks = "".join(
-            f'<span class="badge {_text(b.split()[0])}">{_text(b)}</span>' for b in badges
-        )
-        self._head = f"<h1>{_text(title)}</h1><p>{marks}</p>"
-        self._top: list[str | Callable[[], str]] = []
-        self._parts = self._top
-        self._sections: list[tuple[str, str]] = []
+    caption: str
+    panel: Panel
+    note: str = ""
 
-    def section(self, title: str) -> None:
-        """Begin a section that the list of contents at the top names."""
-        if not self._sections:
-            self._parts = []
-        name = f"s{len(self._sections) + 1}"
-        self._sections.append((name, title))
-        self._parts.append(f'<h2 id="{name}">{_text(title)}</h2>')
 
-    def heading(self, text: str) -> None:
-        """Begin a part of a section."""
-        self._parts.append(f"<h3>{_text(text)}</h3>")
+def render(template: str, title: str, badges: Sequence[str] = (), **given: Any) -> str:
+    """Return a page; no script runs in it but its own, and it asks for nothing outside."""
+    return filled(template, page=_Page(), title=title, badges=badges, made=_made(), **given)
 
-    def paragraph(self, text: str, kind: str = "") -> None:
-        """Add a paragraph; `kind` is the name of a style."""
-        marked = f' class="{kind}"' if kind else ""
-        self._parts.append(f"<p{marked}>{_text(text)}</p>")
 
-    def bullets(self, texts: Iterable[str]) -> None:
-        """Add a list."""
-        self._parts.append(blocks.bullets(texts))
+def filled(template: str, **given: Any) -> str:
+    """Return the text of a template that is filled in."""
+    return _environment().get_template(template).render(given)
 
-    def warnings(self, texts: Sequence[str]) -> None:
-        """Add a box that nobody overlooks; nothing if there is nothing to warn of."""
-        if texts:
-            word = "Warning" if len(texts) == 1 else "Warnings"
-            self._parts.append(
-                f'<div class="warnings" role="alert"><p>{word}</p>{blocks.bullets(texts)}</div>'
-            )
 
-    def advice(self, title: str, texts: Sequence[str], commands: Sequence[str]) -> None:
-        """Add a box that says what to do, and what to type."""
-        typed_text = "\n".join(commands)
-        block = f'<pre tabindex="0">{_text(typed_text)}</pre>' if commands else ""
-        self._parts.append(
-            f'<div class="advice"><p>{_text(title)}</p>{blocks.bullets(texts)}{block}</div>'
+class _Page:
+    """What the templates put into a page beside text: plots, the model that runs, scripts.
+
+    Plots over the same time share it: an array is in the page once.
+    """
+
+    def __init__(self) -> None:
+        self.sections: list[tuple[str, str]] = []
+        self._arrays: dict[str, int] = {}
+        self._plots, self._alive = False, ""
+
+    def section(self, title: str) -> str:
+        """Note a section for the list of contents; return the name that links lead to."""
+        self.sections.append((f"s{len(self.sections) + 1}", title))
+        return self.sections[-1][0]
+
+    def plot(self, panel: Panel) -> Markup:
+        """Return the data of a plot, whose long arrays are shared."""
+        self._plots = True
+        return _json(
+            plotly_figure(panel, lambda array: self._arrays.setdefault(array, len(self._arrays)))
         )
 
-    def tiles(self, figures: Iterable[tuple[str, str, str]]) -> None:
-        """Add the main figures in a row: label, figure, and a remark that may be empty."""
-        self._parts.append(blocks.tiles(figures))
+    def live(self, told: Mapping[str, Any]) -> Markup:
+        """Return what the script of a model that runs in the page must know of it."""
+        self._alive = told["kind"]
+        return _json(told)
 
-    def bars(self, caption: str, rows: Sequence[Bar], floor: float, note: str) -> None:
-        """Add bars of one scale, with a line across them at `floor`."""
-        self._parts.append(blocks.bars(caption, rows, floor, note))
+    def style(self) -> Markup:
+        """Return the style sheet."""
+        return Markup(source("page.css") + (source("live.css") if self._alive else ""))
 
-    def table(
-        self, table: Table, marks: Mapping[str, str] | None = None, *, folded: str = ""
-    ) -> None:
-        """Add a table; a cell whose text is in `marks` gets that style.
+    def scripts(self) -> list[Markup]:
+        """Return the scripts that the page runs."""
+        found = [source("packed.js")] if self._plots or self._alive else []
+        found += [source("page.js")] if self._plots or self._alive else []
+        found += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
+        return [Markup(text) for text in found]
 
-        It is `folded` away behind these words, where they are given.
-        """
-        content = blocks.table(table, marks)
-        self._parts.append(blocks.folded(folded, content) if folded else content)
+    def policy(self) -> Markup:
+        """Return what a browser is told to refuse: all scripts but the page's, and all requests."""
+        allowed = [script_hash(text) for text in self.scripts()]
+        allowed += [_library()[1]] if self._plots or self._alive else []
+        rules = (
+            "default-src 'none'", "style-src 'unsafe-inline'", "img-src data: blob:",
+            f"script-src 'wasm-unsafe-eval' {' '.join(allowed)}", "base-uri 'none'",
+            "form-action 'none'",
+        )  # fmt: skip
+        return Markup("; ".join(rules))
 
-    def picture(self, picture: Picture) -> None:
-        """Add a plot over the whole width."""
-        self._parts.append(self._drawings.figure(picture))
-
-    def still(self, figure: Figure, caption: str) -> None:
-        """Add a picture that matplotlib draws; it is seen where the plots cannot be drawn.
-
-        That is where scripts are off, or the browser is older than 2023.
-        """
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()  # type: ignore[no-untyped-call]
-        drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-        step, buffer = 255.0 / (_LEVELS - 1), io.BytesIO()
-        imsave(buffer, (step * np.rint(drawn / step)).astype(np.uint8), format="png")
-        data = base64.b64encode(buffer.getvalue()).decode("ascii")
-        self._parts.append(
-            f'<figure class="stand-in"><figcaption>{_text(caption)}</figcaption><img class="still"'
-            f' alt="{_text(caption)}" src="data:image/png;base64,{data}"></figure>'
-        )
-
-    def pictures(self, pictures: Iterable[Picture]) -> None:
-        """Add plots side by side, two in a row where there is room."""
-        figures = "".join(map(self._drawings.figure, pictures))
-        self._parts.append(f'<div class="pair">{figures}</div>')
-
-    def live(self, told: Callable[[], Mapping[str, Any] | str]) -> None:
-        """Add a model that runs in the page.
-
-        What live.js must know of it is asked for when all else is there; words say why it is not.
-        """
-
-        def part() -> str:
-            found = told()
-            if isinstance(found, str):
-                return f'<p class="note">{_text(found)}</p>'
-            self._alive = found["kind"]
-            return (
-                f'<div class="live">{_json(found)}<p class="note still-note">With scripts on, the'
-                " model runs here: sliders for its parameters, switches for its effects.</p></div>"
-            )
-
-        self._parts.append(part)
-
-    def text(self) -> str:
-        """Return the page; no script runs in it but its own, and it asks for nothing outside."""
-        contents = "".join(f'<a href="#{n}">{_text(title)}</a>' for n, title in self._sections)
-        body = [self._head, *self._top]
-        if self._sections:
-            body += [f'<nav aria-label="contents">{contents}</nav>', *self._parts]
-        told = [part if isinstance(part, str) else part() for part in body]
-        style = _source("page.css") + (_source("live.css") if self._alive else "")
-        scripts = [_source("packed.js")] if self._drawings or self._alive else []
-        scripts += [_source("page.js")] if self._drawings else []
-        scripts += ["\n".join(map(_source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
-        allowed = [script_hash(text.encode()) for text in scripts]
-        allowed += [library_hash()] if self._drawings else []
-        return (
-            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-            + _policy(allowed)
-            + '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            f"<title>{_text(self._title)}</title><style>{style}</style>"
-            + "</head>\n<body><main>\n"
-            + "\n".join(told)
-            + f"\n<footer>{_text(_made())}</footer>"
-            + f'\n<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
-            + (self._drawings.shared() if self._drawings else "")
-            + "\n</main>"
-            + "".join(f"<script>{text}</script>" for text in scripts)
-            + "\n</body></html>\n"
-        )
+    def shared(self) -> Markup:
+        """Return what all plots take: colours at night, the arrays, the library that draws them."""
+        if not (self._plots or self._alive):
+            return Markup("")
+        colours = f'<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
+        held = {"arrays": packed(" ".join(self._arrays).encode()), "library": _library()[0]}
+        rows = (f'<script type="application/gzip" id="{n}">{t}</script>' for n, t in held.items())
+        return Markup(colours + "".join(rows))
 
 
-def _source(name: str) -> str:
-    """Return a style or script that lies beside this file."""
-    return files("psa_casadi.report.page").joinpath(name).read_text(encoding="utf-8")
-
-
-def _policy(scripts: Iterable[str]) -> str:
-    """Return what a browser is told to refuse: all scripts but these, and all requests."""
-    allowed = " ".join(scripts)
-    rules = (
-        "default-src 'none'", "style-src 'unsafe-inline'", "img-src data: blob:",
-        f"script-src 'wasm-unsafe-eval' {allowed}", "base-uri 'none'", "form-action 'none'",
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=PackageLoader(_HOME, "templates"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, finalize=_words,
     )  # fmt: skip
-    return f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">'
+    made.globals.update(column_styles=_column_styles, still_picture=_still_picture)
+    return made
 
 
-def _json(content: object) -> str:
+def _words(value: Any) -> Any:
+    """Return words as HTML can carry them; a percent sign stays with its number."""
+    if hasattr(value, "__html__"):
+        return value
+    return Markup(escape(plain(str(value))).replace(" %", "\u00a0%"))
+
+
+def _column_styles(table: Table) -> list[str]:
+    """Return the style of every column: figures, hashes, long texts, or none."""
+    return [_column_style(c) for c in zip(*table.rows, strict=True)] or [""] * len(table.head)
+
+
+def _column_style(cells: tuple[str, ...]) -> str:
+    filled = [c for c in cells if c]
+    if filled and all(_FIGURE.fullmatch(c) for c in filled):
+        return "figure"
+    if filled and all(_HASH.fullmatch(c) for c in filled):
+        return "hash"
+    return "wide" if any(len(c) > _WIDE for c in filled) else ""
+
+
+def _still_picture(figure: Figure) -> str:
+    """Return the address of a small PNG that matplotlib draws."""
+    canvas: Any = figure.canvas
+    canvas.draw()
+    drawn, step = np.asarray(canvas.buffer_rgba()), 255.0 / (_LEVELS - 1)
+    buffer = io.BytesIO()
+    imsave(buffer, (step * np.rint(drawn / step)).astype(np.uint8), format="png")
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def source(name: str) -> str:
+    """Return a style or script that lies beside this file."""
+    return files(_HOME).joinpath(name).read_text(encoding="utf-8")
+
+
+def packed(content: bytes) -> str:
+    """Return bytes as packed.js opens them: gzip in base64."""
+    return base64.b64encode(gzip.compress(content, 9, mtime=0)).decode("ascii")
+
+
+def script_hash(text: str) -> str:
+    """Return what a content security policy calls a script or a style."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+@cache  # packing takes 0.3 s
+def _library() -> tuple[str, str]:
+    """Return the script that the installed plotly draws with, packed, and its hash."""
+    text = get_plotlyjs()
+    return packed(text.encode()), script_hash(text)
+
+
+def _json(content: object) -> Markup:
     """Return data for a script; "<" is escaped so that no text in it can end the script."""
     text = json.dumps(content, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
-    return f'<script type="application/json">{text}</script>'
+    return Markup(f'<script type="application/json">{text}</script>')
 
 
 def _made() -> str:

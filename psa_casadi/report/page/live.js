@@ -63,7 +63,7 @@ psaLive.report = function (box, told, run) {
 
   // --- what is seen
   var plots = ['time', 'loop', 'residual'].map(function (name) {
-    return make('canvas', {role: 'img', 'aria-label': told.captions[name]});
+    return make('div', {className: 'plot', role: 'img', 'aria-label': told.captions[name]});
   });
   function figure(k) {
     return make('figure', {}, [make('figcaption', {text: told.captions[['time', 'loop', 'residual'][k]]}), plots[k]]);
@@ -111,25 +111,26 @@ psaLive.report = function (box, told, run) {
     var held = r.held.map(function (s) { return [r.time[s[0]], r.time[s[1]]]; });
     var was = r.fitted.map(function (y) { return f * y; });
     var moved = knobs.moved().length > 0 || corrected.checked;
+    var part = psaLive.stretch(r.time, zoom.reach), time = part(r.time), measured = {colour: '--measured', width: 3};
+    function curve(y, look) { return Object.assign({x: time, y: part(y)}, look); }
     psaLive.plot(plots[0], {
-      x: 'time [' + told.time.unit + ']', y: 'displacement [' + told.length.unit + ']', bands: held, reach: zoom.reach,
-      curves: [{x: r.time, y: r.shown, colour: '--measured', dots: true}]
-        .concat(moved ? [{x: r.time, y: was, colour: '--fitted', width: 1}] : [])
-        .concat([{x: r.time, y: model, colour: '--model'}])
+      x: 'time [' + told.time.unit + ']', y: 'displacement [' + told.length.unit + ']', bands: held, reach: zoom.reach, zooms: true,
+      curves: [curve(r.shown, measured)].concat(moved ? [curve(was, {colour: '--fitted', width: 1})] : [])
+        .concat([curve(model, {colour: '--model'})])
     });
-    var part = psaLive.stretch(r.time, zoom.reach);
     psaLive.plot(plots[1], {
       x: 'voltage [V]', y: 'displacement [' + told.length.unit + ']',
-      curves: [{x: part(r.voltage), y: part(r.shown), colour: '--measured', dots: true}, {x: part(r.voltage), y: part(model), colour: '--model', width: 1}]
+      curves: [Object.assign({x: part(r.voltage), y: part(r.shown)}, measured), {x: part(r.voltage), y: part(model), colour: '--model', width: 1}]
     });
-    var ends = [r.time[0], r.time[r.time.length - 1]];
+    var ends = [time[0], time[time.length - 1]];
     psaLive.plot(plots[2], {
-      x: 'time [' + told.time.unit + ']', y: told.aim + ' minus model [' + told.error.unit + ']', bands: held, reach: zoom.reach,
-      curves: [{x: r.time, y: now.residual.map(function (e) { return g * e; }), colour: '--model', width: 1}]
+      x: 'time [' + told.time.unit + ']', y: 'difference [' + told.error.unit + ']', bands: held, reach: zoom.reach, zooms: true,
+      curves: [curve(now.residual.map(function (e) { return g * e; }), {colour: '--model', width: 1})]
         .concat((r.noise > 0 ? [2, -2] : []).map(function (k) {
-          return {x: ends, y: [k * g * r.noise, k * g * r.noise], colour: '--measured', dash: [5, 4], width: 1};
+          return {x: ends, y: [k * g * r.noise, k * g * r.noise], colour: '--measured', dash: 'dash', width: 1};
         }))
     });
+    zoom.listen();
   }
 
   // What each effect that is on takes off the error now, by itself; when the slider rests.

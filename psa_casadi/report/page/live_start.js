@@ -3,8 +3,8 @@ Array.prototype.forEach.call(document.querySelectorAll('.live'), function (box, 
   'use strict';
   var told = JSON.parse(box.querySelector('script').textContent), still = box.querySelector('.still-note');
   told.number = number;
-  psaLive.load(told).then(function (run) {
+  Promise.all([psaLive.load(told), psaPage.ready]).then(function (found) {
     still.hidden = true;
-    psaLive[told.kind](box, told, run);
+    psaLive[told.kind](box, told, found[0]);
   }).catch(function (error) { still.textContent = 'This browser does not run the model: ' + error.message; });
 });

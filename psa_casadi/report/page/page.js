@@ -1,13 +1,15 @@
-(function () {
+// What all plots of a page share: the library, colours by day and night. Draws those that stand still.
+var psaPage = (function () {
   'use strict';
-  var dark = JSON.parse(document.getElementById('dark-colours').textContent);
   var scheme = window.matchMedia('(prefers-color-scheme: dark)');
   var finger = window.matchMedia('(pointer: coarse)').matches;
   var boxes = Array.prototype.slice.call(document.querySelectorAll('.drawing'));
-  var config, arrays;
-  if (!psaPacked.able) { return; } // the still picture stays
+  var config = {responsive: true, displaylogo: false, displayModeBar: false}, dark, arrays;
+  if (!psaPacked.able) { // the still picture stays
+    return {ready: Promise.reject(new Error('it is older than 2023')), finger: finger};
+  }
+  dark = JSON.parse(document.getElementById('dark-colours').textContent);
   document.documentElement.classList.add('scripted');
-  config = {responsive: true, displaylogo: false, displayModeBar: false};
 
   // every colour of a figure is written for paper; at night each has a counterpart
   function painted(part, night) {
@@ -29,6 +31,7 @@
   function draw(box, night, width) {
     var figure = painted(JSON.parse(box.previousElementSibling.textContent), night);
     var layout = figure.layout;
+    layout.template = {}; // all is said in the figure itself
     if (width) {
       layout.width = width;
       layout.autosize = false;
@@ -52,9 +55,12 @@
     });
   }
 
-  function begin(library) {
+  var ready = Promise.all(['arrays', 'library'].map(function (name) {
+    return psaPacked.text(document.getElementById(name).textContent);
+  })).then(function (found) {
+    arrays = found[0].split(' ');
     var script = document.createElement('script');
-    script.textContent = library;
+    script.textContent = found[1];
     document.head.appendChild(script);
     all(scheme.matches, false);
     scheme.addEventListener('change', function () { all(scheme.matches, false); });
@@ -63,15 +69,7 @@
       all(false, true);
     });
     window.addEventListener('afterprint', function () { all(scheme.matches, false); });
-  }
-
-  Promise.all(['arrays', 'library'].map(function (name) {
-    return psaPacked.text(document.getElementById(name).textContent);
-  })).then(function (found) {
-    arrays = found[0].split(' ');
-    begin(found[1]);
-  }).catch(function (error) {
-    document.documentElement.classList.remove('scripted');
-    throw error;
   });
+  ready.catch(function () { document.documentElement.classList.remove('scripted'); });
+  return {ready: ready, finger: finger};
 })();

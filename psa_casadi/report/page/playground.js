@@ -19,8 +19,8 @@ psaLive.playground = function (box, told, run) {
 
   // --- what is seen
   var CAPTIONS = ['Voltage', 'Displacement', 'Loop: displacement over voltage', 'What the effects add', 'Current', 'Gain over frequency, small steps'];
-  var plots = CAPTIONS.map(function (caption) { return make('canvas', {role: 'img', 'aria-label': caption}); });
-  var figures = plots.map(function (canvas, k) { return make('figure', {}, [make('figcaption', {text: CAPTIONS[k]}), canvas]); });
+  var plots = CAPTIONS.map(function (caption) { return make('div', {className: 'plot', role: 'img', 'aria-label': caption}); });
+  var figures = plots.map(function (plot, k) { return make('figure', {}, [make('figcaption', {text: CAPTIONS[k]}), plot]); });
   var output = make('output', {}), status = make('span', {role: 'status'}), beyond = make('p', {className: 'warnings', role: 'alert', hidden: true});
   var legend = make('div', {className: 'legend'});
   [['--model', 'with the effects'], ['--measured', 'without any']].forEach(function (row) {
@@ -58,18 +58,21 @@ psaLive.playground = function (box, told, run) {
     var y = now.outputs[told.shown], y0 = without.found.outputs[told.shown];
     var time = scaled(t, 1e3), um = scaled(y, UM.factor), um0 = scaled(y0, UM.factor);
     var added = y.map(function (x, k) { return 1e9 * (x - y0[k]); });
-    var label = 'time [ms]', part = psaLive.stretch(time, zoom.reach);
-    psaLive.plot(plots[0], {x: label, y: 'voltage [V]', reach: zoom.reach, curves: [{x: time, y: v, colour: '--measured'}]});
-    psaLive.plot(plots[1], {x: label, y: 'displacement [\u00b5m]', reach: zoom.reach, curves: [
-      {x: time, y: um0, colour: '--measured', width: 1}, {x: time, y: um, colour: '--model'}]});
+    var label = 'time [ms]', part = psaLive.stretch(time, zoom.reach), shown = part(time);
+    function over(k, unit, rows, still) {
+      psaLive.plot(plots[k], {x: label, y: unit, reach: zoom.reach, zooms: !still, curves: rows.map(function (row) {
+        return {x: shown, y: part(row[0]), colour: row[1], width: row[2]};
+      })});
+    }
+    over(0, 'voltage [V]', [[v, '--measured']], true);
+    over(1, 'displacement [\u00b5m]', [[um0, '--measured', 1], [um, '--model']]);
     psaLive.plot(plots[2], {x: 'voltage [V]', y: 'displacement [\u00b5m]', curves: [
       {x: part(v), y: part(um0), colour: '--measured', width: 1}, {x: part(v), y: part(um), colour: '--model'}]});
-    psaLive.plot(plots[3], {x: label, y: 'difference [nm]', reach: zoom.reach, curves: [{x: time, y: added, colour: '--model'}]});
+    over(3, 'difference [nm]', [[added, '--model']]);
     if (now.outputs.current) {
-      psaLive.plot(plots[4], {x: label, y: 'current [mA]', reach: zoom.reach, curves: [
-        {x: time, y: scaled(without.found.outputs.current, 1e3), colour: '--measured', width: 1},
-        {x: time, y: scaled(now.outputs.current, 1e3), colour: '--model'}]});
+      over(4, 'current [mA]', [[scaled(without.found.outputs.current, 1e3), '--measured', 1], [scaled(now.outputs.current, 1e3), '--model']]);
     }
+    zoom.listen();
     output.textContent = 'Stroke ' + +(UM.factor * span(y)).toPrecision(4) + ' \u00b5m. The effects add up to ' +
       +Math.max.apply(null, added.map(Math.abs)).toPrecision(3) + ' nm, ' +
       +(100e-9 * Math.max.apply(null, added.map(Math.abs)) / (span(y0) || 1)).toPrecision(2) + ' % of the stroke without them.';

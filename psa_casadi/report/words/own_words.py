@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,11 +33,6 @@ from psa_casadi.report.words.verdict_words import (
     share_row,
     within,
 )
-
-if TYPE_CHECKING:
-    from psa_casadi.any_model.identify import OdeIdentification
-    from psa_casadi.any_model.result import OdeDiagnosis
-
 
 #: Outputs that a sentence names one by one.
 _NAMED = 4
@@ -246,7 +240,7 @@ _VERDICTS = {
 }
 
 
-def _diagnosis(d: "OdeDiagnosis") -> str:
+def _diagnosis(d: OdeDiagnosis) -> str:
     """Return the verdict, the causes with their sizes, the errors and what remains, in lines."""
     several = len(d.causes) > 1
     named = f"{len(d.causes)} causes are" if several else "a cause is"
@@ -276,7 +270,7 @@ def _diagnosis(d: "OdeDiagnosis") -> str:
     return "\n".join([*lines, *(f"  {line}" for line in rest if line)])
 
 
-def _identification(found: "OdeIdentification") -> str:
+def _identification(found: OdeIdentification) -> str:
     """Return the parameters with their standard errors, and what is left of the outputs."""
     model = found.model
     rows = [

@@ -19,6 +19,7 @@ from psa_casadi.report.words.phrases import (
     handy_scale,
     interval_text,
     listing,
+    lowered,
     number,
     percent,
     plain,
@@ -302,7 +303,7 @@ def _in_plant(cause: Cause) -> bool:
 def _of_cause(cause: Cause | PortCause, length: Length) -> str:
     """Return how large a cause is and what to do about it."""
     size, do = size_text(cause.sizes, length), DO.get(cause.remedy, DO["extended_model"])
-    against = f"{size}. Against it: {_lower(do)}" if size else _lower(do)
+    against = f"{size}. Against it: {lowered(do)}" if size else lowered(do)
     return f"{plain(cause.effect).capitalize()}: {against}."
 
 
@@ -311,7 +312,7 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
     lines = []
     for cause in causes:
         known = [EFFECTS[n] for n in cause.cannot_be_told_from[:_RIVALS] if n in EFFECTS]
-        each = [f"{plain(e.name)}: {_lower(DO[e.what_now.code])}" for e in known]
+        each = [f"{plain(e.name)}: {lowered(DO[e.what_now.code])}" for e in known]
         if each:
             own = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
             tests = dict.fromkeys(e.what_now.test for e in (*own, *known))
@@ -358,7 +359,3 @@ def effect_size(effect: Component, model: Model, sizes: Sequence[Size]) -> str:
 def effect_advice(effect: Component) -> tuple[str, str]:
     """Return what to do about an effect, and which record shows it."""
     return DO[effect.what_now.code], RECORDS[effect.what_now.test]
-
-
-def _lower(text: str) -> str:
-    return f"{text[0].lower()}{text[1:]}"

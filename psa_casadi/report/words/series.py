@@ -341,20 +341,10 @@ def spectrum(time: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatA
     grid = np.arange(time[0], time[-1], step)
     even = np.interp(grid, time[valid], residual[valid])
     segment = min(len(even), max(256, len(even) // 6))
-    power = _mean_power(even, segment) * step
-    frequency = np.asarray(np.fft.rfftfreq(segment, step), dtype=float)
-    return frequency[1:], np.asarray(np.sqrt(power[1:]))
+    from scipy.signal import welch  # which takes long to load, and only pages need
 
-
-def _mean_power(values: FloatArray, segment: int) -> FloatArray:
-    """Return the power of one-sided spectra of segments that overlap by half (Welch 1967)."""
-    parts = np.lib.stride_tricks.sliding_window_view(values, segment)
-    parts = parts[:: segment - segment // 2]
-    window = np.hanning(segment + 1)[:-1]
-    spectra = np.fft.rfft((parts - np.mean(parts, axis=1, keepdims=True)) * window, axis=1)
-    power: FloatArray = np.mean(np.abs(spectra) ** 2, axis=0) / np.sum(window**2)
-    power[1 : (segment + 1) // 2] *= 2.0  # what the negative frequencies hold
-    return power
+    frequency, power = welch(even, 1.0 / step, nperseg=segment)
+    return frequency[1:], np.sqrt(power[1:])
 
 
 def shown_lines(frequency: FloatArray, density: FloatArray, limit: int) -> IndexArray:

@@ -27,6 +27,7 @@ from psa_casadi.report.words.phrases import (
     shown_in,
     with_unit,
 )
+from psa_casadi.report.words.series import ResidualFigures
 from psa_casadi.simulation.timings import Stage
 from psa_casadi.units import convert
 
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.any_model.runs import Run
     from psa_casadi.export.check.check import CheckReport, CheckRow
-    from psa_casadi.report.words.series import ResidualFigures
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def column_table(d: Diagnosis) -> Table:
     return _table(("column", "used as", "unit", *head), rows)
 
 
-def fit_error_table(rows: "Sequence[tuple[str, ResidualFigures]]", scale: Scale) -> Table:
+def fit_error_table(rows: Sequence[tuple[str, ResidualFigures]], scale: Scale) -> Table:
     """Return what the model leaves of every record, beside the record's noise level."""
     lines = []
     for name, f in rows:

@@ -171,7 +171,7 @@ def effect_page(
 ) -> str:
     """Return one effect: what it is, equation, signature, source, what now, parameters.
 
-    `seen` is a model that holds it, and how large it is there (`diagnosis.remedy.size.example`).
+    `seen` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
     """
     lines = [
         ("what", effect.description),

@@ -1,0 +1,583 @@
+"""What the JSON files hold: models, diagnoses, identifications, posteriors, checks, devices."""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from psa_casadi.any_model.result import OdeBudget, OutputError, PortCause
+from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
+from psa_casadi.diagnosis.result import (
+    Candidate,
+    Cause,
+    Verdict,
+    unnamed_causes,
+)
+from psa_casadi.export.check.check import CheckReport
+from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.profile import Profile
+from psa_casadi.model.evidence import Evidence
+from psa_casadi.posterior.sample import Figures, Posterior
+from psa_casadi.records.record import Record
+from psa_casadi.report.words.fit_words import Degree, grade
+from psa_casadi.shown import Lined
+from psa_casadi.variables import Publication
+from psa_casadi.version import __version__
+
+CHECK_FORMAT: Literal["psa_casadi.check/1"] = "psa_casadi.check/1"
+
+
+@dataclass(frozen=True)
+class CheckedRow:
+    """One check: the figure found (null: the check broke down), the largest allowed, a remark."""
+
+    name: str
+    found: float | None
+    allowed: float
+    passed: bool
+    remark: str
+
+
+@dataclass(frozen=True)
+class CheckFile:
+    """The checks of an FMU; `compared` says whether there was a model to compare with.
+
+    `left_out` names the checks that this kind of FMU has nothing for.
+    """
+
+    format: Literal["psa_casadi.check/1"]
+    package_version: str
+    fmu: str
+    passed: bool
+    compared: bool
+    rows: tuple[CheckedRow, ...]
+    left_out: tuple[str, ...] = ()
+
+
+def check_file(report: CheckReport) -> dict[str, Any]:
+    """Return what `--json` writes of the checks of an FMU."""
+    rows = (
+        CheckedRow(
+            r.name, r.figure if math.isfinite(r.figure) else None, r.limit, r.passed, r.remark
+        )
+        for r in report.rows
+    )
+    passed, compared = report.passed, report.compared
+    path, left_out = str(report.path), report.left_out
+    return asdict(
+        CheckFile(CHECK_FORMAT, __version__, path, passed, compared, tuple(rows), left_out)
+    )
+
+
+DEVICE_FORMAT: Literal["psa_casadi.device/1"] = "psa_casadi.device/1"
+Work = Literal["identify", "diagnose"]
+Status = Literal["done", "refused", "failed"]
+
+
+@dataclass(frozen=True)
+class DeviceRecord:
+    """A record of the device, with the SHA-256 of its file."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class DeviceFile:
+    """A device of a batch run: how its work ended, and the hash of files and options it is for.
+
+    `refused` says that the records cannot be used, `failed` that something else went wrong; it is
+    tried again by the next run. `sha256` are those of `files`, as they were written.
+    """
+
+    format: Literal["psa_casadi.device/1"]
+    device: str
+    batch: str
+    date: str
+    work: Work
+    status: Status
+    problems: tuple[str, ...]
+    seconds: float
+    key: str
+    package_version: str
+    records: tuple[DeviceRecord, ...]
+    files: tuple[str, ...]
+    sha256: tuple[str, ...] = ()
+
+
+def damage(folder: Path, told: DeviceFile) -> str:
+    """Return what is wrong with the files in a device's folder; "" where they are as written."""
+    for name, sha256 in zip(told.files, told.sha256, strict=False):
+        path = folder / name
+        try:
+            found = hash_of(path.read_bytes())
+        except OSError as error:
+            return f"{path}: cannot be read ({error.strerror}); run `psa batch` again."
+        if found != sha256:
+            return f"{path}: is damaged, as it is not what was written; run `psa batch` again."
+    return ""
+
+
+def hash_of(content: bytes) -> str:
+    """Return the SHA-256 by which the content of a file is known again."""
+    return hashlib.sha256(content).hexdigest()
+
+
+class Told(Lined):
+    """A diagnosis as its file tells it: shows itself, and is written again as it was read."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of the file; what this version does not know is left out."""
+        found: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
+        return found
+
+    def to_json(self) -> str:
+        """Return the text of the file."""
+        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+@dataclass(frozen=True)
+class BothErrors:
+    """The noise floor [m], and the errors of the base and the extended model."""
+
+    noise_floor_rms_m: float
+    base: Errors
+    extended: Errors
+
+
+@dataclass(frozen=True)
+class UnnamedCorrection:
+    """An unnamed correction that helps: its kind and place, evidence, and what else it may be."""
+
+    kind: str
+    port: str
+    sentence: str
+    evidence: float
+    open_to: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class OtherModel:
+    """The extended model with another effect instead of a cause; how much the two differ."""
+
+    cause: str
+    instead: str
+    rms_ratio: float
+    plant_differs_m: float
+    plant_differs_percent: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a further column decided: what is named with it and without it, and in words.
+
+    An `output` is fitted, with `noise` and held-out errors `base_rms` and `extended_rms` in its SI
+    `unit`; an `input` drives the model, and has none. `named` and `named_without` hold the named
+    sets with their probabilities, `ruled_out` what is only in the latter; `evidence` is what the
+    column adds to ln of the Bayes factor of the extended model over the base.
+    """
+
+    column: str
+    role: Literal["output", "input"]
+    unit: str
+    noise: float | None
+    base_rms: float | None
+    extended_rms: float | None
+    named: Mapping[str, float]
+    named_without: Mapping[str, float]
+    ruled_out: tuple[str, ...]
+    evidence: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class BlindSpot:
+    """An effect of practical size that the records could not have shown."""
+
+    effect: str
+    smallest_detectable_gain: float
+    unit: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """What is left: whether it is noise, and where it is not."""
+
+    white: bool
+    p_value: float
+    where: str
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """The experiment that would distinguish the rivals.
+
+    `voltage_csv` is the file with the voltage to play, where one was written; `chance` is for each
+    rival the probability that it is then named if it is the cause.
+    """
+
+    voltage_csv: str | None
+    separates: tuple[str, ...]
+    why: str
+    chance: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RecordNoise:
+    """The noise of one record: its rms [m], where that is known from, and a sentence."""
+
+    record: str
+    rms: float
+    source: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class RecordMisfit:
+    """What a model gets wrong in one record: rms, excess over the noise [m], shares of views."""
+
+    record: str
+    rms: float
+    excess: float
+    views: Mapping[str, float]
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RecordUsed:
+    """A record that was diagnosed, with the SHA-256 of its file."""
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True, repr=False)
+class DiagnosisFile(Told):
+    """A diagnosis: verdict, causes, errors before and after, and what remains.
+
+    It answers by the names of a `Diagnosis` what needs no samples and no model.
+    """
+
+    format: Literal["psa_casadi.diagnosis/1"]
+    verdict: Verdict
+    doubt: str
+    causes: tuple[Cause, ...]
+    candidates: tuple[Candidate, ...]
+    errors: BothErrors
+    gain: Gain
+    budget: Budget | None
+    patch: UnnamedCorrection | None
+    alternatives: tuple[OtherModel, ...]
+    columns: tuple[Decision, ...]
+    blind_to: tuple[BlindSpot, ...]
+    remaining: Remaining
+    next_experiment: NextExperiment
+    notes: tuple[str, ...]
+    noise: tuple[RecordNoise, ...]
+    misfit: tuple[RecordMisfit, ...]
+    remainder: tuple[RecordMisfit, ...]
+    records: tuple[RecordUsed, ...]
+
+    @property
+    def noise_floor_rms_m(self) -> float:
+        """The noise floor [m]."""
+        return self.errors.noise_floor_rms_m
+
+    @property
+    def base_errors(self) -> Errors:
+        """The errors of the base model."""
+        return self.errors.base
+
+    @property
+    def extended_errors(self) -> Errors:
+        """The errors of the extended model."""
+        return self.errors.extended
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Effects that the extended model holds and that are not named as causes."""
+        return unnamed_causes(self.budget, self.causes)
+
+
+IDENTIFICATION_FORMAT: Literal["psa_casadi.identification/1"] = "psa_casadi.identification/1"
+
+
+@dataclass(frozen=True)
+class FoundParameter:
+    """A parameter: value and 95 % interval in its unit, and how well the records determine it."""
+
+    value: float
+    unit: str
+    interval: tuple[float, float] | None
+    determined: Degree
+    meaning: str
+
+
+@dataclass(frozen=True)
+class FittedRecord:
+    """A record: SHA-256 of its file, samples used, residual rms and noise level [m], and range."""
+
+    name: str
+    sha256: str
+    samples: int
+    rms_m: float
+    noise_m: float
+    rms_percent_of_range: float
+
+
+@dataclass(frozen=True)
+class AdvisedRecord:
+    """A record to measure next: how often, and the parameters that it would determine."""
+
+    sentence: str
+    parameters: tuple[str, ...]
+    repeats: int
+
+
+@dataclass(frozen=True)
+class ProfileInterval:
+    """The 95 % interval of a profile likelihood; an end is null where the cost never rises so."""
+
+    unit: str
+    estimate: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class IdentificationFile:
+    """An identified model: parameters, records, residual, and the records to measure next."""
+
+    format: Literal["psa_casadi.identification/1"]
+    package_version: str
+    model: str
+    parameters: Mapping[str, FoundParameter]
+    rms_m: float
+    converged: bool
+    interrupted: bool
+    records: tuple[FittedRecord, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+    advice: tuple[AdvisedRecord, ...]
+    profiles: Mapping[str, ProfileInterval]
+
+
+def identification_file(found: Identification, profiles: Iterable[Profile] = ()) -> dict[str, Any]:
+    """Return what `--json` writes of an identification."""
+    intervals = found.model.provenance.intervals
+    parameters = {
+        p.name: FoundParameter(
+            found.model.values[p.name],
+            p.unit,
+            (i.low, i.high) if (i := intervals.get(p.name)) is not None else None,
+            grade(found, p.name).degree,
+            p.description,
+        )
+        for p in found.model.structure.parameters
+    }
+    residuals = found.fit.residuals_of(found.experiments)
+    records = [
+        _fitted(e.record, int(e.used.sum()), r, sigma)
+        for e, r, sigma in zip(found.experiments, residuals, found.fit.sigma, strict=True)
+    ]
+    content = IdentificationFile(
+        IDENTIFICATION_FORMAT,
+        __version__,
+        found.model.name,
+        parameters,
+        found.fit.rms,
+        found.fit.converged,
+        found.interrupted,
+        tuple(records),
+        found.warnings,
+        found.sentences,
+        tuple(AdvisedRecord(a.sentence, a.parameters, a.repeats) for a in found.advice),
+        {p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
+    )
+    return asdict(content)
+
+
+def _fitted(record: Record, samples: int, residual: Any, noise: float) -> FittedRecord:
+    rms = float(np.sqrt(np.mean(residual**2)))
+    share = 100.0 * rms / record.range_m
+    return FittedRecord(record.name, record.sha256, samples, rms, float(noise), share)
+
+
+@dataclass(frozen=True)
+class ModelParameter:
+    """A parameter's value in its unit, its 95 % interval, and whether a fit found it."""
+
+    value: float
+    unit: str = ""
+    interval: tuple[float, float] | None = None
+    free: bool = False
+
+
+@dataclass(frozen=True)
+class OwnEffect:
+    """An effect that is not of this package: its module and the hash of what it declares."""
+
+    name: str
+    module: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class IdentifiedFrom:
+    """A record that the model was fitted to, with the SHA-256 of its file."""
+
+    record: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """A model by the names of its components, with every value, interval and origin."""
+
+    format: Literal["psa_casadi.model/1"]
+    components: tuple[str, ...]
+    effects: tuple[str | OwnEffect, ...]
+    parameters: Mapping[str, ModelParameter]
+    name: str = "psa"
+    description: str = ""
+    publication: Publication = field(default_factory=Publication)
+    starts: Mapping[str, float] = field(default_factory=dict)
+    interrupted: bool = False
+    force_scale: str = "assumed"
+    notes: tuple[str, ...] = ()
+    identified_from: tuple[IdentifiedFrom, ...] = ()
+    package_version: str = ""
+    evidence: Evidence | None = None
+
+
+POSTERIOR_FORMAT: Literal["psa_casadi.posterior/1"] = "psa_casadi.posterior/1"
+
+
+@dataclass(frozen=True)
+class SampledParameter:
+    """A parameter's posterior in its unit; null where a figure cannot be had.
+
+    `interval` holds 94 % of it at the highest density, `mc_error` is the standard error of the mean
+    by the chains' length, `ess` counts effective draws, `r_hat` is above 1.01 where chains
+    disagree, `prior_share` is the standard deviation over the prior's.
+    """
+
+    unit: str
+    mean: float
+    sd: float
+    interval: tuple[float, float]
+    mc_error: float | None
+    ess: float | None
+    r_hat: float | None
+    prior_share: float | None
+    meaning: str
+
+
+@dataclass(frozen=True)
+class SampledRecord:
+    """A record: SHA-256 of its file, samples used, how many count as one, residual rms [m]."""
+
+    name: str
+    sha256: str
+    samples: int
+    samples_as_one: float
+    rms_m: float
+
+
+@dataclass(frozen=True)
+class PosteriorFile:
+    """The posterior of a model's parameters given records, and how it was drawn."""
+
+    format: Literal["psa_casadi.posterior/1"]
+    package_version: str
+    model: str
+    parameters: Mapping[str, SampledParameter]
+    chains: int
+    draws: int
+    seed: int
+    divergences: int
+    records: tuple[SampledRecord, ...]
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def posterior_file(found: Posterior) -> dict[str, Any]:
+    """Return what `--json` writes of a posterior."""
+    task = found.task
+    records = tuple(
+        SampledRecord(e.record.name, e.record.sha256, int(e.used.sum()), float(worth), float(rms))
+        for e, worth, rms in zip(task.experiments, task.inflation, task.levels, strict=True)
+    )
+    content = PosteriorFile(
+        POSTERIOR_FORMAT,
+        __version__,
+        found.model.name,
+        {f.name: _parameter(found, f) for f in found.figures},
+        found.chains,
+        found.draws,
+        found.seed,
+        found.divergences,
+        records,
+        found.warnings,
+        found.sentences,
+    )
+    return asdict(content)
+
+
+def _parameter(found: Posterior, f: Figures) -> SampledParameter:
+    return SampledParameter(
+        unit=f.unit,
+        mean=f.mean,
+        sd=f.sd,
+        interval=(f.low, f.high),
+        mc_error=_finite(f.mc_error),
+        ess=_finite(f.ess),
+        r_hat=_finite(f.r_hat),
+        prior_share=_finite(f.prior_share),
+        meaning=found.model.parameter(f.name).description,
+    )
+
+
+def _finite(figure: float) -> float | None:
+    return figure if math.isfinite(figure) else None
+
+
+@dataclass(frozen=True)
+class FreeCorrection:
+    """A free function of some variables at a port that would remove most of what is left."""
+
+    port: str
+    of: str
+    evidence: float
+    share: float
+    unit: str
+    variable: str
+
+
+@dataclass(frozen=True, repr=False)
+class OwnModelFile(Told):
+    """A diagnosis of a model of one's own: verdict, causes, errors of every output, what remains.
+
+    `values` are the parameters of the extended model in the model's units. Files of older versions
+    have no `budget`.
+    """
+
+    format: Literal["psa_casadi.own_model_diagnosis/1"]
+    verdict: Verdict
+    causes: tuple[PortCause, ...]
+    candidates: tuple[Candidate, ...]
+    errors: tuple[OutputError, ...]
+    missed: Remaining
+    remaining: Remaining
+    unnamed: str
+    correction: FreeCorrection | None
+    notes: tuple[str, ...]
+    values: Mapping[str, float]
+    records: tuple[RecordUsed, ...]
+    budget: OdeBudget | None = None

@@ -1,0 +1,164 @@
+"""Pages of several devices: a few side by side, or a population and who stands out of it."""
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+from psa_casadi.errors import InputError
+from psa_casadi.files import atomic_write
+from psa_casadi.population.finding import Finding
+from psa_casadi.population.population import Difference, Population, differences
+from psa_casadi.report.page.document import Picture, render
+from psa_casadi.report.plots.device_plots import (
+    budget_plot,
+    difference_plot,
+    drift_plot,
+    error_plots,
+    spread_plot,
+)
+from psa_casadi.report.words.phrases import number, one_unit
+from psa_casadi.report.words.population_words import (
+    METHOD,
+    batch_table,
+    budget_table,
+    causes_text,
+    difference_sentence,
+    difference_table,
+    drift_table,
+    error_scale,
+    file_table,
+    frequency_table,
+    left_out_sentence,
+    outlier_table,
+    population_sentences,
+    spread_table,
+    verdict_table,
+)
+from psa_casadi.report.words.tables import Table
+from psa_casadi.report.words.verdict_words import VERDICTS
+
+#: More devices than this are a population.
+MOST = 20
+#: Tiles at the top for so many devices; the table has all.
+_MOST_TILES = 4
+#: Parameters that have a plot; those in which devices stand out come first.
+_MOST_PLOTS = 12
+
+
+def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) -> None:
+    """Write the page of devices side by side (`read_findings`), whole or not at all.
+
+    It shows verdicts, causes with confidence, error budgets, parameters with intervals and which
+    differ beyond noise, and the errors over time and voltage of the records that models carry.
+
+    Raises:
+        InputError: there are fewer than two devices or too many, or `path` cannot be written to.
+    """
+    if len(findings) < 2:
+        raise InputError(
+            "One device is nothing to compare; give the files of two or more. (A model and a"
+            " diagnosis of the same records are one device.)"
+        )
+    if len(findings) > MOST:
+        raise InputError(
+            f"{len(findings)} devices have no room side by side; give {MOST} at most, or the folder"
+            " of results of `psa batch` for the page of a population."
+        )
+    rows, scale = differences(findings), error_scale(findings)
+    with one_unit(scale):
+        page = render(
+            "comparison.html",
+            f"Comparison of {len(findings)} devices",
+            findings=findings,
+            verdict=difference_sentence(findings, rows),
+            tiles=[_tile(f) for f in findings[:_MOST_TILES]],
+            verdicts=verdict_table(findings, scale),
+            **_compared(findings, rows),
+            scales=len({f.force_scale for f in findings if f.force_scale}),
+            files=file_table(findings),
+        )
+    atomic_write(path, page)
+
+
+def _tile(f: Finding) -> tuple[str, str, str]:
+    """Return a device with its verdict and cause, or with the error of its fit."""
+    if f.verdict:
+        return f.device, VERDICTS.get(f.verdict, f.verdict), causes_text(f)
+    if f.rms_percent is not None:
+        return f.device, f"{number(f.rms_percent, 2)} % of range", "rms of the fit"
+    return f.device, "model", ""
+
+
+def _compared(findings: Sequence[Finding], rows: Sequence[Difference]) -> dict[str, Any]:
+    """Return plots and tables of error budgets, parameters and errors, where there are any."""
+    found: dict[str, Any] = dict.fromkeys(("budget", "parameters", "traces"))
+    if any(f.budget for f in findings):
+        found["budget"] = {"panel": budget_plot(findings), "table": budget_table(findings)}
+    if rows:
+        found["parameters"] = {
+            "panel": difference_plot(findings, rows),
+            "table": difference_table(findings, rows),
+        }
+    if any(f.trace for f in findings):
+        found["traces"] = error_plots(findings)
+    return found
+
+
+def write_population(
+    found: Population,
+    path: str | os.PathLike[str],
+    *,
+    without: Sequence[tuple[str, str, str]] = (),
+) -> None:
+    """Write the page of a population, whole or not at all.
+
+    `without` are devices that have no result: name, status, and why.
+
+    Raises InputError when `path` cannot be written to.
+    """
+    p, batches = found, {f.batch for f in found.findings if f.batch}
+    badges = [f"{len(p.findings)} devices"]
+    badges += [f"{len(batches)} batch{'es' if len(batches) > 1 else ''}"] if batches else []
+    counts = {s.estimates.name: 0 for s in p.spreads}
+    for o in p.outliers:
+        counts[o.parameter] += 1
+    shown = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
+    page = render(
+        "population.html",
+        "Population of devices",
+        badges,
+        p=p,
+        verdict=" ".join(population_sentences(p)),
+        tiles=_tiles(p, len(without)),
+        outliers=outlier_table(p),
+        method=METHOD,
+        spreads=spread_table(p),
+        left_out=left_out_sentence(p),
+        spread_pictures=[
+            Picture(s.estimates.name, spread_plot(p, s), s.estimates.meaning) for s in shown
+        ],
+        batches=batch_table(p),
+        drifts=drift_table(p),
+        drift_pictures=[
+            Picture(f"{s.estimates.name} over the date", drift_plot(p, s))
+            for s in p.spreads
+            if s.estimates.name in p.drifting
+        ],
+        verdict_counts=frequency_table("verdict", p.verdicts),
+        cause_counts=frequency_table("cause", p.causes),
+        without=Table(("device", "ended", "why"), tuple(without)) if without else None,
+    )
+    atomic_write(path, page)
+
+
+def _tiles(p: Population, lost: int) -> list[tuple[str, str, str]]:
+    tiles = [
+        ("devices", str(len(p.findings)), f"{lost} more without a result" if lost else ""),
+        ("stand out", str(len({o.device for o in p.outliers})), ""),
+    ]
+    if p.batch_p:
+        differ = len(p.batches_differ)
+        tiles.append(("parameters in which batches differ", str(differ), f"of {len(p.batch_p)}"))
+    if p.drift_p:
+        tiles.append(("parameters that drift", str(len(p.drifting)), f"of {len(p.drift_p)}"))
+    return tiles

@@ -1,0 +1,457 @@
+"""Pictures of results by matplotlib, for files and notebooks."""
+
+import os
+import textwrap
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.gridspec import GridSpec
+
+from psa_casadi.any_model.identify import OdeIdentification
+from psa_casadi.any_model.result import OdeDiagnosis
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.signature import Signature
+from psa_casadi.errors import InputError
+from psa_casadi.files import atomic_path
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.identify import Identification
+from psa_casadi.posterior.chains import columns_of_records
+from psa_casadi.posterior.sample import HDI, Figures, Posterior
+from psa_casadi.records.record import Record
+from psa_casadi.report.plots.findings import evidence_plot, signature_plot
+from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
+from psa_casadi.report.plots.records import (
+    loop_plot,
+    measured_plot,
+    residual_plot,
+    samples,
+    zoom_plot,
+)
+from psa_casadi.report.words.misfit_words import AXES
+from psa_casadi.report.words.own_words import own_fit_series, own_series
+from psa_casadi.report.words.phrases import (
+    added,
+    handy_scale,
+    in_brackets,
+    length_scale,
+    listing,
+    number,
+    percent,
+    plain,
+    prefixed_scale,
+    scale_of,
+    shown_in,
+    with_unit,
+)
+from psa_casadi.report.words.series import (
+    BASE_COLOUR,
+    EXTENDED_COLOUR,
+    HELD_OUT_COLOUR,
+    MEASURED_COLOUR,
+    NOISE_COLOUR,
+    FloatArray,
+    Series,
+    most_telling,
+    series_of,
+    series_of_fit,
+    telling_window,
+    time_scale,
+)
+from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
+from psa_casadi.simulation.simulate import Trajectory
+from psa_casadi.units import convert
+
+Compared = Diagnosis | Identification | OdeDiagnosis | OdeIdentification
+Plotted = Compared | Trajectory | Posterior | Record
+
+#: What all pictures share.
+SIZE_INCHES, DPI = (16.0, 10.0), 100
+#: Room around the plots of a still picture, for labels of any size that they have there.
+_STILL_ROOM = {
+    "left": 0.075,
+    "right": 0.99,
+    "top": 0.935,
+    "bottom": 0.09,
+    "hspace": 0.42,
+    "wspace": 0.3,
+}
+#: Samples of a record, bars of effects for which there is room, parameters and their bins.
+_MOST_POINTS, _MOST_BARS, _MOST_PARAMETERS, _BINS = 8000, 9, 12, 40
+_COLUMNS = 4
+#: A legend above the plot, beside its title, and one over the curves.
+_ABOVE = {
+    "fontsize": FONT - 1.5, "ncols": 4, "loc": "lower right", "bbox_to_anchor": (1.0, 0.98),
+    "frameon": False, "columnspacing": 1.2, "handlelength": 1.4,
+}  # fmt: skip
+_OVER = {
+    "fontsize": FONT - 1.5, "ncols": 4, "loc": "upper center", "columnspacing": 1.2,
+    "handlelength": 1.4,
+}  # fmt: skip
+
+
+def save_figure(
+    diagnosis: Diagnosis,
+    path: str | os.PathLike[str],
+    *,
+    origin: str = "measured",
+    narrow: bool = False,
+) -> None:
+    """Write the picture of a diagnosis as a PNG of 1600 x 1000 points, whole or not at all.
+
+    Of several records it shows the one that the base model misses most. `origin`, "measured" or
+    "synthetic", names the record's curve. A `narrow` one has two panels and 720 x 880 points, for
+    a phone. Raises InputError when `path` cannot be written to.
+    """
+    make = narrow_figure if narrow else diagnosis_figure
+    with atomic_path(path) as temporary:
+        make(diagnosis, origin=origin).savefig(temporary, format="png")
+
+
+def figure_of(result: Plotted) -> Figure:
+    """Return the picture of a result."""
+    if isinstance(result, Diagnosis):
+        return diagnosis_figure(result)
+    if isinstance(result, Identification):
+        return fit_figure(result)
+    if isinstance(result, Trajectory):
+        return response_figure(result.time, result.voltage, result.displacement)
+    if isinstance(result, Posterior):
+        return posterior_figure(result)
+    if isinstance(result, Record):
+        return one_output(result, None, None)
+    return record_figure(most_telling(_series(result)))
+
+
+def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
+    """Return the picture of a diagnosis: records, loop, residual and evidence."""
+    series = series_of(diagnosis)
+    shown = most_telling(series)
+    figure, grid = _sheet(shown, origin)
+    _draw_residual(figure.add_subplot(grid[1, :2]), shown)
+    evidence = figure.add_subplot(grid[1, 2])
+    count = len(diagnosis.candidates)
+    part = f" ({_MOST_BARS} of {count})" if count > _MOST_BARS else ""
+    draw(evidence, evidence_plot(diagnosis, _MOST_BARS), f"Evidence, each effect alone{part}")
+    evidence.grid(visible=False, axis="y")
+    which = _which(series, shown, origin, "base model")
+    lines = [*textwrap.wrap(verdict_sentence(diagnosis), 125), which]
+    figure.suptitle("\n".join(lines), fontsize=FONT + 3)
+    return figure
+
+
+def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
+    """Return the picture of an identification: the record it misses most, loop and residual."""
+    series = series_of_fit(found)
+    shown = most_telling(series)
+    figure, grid = _sheet(shown, origin)
+    _draw_residual(figure.add_subplot(grid[1, :]), shown)
+    figure.suptitle(_which(series, shown, origin, "model"), fontsize=FONT + 3)
+    return figure
+
+
+def record_figure(s: Series, *, origin: str = "measured") -> Figure:
+    """Return the picture of one record: measured against model, loop and residual."""
+    figure = sheet((12.0, 6.4), 80, layout=None)
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
+    shown = samples(s, _MOST_POINTS)
+    above = figure.add_subplot(grid[0, :2] if s.against else grid[0, :])
+    draw(above, measured_plot(s, origin, shown), s.title, legend=_ABOVE)
+    above.margins(x=0.01)
+    if s.against:
+        draw(figure.add_subplot(grid[0, 2]), loop_plot(s, origin, shown), "Loop")
+    _draw_residual(figure.add_subplot(grid[1, :]), s, origin)
+    return figure
+
+
+def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:
+    """Return the picture of a displacement [m] over time [s] and over the voltage [V]."""
+    figure = sheet((SIZE_INCHES[0], 0.5 * SIZE_INCHES[1]), DPI)
+    over_time, loop = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
+    scale = length_scale(float(np.ptp(displacement)))
+    y, label = scale.factor * displacement, f"[{scale.unit}]"
+    draw(over_time, Panel("time [s]", label).line(time, y), "Displacement")
+    draw(loop, Panel("voltage [V]", label).line(voltage, y), "Loop")
+    return figure
+
+
+def _sheet(s: Series, origin: str) -> tuple[Figure, GridSpec]:
+    """Return a picture with a record, its telling window and its loop in the upper row."""
+    figure = sheet(SIZE_INCHES, DPI)
+    ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
+    grid = figure.add_gridspec(2, 3, **ratios)
+    shown, window = samples(s, _MOST_POINTS), telling_window(s)
+    whole, part, loop = (figure.add_subplot(grid[0, k]) for k in range(3))
+    draw(whole, measured_plot(s, origin, shown), f"{s.title} (box: the part on the right)")
+    ends = s.time_scale.factor * s.time[window][[0, -1]]
+    whole.axvspan(*ends, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
+    whole.margins(x=0.01)
+    inside = (
+        "In the box, where the error falls most" if len(s.curves) > 1 else "The part in the box"
+    )
+    draw(part, zoom_plot(s, origin, _MOST_POINTS), inside, legend={})
+    draw(loop, loop_plot(s, origin, shown), "Loop", legend={"loc": "upper left"})
+    return figure, grid
+
+
+def _which(series: tuple[Series, ...], shown: Series, origin: str, model: str) -> str:
+    which = f"{origin} record: {shown.name}"
+    if len(series) > 1:
+        which += f" (the one of {len(series)} that the {model} misses most)"
+    return which
+
+
+def _draw_residual(axes: Axes, s: Series, origin: str = "measured") -> None:
+    """Draw what the models leave of a record, with room for the legend above."""
+    shown = samples(s, _MOST_POINTS)
+    draw(axes, residual_plot(s, shown), f"Residual: {origin} minus model", legend=_OVER)
+    axes.margins(x=0.005)
+    largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves)
+    largest = s.residual_scale.factor * largest or 1.0
+    axes.set_ylim(-1.1 * largest, 1.45 * largest)
+
+
+def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
+    """Return two panels: the residual over a stretch of time, and the held-out errors as bars.
+
+    At half its 720 x 880 points, the width of a phone, letters are still large enough.
+    """
+    figure, font = sheet((3.6, 4.4), 200), 9.0
+    above, below = figure.subplots(2, 1, height_ratios=(2.2, 1.0))
+    s = most_telling(series_of(diagnosis))
+    window = telling_window(s)
+    more = 3 * (window.stop - window.start)
+    part = slice(max(0, window.start - more), min(len(s.time), window.stop + more))
+    plot = residual_plot(s, part)
+    plot.layout["shapes"] = []  # a shaded band is plainer than dashes
+    noise = 2.0 * s.residual_scale.factor * s.noise
+    above.axhspan(-noise, noise, color=HELD_OUT_COLOUR, label="noise, 2 sigma")
+    draw(above, plot, f"{origin.capitalize()} minus simulated", font=font)
+    above.locator_params(axis="x", nbins=5)
+    above.margins(x=0.0)
+    low, high = above.get_ylim()
+    above.set_ylim(low, high + 0.32 * (high - low))  # for the legend
+    above.legend(fontsize=font - 0.5, loc="upper left", ncols=2, columnspacing=0.9,
+                 handlelength=1.2, framealpha=0.0)  # fmt: skip
+    _bars(below, diagnosis, font)
+    causes = listing([plain(c.effect) for c in diagnosis.causes])
+    verdict = VERDICTS[diagnosis.verdict].capitalize()
+    figure.suptitle(f"{verdict}: {causes}" if causes else verdict, fontsize=font + 2, wrap=True)
+    return figure
+
+
+def _bars(axes: Axes, d: Diagnosis, font: float) -> None:
+    """Draw the held-out errors, with the noise as their floor."""
+    rows = [("base model", BASE_COLOUR, d.base_errors.holdout_rms_m)]
+    if added(d):
+        rows.append(("extended", EXTENDED_COLOUR, d.extended_errors.holdout_rms_m))
+    rows.append(("noise", NOISE_COLOUR, d.noise_floor_rms_m))
+    largest = max(rms for *_, rms in rows)
+    scale = scale_of(d.experiments, largest)
+    for k, (_, colour, rms) in enumerate(rows):
+        axes.barh(k, rms, color=colour, height=0.7)
+        axes.annotate(f" {scale.text(rms)}", (rms, k), va="center", fontsize=font)
+    axes.axvline(d.noise_floor_rms_m, color="black", linestyle="--", linewidth=1.0)
+    axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=font)
+    axes.set_xlim(0.0, 1.3 * largest)
+    axes.invert_yaxis()
+    axes.set_xticks([])
+    axes.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
+    axes.spines[["top", "right", "bottom"]].set_visible(False)
+
+
+def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure:
+    """Return the figure of the axes on which one quantity of a result was drawn.
+
+    Without an `output` it is the main one. Raises InputError for one that the result does not have.
+    """
+    if axes is None:
+        axes = sheet((9.0, 4.5), 100).add_subplot()
+    if isinstance(result, Trajectory):
+        columns = {"voltage": result.voltage, **result.states, **result.outputs}
+        name = _chosen(output, columns, result.shown)
+        _curve(axes, result.time, columns[name], name, result.units.get(name, ""))
+    elif isinstance(result, Record):
+        name = _chosen(output, result.recorded, result.shown)
+        _curve(axes, result.time, result.recorded[name], name, result.units[name])
+    elif isinstance(result, Posterior):
+        by_name = {f.name: f for f in result.figures}
+        _draw_parameter(axes, result, by_name[_chosen(output, by_name, next(iter(by_name)))])
+    else:
+        _draw_compared(axes, _series(result), output)
+    found: Figure | SubFigure = axes.figure
+    return found if isinstance(found, Figure) else found.figure
+
+
+def _draw_compared(axes: Axes, series: tuple[Series, ...], output: str | None) -> None:
+    """Draw what was measured beside the models; "residual" is what these leave."""
+    quantities = dict.fromkeys(s.quantity for s in series)
+    name = _chosen(output, [*quantities, "residual"], most_telling(series).quantity)
+    if name == "residual":
+        _draw_residual(axes, most_telling(series))
+        return
+    shown = most_telling([s for s in series if s.quantity == name])
+    whole = replace(shown, held_out=np.zeros(len(shown.time), dtype=bool))
+    draw(axes, measured_plot(whole, "measured", slice(None)), shown.title, legend={})
+    axes.margins(x=0.01)
+
+
+def _series(result: Compared) -> tuple[Series, ...]:
+    if isinstance(result, Diagnosis):
+        return series_of(result)
+    if isinstance(result, Identification):
+        return series_of_fit(result)
+    return own_series(result) if isinstance(result, OdeDiagnosis) else own_fit_series(result)
+
+
+def _chosen(output: str | None, there: Collection[str], usual: str) -> str:
+    if output is None:
+        return usual
+    if output not in there:
+        raise InputError(f"There is no output '{output}' to plot; there are {', '.join(there)}.")
+    return output
+
+
+def _curve(axes: Axes, time: FloatArray, values: FloatArray, name: str, unit: str) -> None:
+    """Draw values in their SI unit over time, in a handy one."""
+    size = float(np.nanmax(np.abs(values), initial=0.0))
+    scale = handy_scale(size) if unit == "m" else prefixed_scale(size, unit or "1")
+    label = in_brackets(name, scale.unit)
+    draw(axes, Panel("time [s]", label).line(time, scale.factor * values, name))
+
+
+def posterior_figure(found: Posterior) -> Figure:
+    """Return what prior and posterior predict of the record missed most, and the parameters."""
+    shown = int(np.argmax(found.task.levels))
+    figures = found.figures[:_MOST_PARAMETERS]
+    rows = -(-len(figures) // _COLUMNS)
+    figure = sheet((SIZE_INCHES[0], 4.6 + 2.6 * rows), DPI)
+    parts = figure.subfigures(2, 1, height_ratios=(4.6, 2.6 * rows), squeeze=False)
+    before, after = parts[0, 0].subplots(1, 2)
+    _draw_prior(before, found, shown)
+    _draw_posterior(after, found, shown)
+    axes = np.atleast_1d(parts[1, 0].subplots(rows, min(_COLUMNS, len(figures)))).ravel()
+    for each, f in zip(axes, figures, strict=False):
+        _draw_parameter(each, found, f)
+    for each in axes[len(figures) :]:
+        each.set_axis_off()
+    name = found.task.experiments[shown].record.name
+    more = len(found.figures) - len(figures)
+    rest = f"; {more} more parameters are in the table" if more else ""
+    figure.suptitle(
+        f"Prior and posterior of {found.model.name}, record {name}{rest}", fontsize=FONT
+    )
+    return figure
+
+
+def _band(found: Posterior, group: str, record: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the ends of the band that holds 94 % of what is predicted, and the median [m]."""
+    column = columns_of_records(found.task)[record]
+    draws = (
+        found.tree[group][column].to_numpy().reshape(-1, found.task.experiments[record].record.n)
+    )
+    low, high = 0.5 * (1.0 - HDI), 0.5 * (1.0 + HDI)
+    ends: FloatArray = np.quantile(draws, [low, high, 0.5], axis=0)
+    return ends[0], ends[1], ends[2]
+
+
+def _draw_prior(axes: Axes, found: Posterior, record: int) -> None:
+    r = found.task.experiments[record].record
+    y = measured(r)
+    if not found.tree["prior_predictive"].sizes["draw"]:
+        style(axes, "No draw of the prior can be simulated", "time [s]", "")
+        return
+    low, high, _ = _band(found, "prior_predictive", record)
+    span = float(np.nanmax(y) - np.nanmin(y))
+    scale = length_scale(3.0 * span)
+    band = f"prior, {100.0 * HDI:.0f} %"
+    axes.fill_between(
+        r.time, scale.factor * low, scale.factor * high, color=BASE_COLOUR, alpha=0.3, label=band
+    )
+    axes.plot(r.time, scale.factor * y, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
+    middle = 0.5 * float(np.nanmax(y) + np.nanmin(y))
+    axes.set_ylim(scale.factor * (middle - 1.5 * span), scale.factor * (middle + 1.5 * span))
+    style(axes, "Prior predictive", "time [s]", f"displacement [{scale.unit}]")
+    axes.legend(fontsize=FONT - 1, loc="upper right")
+
+
+def _draw_posterior(axes: Axes, found: Posterior, record: int) -> None:
+    r = found.task.experiments[record].record
+    low, high, middle = _band(found, "posterior_predictive", record)
+    left = measured(r) - middle
+    scale = length_scale(float(np.nanmax(np.abs(left))))
+    band = f"posterior, {100.0 * HDI:.0f} %"
+    axes.plot(r.time, scale.factor * left, color=MEASURED_COLOUR, linewidth=0.8, label="measured")
+    axes.fill_between(
+        r.time, scale.factor * (low - middle), scale.factor * (high - middle),
+        color=EXTENDED_COLOUR, alpha=0.4, label=band, zorder=3,
+    )  # fmt: skip
+    title = "Posterior predictive, less its median"
+    style(axes, title, "time [s]", f"difference [{scale.unit}]")
+    axes.legend(fontsize=FONT - 1, loc="upper right")
+
+
+def _draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
+    """Draw the posterior of a parameter, and its prior."""
+    unit, display = shown_in(found.model, f.name)
+    values, before = (
+        np.array([convert(v, unit, display) for v in found.tree[g][f.name].to_numpy().ravel()])
+        for g in ("posterior", "prior")
+    )
+    axes.hist(values, bins=_BINS, density=True, color=EXTENDED_COLOUR, alpha=0.7)
+    low, high = axes.get_xlim()
+    inside = before[(before >= low) & (before <= high)]
+    if len(inside) >= 0.2 * max(len(before), 1):
+        weights = np.full(len(inside), _BINS / (2.0 * (high - low) * len(before)))
+        axes.hist(inside, bins=_BINS // 2, weights=weights, histtype="step", color=BASE_COLOUR)
+    for end in (f.low, f.high):
+        axes.axvline(convert(end, unit, display), color=NOISE_COLOUR, linestyle="--", linewidth=1.0)
+    title = f"{f.name} = {number(convert(f.mean, unit, display), 4)}"
+    style(axes, title, in_brackets(f.name, display), "")
+    axes.set_yticks([])
+
+
+def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[str]) -> None:
+    """Write the picture of an effect's signature as a PNG of 1300 x 620, whole or not at all.
+
+    Left the difference over time above the voltage's ghost, right against the coordinate that
+    tells it best. Raises InputError when `path` cannot be written to.
+    """
+    figure = sheet((13.0, 6.2), DPI)
+    left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+    scale = length_scale(float(np.max(np.abs(seen.difference))))
+    clock = time_scale(float(seen.time[-1]))
+    time = clock.factor * seen.time
+    behind = left.twinx()
+    behind.fill_between(time, seen.voltage, color=NOISE_COLOUR, alpha=0.18, linewidth=0)
+    behind.set_ylabel("voltage [V] (grey)", fontsize=FONT, color=NOISE_COLOUR)
+    behind.tick_params(labelsize=FONT - 1, colors=NOISE_COLOUR)
+    left.set_zorder(behind.get_zorder() + 1)
+    left.patch.set_visible(False)
+    added_over_time = Panel(f"time [{clock.unit}]", f"difference [{scale.unit}]")
+    added_over_time.line(time, scale.factor * seen.difference)
+    draw(left, added_over_time, "What the effect adds, over time")
+    left.margins(x=0.01)
+    view = seen.telling
+    title = f"{AXES[view.name].title}: explains {percent(view.share)} of it"
+    if view.name == "spectrum":
+        title = f"Spectrum: {percent(view.share)} of it in one peak"
+    legend: dict[str, str] | None = None if view.name == "spectrum" else {}
+    draw(right, signature_plot(seen), textwrap.fill(title, 48), legend=legend)
+    look = textwrap.fill(f"{plain(effect.name)}: {effect.looks_like}", 120)
+    figure.suptitle(f"{look}\n{size_sentence(seen)}", fontsize=FONT + 1)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=DPI)
+
+
+def size_sentence(seen: Signature) -> str:
+    """Say on what stack the signature is simulated, and how large the effect is."""
+    size = with_unit(number(seen.size), seen.unit)
+    largest = float(np.max(np.abs(seen.difference))) / seen.stroke
+    return (
+        f"Simulated on the stack {seen.stack} with {seen.gain} = {size}: at most"
+        f" {number(100.0 * largest, 2)} % of the stroke, offset and slope re-fitted."
+    )

@@ -1,0 +1,314 @@
+"""What is found: evidence of effects, views of a residual, signatures, what is determined."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from psa_casadi.any_model.result import FreeFunction
+from psa_casadi.diagnosis.misfit import Misfit, Spectrum
+from psa_casadi.diagnosis.patch import Patch
+from psa_casadi.diagnosis.result import Candidate, Diagnosis
+from psa_casadi.diagnosis.signature import Signature
+from psa_casadi.diagnosis.views import View
+from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
+from psa_casadi.report.plots.panel import BOUND_COLOUR, INK, WEAK_COLOUR, Panel, logarithmic
+from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
+from psa_casadi.report.words.misfit_words import AXES
+from psa_casadi.report.words.phrases import (
+    Scale,
+    in_brackets,
+    length_scale,
+    number,
+    percent,
+    plain,
+    prefixed_scale,
+    probability_text,
+)
+from psa_casadi.report.words.series import (
+    BASE_COLOUR,
+    EXTENDED_COLOUR,
+    NOISE_COLOUR,
+    FloatArray,
+    bar_colour,
+)
+from psa_casadi.units import convert
+
+if TYPE_CHECKING:  # which take long to load
+    from psa_casadi.any_model.result import OdeDiagnosis
+
+_DEGREE_COLOURS: dict[Degree, str] = {
+    "determined": EXTENDED_COLOUR,
+    "weak": WEAK_COLOUR,
+    "undetermined": BASE_COLOUR,
+    "on its bound": BOUND_COLOUR,
+    "fixed": NOISE_COLOUR,
+}
+#: The bars begin and end here [%]; what lies beyond says so in its figure.
+_SHORTEST, _LONGEST = 0.01, 1000.0
+#: Heights of a bar, and of a plot's margins with its axis and legend.
+_BAR, _MARGINS = 22, 124
+#: Correlations of more parameters than this leave no room for figures on a phone.
+_MOST_FIGURES = 12
+_LOW = 300
+#: Samples of a signature that are drawn behind its means, and of a correction.
+_BEHIND, _SAMPLES = 1000, 3000
+#: The cost is shown up to this many limits; beyond, a curve only hides its foot.
+_TOP = 2.5
+_PARABOLA_POINTS = 81
+
+
+def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Panel:
+    """One bar for every effect that was tried; text says the share of the excess it explains.
+
+    Named causes come first, with their confidence. Of many, the first and most telling ones where
+    only so many are to be drawn.
+    """
+    causes = {c.effect: c.confidence for c in d.causes}
+    order = sorted(d.candidates, key=lambda c: c.effect not in causes)  # keeps the others' order
+    rows = order[: None if most is None else max(most, len(causes))][::-1]
+    # asinh shows small, large and negative evidence in one picture; the labels give the figures
+    values = [float(np.arcsinh(c.evidence / 10.0)) for c in rows]
+    names = [plain(c.effect).replace("independent ", "independent\n") for c in rows]
+    colours = [bar_colour(c, set(causes)) for c in rows]
+    plot = Panel("evidence [ln units], compressed", height=110 + 30 * len(rows), showlegend=False)
+    plot.bars(values, names, "", colours, hoverinfo="skip")
+    # the figures stand to the right of bar and zero, clear of the names
+    figures = [f" {round(c.evidence):,}; {_figure(c, d)}" for c in rows]
+    ends = [max(v, 0.0) for v in values]
+    plot.texts(ends, names, figures, "middle right", cliponaxis=False)
+    largest = max([abs(v) for v in values], default=1.0) or 1.0
+    reach = [min([0.0, *values]) * 1.1, (2.3 if causes else 1.75) * largest]
+    return plot.axes(
+        {"showticklabels": False, "ticks": "", "range": reach},
+        {"showgrid": False, "ticks": "", "automargin": True},
+        margin={"l": 10, "r": 8, "t": 16, "b": 44},
+    )
+
+
+def _figure(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
+    """Return how sure a named cause is, the probability of others; else the share it explains."""
+    named = next((c for c in d.causes if c.effect == candidate.effect), None)
+    if named is not None:
+        return f"named, {probability_text(named.confidence)}"
+    if d.causes:
+        return probability_text(candidate.probability)
+    share = candidate.explained_share
+    if not candidate.fitted and share == 0:
+        return "screened"
+    return percent(share) if share >= 0 else "fits worse"
+
+
+def view_named(m: Misfit, name: str) -> View | None:
+    """Return the view of that name, None where the record has none or nothing to show in it."""
+    rows = (*m.views, *((m.holds,) if m.holds else ()))
+    return next((v for v in rows if v.name == name and v.x.size), None)
+
+
+def view_plot(before: View, after: View | None, *, counts: bool) -> Panel:
+    """Binned means of the residual with two standard errors, before and after the extension."""
+    scale = length_scale(float(np.max(np.abs(before.mean))), counts=counts)
+    rows = [(before, BASE_COLOUR, "base model")]
+    rows += [(after, EXTENDED_COLOUR, "extended model")] if after is not None else []
+    plot, factor = _view_panel(before, scale, "residual", [v.x for v, _, _ in rows])
+    for view, colour, name in rows:
+        errors = {"array": 2.0 * scale.factor * view.spread, "color": colour,
+                  "thickness": 1.0, "width": 2}  # fmt: skip
+        plot.marks(factor * view.x, scale.factor * view.mean, name, colour,
+                   line={"color": colour, "width": 1.8}, error_y=errors)  # fmt: skip
+    return plot
+
+
+def spectrum_view_plot(before: Spectrum, after: Spectrum | None, *, counts: bool) -> Panel:
+    """Amplitude density of the residual before and after the extension, above the noise's."""
+    scale = length_scale(float(np.max(before.density)), counts=counts)
+    rows = [(before.density, before.frequency, BASE_COLOUR, "base model", "solid")]
+    if after is not None:
+        rows.append((after.density, after.frequency, EXTENDED_COLOUR, "extended model", "solid"))
+    rows.append((before.floor, before.frequency, INK, "noise", "dash"))
+    plot = Panel("frequency [Hz]", f"residual [{scale.unit}/√Hz]", _LOW, showlegend=True)
+    for density, frequency, colour, name, dash in rows:
+        plot.line(frequency, scale.factor * density, name, colour, 1.5, dash)
+    values = scale.factor * np.concatenate([density for density, *_ in rows])
+    ends = float(np.min(values[values > 0])), float(np.max(values))
+    return plot.axes(logarithmic(_ends(before.frequency)), logarithmic(ends))
+
+
+def signature_plot(seen: Signature) -> Panel:
+    """What an effect adds along its telling coordinate: samples behind their binned means."""
+    view, scale = seen.telling, length_scale(float(np.max(np.abs(seen.difference))))
+    plot, factor = _view_panel(view, scale, "difference", [view.x])
+    mean = scale.factor * view.mean
+    look: dict[str, Any] = {"line": {"color": EXTENDED_COLOUR, "width": 1.8}}
+    if view.name == "spectrum":
+        top = float(np.max(mean))
+        plot.line(factor * view.x, mean, "difference")
+        reach = [float(np.log10(top)) - 4.0, float(np.log10(top)) + 0.4]
+        axis = {**logarithmic((1e-4 * top, top)), "range": reach}
+        axis["title"] = {"text": f"difference [{scale.unit}/√Hz]", "standoff": 8}
+        return plot.axes(y=axis, showlegend=False)
+    low, high = _ends(view.x)
+    on = np.flatnonzero((seen.coordinate >= low) & (seen.coordinate <= high))
+    on = on[:: max(1, on.size // _BEHIND)]
+    behind = factor * seen.coordinate[on], scale.factor * seen.counted[on]
+    plot.marks(*behind, "samples", NOISE_COLOUR, 3)
+    return plot.marks(factor * view.x, mean, "binned means", **look)
+
+
+def _view_panel(
+    view: View, scale: Scale, what: str, shown: list[FloatArray]
+) -> tuple[Panel, float]:
+    """Return an empty plot of a view, and what its coordinate is multiplied by to be shown."""
+    unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
+    plot = Panel(
+        f"{AXES[view.name].label} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True
+    )
+    if view.name.startswith(("since_reversal", "holds", "spectrum")):
+        plot.axes(logarithmic(_ends(factor * np.concatenate(shown))))
+    return plot.axes(y={"zeroline": True, "zerolinecolor": NOISE_COLOUR}), factor
+
+
+def _ends(values: FloatArray) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
+
+
+def patch_plot(d: Diagnosis, patch: Patch) -> tuple[str, Panel]:
+    """Return the coordinate's name and what an unnamed correction adds over it.
+
+    That is of the record to which most is added.
+    """
+    k = max(range(len(patch.added)), key=lambda i: float(np.std(patch.added[i])))
+    e, added = d.experiments[k], patch.added[k] - np.mean(patch.added[k])
+    counts = e.record.displacement_unit == "counts"
+    scale = length_scale(float(np.max(np.abs(added), initial=1e-12)), counts=counts)
+    x, name, unit = _coordinate(d, patch, k)
+    part = slice(None, None, max(1, len(x) // _SAMPLES))
+    plot = Panel(f"{name} [{unit}]", f"added [{scale.unit}]", 320)
+    if patch.kind in ("curve", "direction", "memory"):
+        return name, plot.marks(x[part], scale.factor * added[part], size=3)
+    return name, plot.line(x[part], scale.factor * added[part], width=1.5)
+
+
+def _coordinate(d: Diagnosis, patch: Patch, k: int) -> tuple[FloatArray, str, str]:
+    record = d.experiments[k].record
+    if patch.kind == "curve" and patch.port != "drive voltage":
+        size = 1.0 if record.displacement_unit == "counts" else 1e6
+        unit = "counts" if size == 1.0 else "µm"
+        return size * d.extended[k], "predicted displacement", unit
+    if patch.kind in ("curve", "direction", "memory"):
+        return record.voltage, "voltage", "V"
+    return record.time - record.time[0], "time", "s"
+
+
+def free_plot(f: FreeFunction) -> Panel:
+    """Plot what a free function of a model's port adds, over the variable that it follows most."""
+    part = slice(None, None, max(1, len(f.along) // _SAMPLES))
+    x, y = f.along[part], f.added[part]
+    seen = prefixed_scale(float(np.max(np.abs(x), initial=0.0)), f.variable_unit or "1")
+    scale = prefixed_scale(float(np.max(np.abs(y), initial=0.0)), f.unit)
+    plot = Panel(in_brackets(f.variable, seen.unit), in_brackets("added", scale.unit), 320)
+    return plot.marks(seen.factor * x, scale.factor * y, size=3)
+
+
+def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
+    """One bar for every parameter: its standard error over its value, on a logarithmic axis."""
+    fitted = sorted((g for g in graded if g.degree != "fixed"), key=lambda g: g.error)
+    rows = [*fitted, *(g for g in graded if g.degree == "fixed")]
+    shown = [min(max(100.0 * g.error, _SHORTEST), _LONGEST) for g in fitted]
+    left = 10.0 ** math.floor(math.log10(min([1.0, *shown]) * 0.5))
+    right = max([100.0, *shown]) * 15.0
+    plot = Panel("relative standard error [%]", height=_MARGINS + _BAR * len(rows))
+    for degree in DEGREES:
+        group = [(g, x) for g, x in zip(fitted, shown, strict=True) if g.degree == degree]
+        if group:
+            names = [g.name for g, _ in group]
+            plot.bars([x for _, x in group], names, degree, _DEGREE_COLOURS[degree], width=0.66,
+                      hovertemplate="%{y}: %{x:.3g} %<extra></extra>")  # fmt: skip
+    colours = [NOISE_COLOUR if g.degree == "fixed" else INK for g in rows]
+    plot.texts([right / 1.15] * len(rows), [g.name for g in rows], [_error_text(g) for g in rows],
+               "middle left", textfont={"color": colours})  # fmt: skip
+    plot.upright(100.0 * WEAK_ERROR).upright(50.0, dash="dash")
+    return plot.axes(
+        {"type": "log", "dtick": 1, "range": [math.log10(left), math.log10(right)],
+         "exponentformat": "none", "side": "bottom"},
+        {"categoryorder": "array", "categoryarray": [g.name for g in reversed(rows)],
+         "showgrid": False, "ticks": "", "automargin": True, "range": [-0.6, len(rows) - 0.4]},
+        barmode="overlay", margin={"l": 20, "r": 10, "t": 46, "b": 46},
+    )  # fmt: skip
+
+
+def _error_text(grade: Grade) -> str:
+    if grade.degree == "fixed":
+        return "fixed"
+    if not grade.error <= _LONGEST / 100.0:
+        return f"> {_LONGEST:.0f} %"
+    return f"{number(100.0 * grade.error, 2)} %"
+
+
+def correlation_plot(found: Identification) -> Panel:
+    """Correlations of the estimates as a square of colours, strong ones with their figure."""
+    names, matrix = list(found.determinacy.names), found.determinacy.correlations
+    written, rows = len(names) <= _MOST_FIGURES, max(10, len(found.model.structure.parameters))
+    plot = Panel(height=_MARGINS + _BAR * min(rows, 2 * len(names) + 2))
+    cells = [(i, k, float(np.clip(matrix[i, k], -1.0, 1.0)))
+             for i in range(len(names)) for k in range(i + 1)]  # fmt: skip
+    for sign, colour, said in ((1.0, EXTENDED_COLOUR, "positive"), (-1.0, BASE_COLOUR, "negative")):
+        shown = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
+        look = {"color": colour, "opacity": [abs(v) for _, _, v in shown]}
+        plot.bars(  # a cell is a bar that begins at its column
+            [0.92] * len(shown), [names[i] for i, _, _ in shown], said, look, width=0.92,
+            base=[k - 0.46 for _, k, _ in shown],
+            text=[_correlation_text(v) if written and i > k else "" for i, k, v in shown],
+            textposition="inside", insidetextanchor="middle", textangle=0, constraintext="none",
+            textfont={"size": 10, "color": INK},
+            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in shown],
+            hovertemplate="%{hovertext}<extra></extra>",
+        )  # fmt: skip
+    bare = {"showgrid": False, "ticks": "", "mirror": False, "showline": False, "automargin": True}
+    count = len(names)
+    return plot.axes(
+        {**bare, "tickangle": -60, "tickvals": list(range(count)), "ticktext": names,
+         "range": [-0.5, count - 0.5]},
+        {**bare, "categoryorder": "array", "categoryarray": names, "range": [count - 0.5, -0.5]},
+        margin={"l": 20, "r": 12, "t": 40, "b": 20}, meta={"square": True}, barmode="overlay",
+    )  # fmt: skip
+
+
+def _correlation_text(value: float) -> str:
+    if abs(value) < 0.5:
+        return ""
+    return f"{value:.2f}".replace("-", "−").replace("0.", ".").replace("1.00", "1")
+
+
+def profile_plot(p: Profile) -> Panel:
+    """Increase of the cost over the parameter's value, with the limit and the 95 % interval shaded.
+
+    A dotted parabola shows the linearised interval; where it departs from the profile, the standard
+    error misleads. The axis is logarithmic where the profile spans more than a factor of three.
+    """
+    values = np.array([convert(float(v), p.unit, p.display_unit) for v in p.values])
+    span = (float(values[0]), float(values[-1]))
+    log = p.log and span[1] > 3.0 * span[0] > 0.0
+    unit = "" if p.unit == "1" else f" [{p.display_unit}]"
+    plot = Panel(f"{p.name}{unit}", "increase of the cost", 380)
+    plot.marks(values, p.increase, "all other parameters fitted anew",
+               line={"color": EXTENDED_COLOUR, "width": 2.0})  # fmt: skip
+    if p.log:  # what the standard error alone says, in the logarithm where it has one
+        at = np.geomspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
+        away = np.log(at / p.estimate) * p.estimate / p.standard_error
+    else:
+        at = np.linspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
+        away = (at - p.estimate) / p.standard_error
+    shown = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
+    plot.line(shown, away**2, "linearised", NOISE_COLOUR, dash="dot")
+    low, high = (
+        edge if end is None else convert(end, p.unit, p.display_unit)
+        for end, edge in ((p.low, span[0]), (p.high, span[1]))
+    )
+    plot.across(PROFILE_LIMIT).bands([(low, high)])
+    reach = [float(np.log10(v)) for v in span] if log else list(span)
+    return plot.axes(
+        {**(logarithmic(span) if log else {}), "range": reach},
+        {"range": [-0.1 * PROFILE_LIMIT, _TOP * PROFILE_LIMIT]},
+    )
