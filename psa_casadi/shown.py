@@ -9,6 +9,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_WORDS = "psa_casadi.report.words.advice_words"
+
+
+class Worded:
+    """What says itself in a sentence."""
+
+    @property
+    def sentence(self) -> str:
+        """The result in words."""
+        return str(import_module(_WORDS).sentence_of(self))
+
+
 _made: Callable[..., Any]
 
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from psa_casadi.components import BASE
-from psa_casadi.identification.certainty.determinacy import covariance_of
+from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.identify import Identification, identify

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.identification.certainty.determinacy import Determinacy, determinacy
+from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record

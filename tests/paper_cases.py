@@ -1,5 +1,6 @@
 """Steps in closed form, and records of the reference that the paper's method is tried on."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
@@ -51,6 +52,19 @@ def residues(p: dict[str, float]) -> NDArray[np.complex128]:
 def step_response(p: dict[str, float], time: FloatArray) -> FloatArray:
     g = 1.0 + np.exp(np.outer(time, poles(p))) @ residues(p)
     return np.asarray(g.real, dtype=np.float64)
+
+
+def coefficients_of_values(values: Mapping[str, float]) -> FloatArray:
+    """Return a_1..a_5, b_1, shape (6,), of the physical parameters of the cascade, eqs. (13), (15).
+
+    The denominator is (tau s + 1) (m_B/k_B s^2 + c_B/k_B s + 1) (m_P/k_P s^2 + c_P/k_P s + 1).
+    """
+    product = np.array([values["tau"], 1.0])
+    for part in "BP":
+        m, c, k = (values[f"{q}_{part}"] for q in "mck")
+        product = np.polymul(product, [m / k, c / k, 1.0])
+    zero = (values["c_B"] + values["c_P"]) / (values["k_B"] + values["k_P"])
+    return np.append(product[-2::-1], zero)
 
 
 def closed_step(p: dict[str, float], duration: float, samples: int, noise: float = 0.0) -> Record:

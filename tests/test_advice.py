@@ -2,13 +2,12 @@
 
 import pytest
 
-from psa_casadi.identification.advice.advice import FORCE_ADVICE, Advice, advice
-from psa_casadi.identification.advice.plans import plans, quantity
-from psa_casadi.identification.advice.scenarios import scenarios
-from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.advice import Advice, advice, plans, scenarios
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.records import Record
 from psa_casadi.records.split import whole
+from psa_casadi.report.words.advice_words import plan_words, quantity
 from tests.benchmarks.records import loop_voltage
 from tests.loop_fits import FREE, NOISE, loops, measured
 from tests.stack_models import stack
@@ -32,7 +31,7 @@ def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
                                         f" and {planned[0].parameters[-1]}.")  # fmt: skip
     ringing, last = results[-2:]
     assert ringing.sentence.startswith("If the mechanics ring, m_P and m_B would be determined")
-    assert (last.sentence, last.record) == (FORCE_ADVICE, None)
+    assert (last.kind, last.record) == ("force", None)
     found, experiments, determined = loops("PTBS200")
     given = advice(found, experiments, determined, force_scale_given=True)
     assert [a.sentence for a in given] == [a.sentence for a in results[:-1]]
@@ -92,7 +91,7 @@ def test_plans_stay_within_the_records_voltages() -> None:
         assert p.record.voltage.min() >= -20.0 - 1e-9
         assert p.record.voltage.max() <= 0.7 * 120.0 - 20.0 + 1e-9
         assert p.record.voltage[0] == pytest.approx(-20.0)
-        assert "-20 V" in p.words
+        assert "-20 V" in plan_words(p)
     rates = [p.rate for p in found if p.kind == "step"]
     assert rates == sorted(rates)
     assert len(rates) <= 6

@@ -20,13 +20,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from psa_casadi import children
 from psa_casadi.cli.app import app
-from psa_casadi.devices import dask_client, device
+from psa_casadi.devices import device, executors
 from psa_casadi.devices.batch import batch
-from psa_casadi.devices.jobs import Job, jobs_given
-from psa_casadi.devices.processes import Processes
-from psa_casadi.devices.submission import outcomes
-from psa_casadi.devices.task import DeviceOutcome, DeviceTask, Options, key_of
+from psa_casadi.devices.executors import Processes, outcomes
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options, jobs_given, key_of
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.model.model_file import load_model
@@ -318,39 +317,6 @@ def test_an_executor_that_is_lost_is_no_result_of_a_device(
 
 
 @slow
-@pytest.mark.skipif(sys.platform == "win32", reason="signals cannot be sent to one process")
-def test_a_scheduler_that_is_lost_is_told_in_a_sentence(records: Path, tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    python = [sys.executable, "-m"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    there = tmp_path / "scheduler.json"
-    given = ["--scheduler-file", str(there), "--no-dashboard"]
-    parts = [
-        subprocess.Popen([*python, f"distributed.cli.dask_{part}", *given, *more], **quiet)  # type: ignore[call-overload]
-        for part, more in (("scheduler", ["--port", "0"]), ("worker", ["--nthreads", "1"]))
-    ]
-    try:
-        while not there.is_file():
-            time.sleep(0.1)
-        address = json.loads(there.read_text())["address"]
-        process = command(records, tmp_path / "out", "--dask", address)
-        assert process.stderr is not None
-        for line in process.stderr:
-            if "done)" in line or "refused)" in line:
-                parts[0].kill()
-                break
-        _, told = process.communicate(timeout=60)
-    finally:
-        for part in parts:
-            part.kill()
-            part.wait()
-    assert process.returncode == 1
-    said = [row for row in told.splitlines() if row and not row.startswith("  batch,")]
-    assert len(said) == 1, told
-    assert said[0].startswith("Failed: The executor was lost (")
-
-
-@slow
 @pytest.mark.parametrize("address", ["junk", "tls://127.0.0.1:1"])
 def test_an_address_of_no_scheduler_is_told_in_a_sentence(
     address: str, records: Path, tmp_path: Path
@@ -367,9 +333,9 @@ def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
         raise ImportError(name)
 
-    monkeypatch.setattr(dask_client, "import_module", missing)
+    monkeypatch.setattr(executors, "import_module", missing)
     with pytest.raises(InputError, match=r"pip install 'psa-casadi\[dask\]'"):
-        dask_client.dask_client("local").__enter__()
+        executors.dask_client("local").__enter__()
 
 
 @slow
@@ -382,8 +348,8 @@ def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
         for task, outcome in outcomes(given, own, 1):
             found[task.job.device] = outcome
             if task.job.device == "d0":  # the next begins with a process that is dying
-                (process,) = own._all
-                os.kill(process.child.pid, signal.SIGKILL)
+                (child,) = children._CHILDREN
+                os.kill(child.pid, signal.SIGKILL)
     finally:
         own.end()
     assert [found[f"d{k}"].status for k in range(3)] == ["done", "failed", "done"]
@@ -400,7 +366,7 @@ def test_processes_of_the_standard_library_do_it_too(records: Path, tmp_path: Pa
 @slow
 def test_a_cluster_of_dask_does_it_too(records: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    with dask_client.dask_client("local", 2) as client:
+    with executors.dask_client("local", 2) as client:
         found = batch(records, tmp_path / "out", executor=client)
     assert found.counts == {"done": 2, "refused": 1}
     assert load_model(tmp_path / "out" / "first" / "model.json").provenance.free

@@ -16,7 +16,7 @@ from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.fmu import evidence
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import Fmu
-from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.prepare import prepared

@@ -14,9 +14,8 @@ from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps
-from psa_casadi.population.finding import Finding, Found
+from psa_casadi.population.finding import Finding, Found, replayed
 from psa_casadi.population.population import population
-from psa_casadi.population.replay import replayed
 from psa_casadi.report.documents.files import identification_file
 from psa_casadi.report.documents.findings import read_findings
 from psa_casadi.report.page.devices import MOST, write_comparison, write_population

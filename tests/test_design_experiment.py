@@ -7,20 +7,25 @@ import pytest
 from scipy.optimize import least_squares
 
 from psa_casadi import reference
-from psa_casadi.design.experiment.candidates import KINDS, Kind, draw, rest_of
-from psa_casadi.design.experiment.chances import naming_probability, plays_of
-from psa_casadi.design.experiment.criterion import Criterion, Point
+from psa_casadi.design.experiment.criteria import (
+    Criterion,
+    Information,
+    Optimality,
+    Rival,
+    SensorNoise,
+    Separation,
+    rival_of_model,
+)
 from psa_casadi.design.experiment.experiment import (
     informative_experiment,
+    naming_probability,
+    plays_of,
     rival_of_effect,
     separating_experiment,
     usual_records,
 )
-from psa_casadi.design.experiment.information import Information, Optimality
-from psa_casadi.design.experiment.limits import Limits, excess
-from psa_casadi.design.experiment.rivals import Rival, SensorNoise, rival_of_model
-from psa_casadi.design.experiment.search import Effort, search
-from psa_casadi.design.experiment.separation import Separation
+from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, draw, excess, rest_of
+from psa_casadi.design.experiment.search import Effort
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
@@ -212,37 +217,6 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
     for name in FREE:
         before, after = (np.diff(i[name])[0] for i in (sharp.before, sharp.intervals))
         assert 0.0 < after < before
-
-
-def test_a_record_that_is_enough_is_not_improved() -> None:
-    class Swing:
-        """The mean square of the voltage about its middle [V^2]: more is better."""
-
-        def at(self, record: Record) -> Point:
-            def swing(other: Record) -> float:
-                return float(np.mean((other.voltage - 50.0) ** 2))
-
-            return Point(swing(record), swing)
-
-    asked: list[float] = []
-
-    def enough(record: Record) -> bool:
-        asked.append(Swing().at(record).value)
-        return asked[-1] > least
-
-    limits = Limits(0.0, 100.0, 1.0, 200)
-    least = np.inf
-    further = search(Swing(), limits, 1e4, kinds=("triangles",), enough=enough)
-    drawn = further.drawn
-    assert asked[0] == drawn < further.value
-    least = drawn - 1.0
-    at_once = search(Swing(), limits, 1e4, kinds=("triangles",), enough=enough)
-    assert at_once.value == drawn
-    assert at_once.evaluations == Effort().draws
-    least = 0.5 * (drawn + asked[1])
-    after_one = search(Swing(), limits, 1e4, kinds=("triangles",), enough=enough)
-    assert drawn < after_one.value
-    assert at_once.evaluations < after_one.evaluations < further.evaluations
 
 
 def test_the_more_noise_the_more_plays() -> None:

@@ -12,16 +12,25 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.collocation import interval_of
-from psa_casadi.design.tracking.dynamics import dynamics_of
 from psa_casadi.design.tracking.inversion import correct, invert
 from psa_casadi.design.tracking.minimum_time import quickest_move
-from psa_casadi.design.tracking.program import NoSolutionError, Program
-from psa_casadi.design.tracking.saturation import binding
-from psa_casadi.design.tracking.targets import Target, raster_scan, read_target
-from psa_casadi.design.tracking.tracking import TrackedInput, track
-from psa_casadi.design.tracking.verification import error_of, uncompensated
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Target,
+    binding,
+    dynamics_of,
+    error_of,
+    raster_scan,
+    read_target,
+    uncompensated,
+)
+from psa_casadi.design.tracking.tracking import (
+    NoSolutionError,
+    Program,
+    TrackedInput,
+    interval_of,
+    track,
+)
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
 from tests.benchmarks.design_tracking import (
     LIMITS,

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psa_casadi.identification.certainty.combinations import Combination, free_combinations
-from psa_casadi.identification.certainty.determinacy import Determinacy, covariance_of
-from psa_casadi.identification.certainty.formulas import physical_formulas
+from psa_casadi.identification.combinations import Combination, free_combinations, physical_formulas
+from psa_casadi.identification.determinacy import Determinacy, covariance_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import simulate
 from tests.loop_fits import FREE, LOOP, FloatArray, loops

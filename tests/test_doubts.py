@@ -1,6 +1,7 @@
 """Odd but readable records: a verdict, or a sentence that names the cause."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,15 +11,16 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.start.doubts import (
+    doubtful_quantity,
     doubtful_sign,
+    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
+    refuse_few,
     refuse_unusable,
+    refuse_wrapped,
 )
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
-from psa_casadi.identification.start.readings import refuse_few
-from psa_casadi.identification.start.time_unit import doubtful_time
 from psa_casadi.records.record import Record
 from psa_casadi.records.suspects import suspects
 from psa_casadi.units import FloatArray
@@ -30,20 +32,19 @@ TABLE = [EFFECTS["slow_creep"], EFFECTS["sensor_jump"]]
 
 
 @pytest.fixture(scope="module")
-def given() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Time, voltage and displacement of an independent plant, 29 um at 60 V."""
+def given() -> Record:
+    """Return the record of an independent plant, 29 um at 60 V."""
     rng = np.random.default_rng(3)
     stack, time = draw_stack(rng), np.arange(600) / 200.0
     voltage = np.round(0.95 * stack.u_rated * np.concatenate([np.zeros(10), loops(rng, 590)]), 3)
     y = simulate_base(stack, time, voltage).displacement
-    return time, voltage, y + 2e-4 * np.ptp(y) * rng.standard_normal(y.size)
+    y += 2e-4 * np.ptp(y) * rng.standard_normal(y.size)
+    return Record(name="r", time=time, voltage=voltage, displacement=y)
 
 
-def scaled(
-    given: tuple[FloatArray, FloatArray, FloatArray], t: float = 1.0, v: float = 1.0, y: float = 1.0
-) -> Record:
-    time, voltage, shown = given
-    return Record(name="r", time=t * time, voltage=v * voltage, displacement=y * shown)
+def scaled(given: Record, t: float = 1.0, v: float = 1.0, y: float = 1.0) -> Record:
+    shown = y * np.asarray(given.displacement)
+    return replace(given, time=t * given.time, voltage=v * given.voltage, displacement=shown)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +72,7 @@ def test_a_unit_far_off_is_refused_with_the_likely_one(
     command: Callable[[list[Record]], object],
     factors: dict[str, float],
     told: str,
-    given: tuple[FloatArray, FloatArray, FloatArray],
+    given: Record,
 ) -> None:
     with pytest.raises(InputError, match=told):
         command([scaled(given, **factors)])
@@ -88,13 +89,13 @@ def test_a_unit_far_off_is_refused_with_the_likely_one(
     ],
 )
 def test_a_unit_that_may_be_another_is_doubted(
-    factors: dict[str, float], told: str, given: tuple[FloatArray, FloatArray, FloatArray]
+    factors: dict[str, float], told: str, given: Record
 ) -> None:
     assert told in doubtful_unit([scaled(given, **factors)])
     assert doubtful_unit([scaled(given)]) == ""
 
 
-def test_sign_and_time_are_doubted(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
+def test_sign_and_time_are_doubted(given: Record) -> None:
     assert not doubtful_sign([scaled(given)])
     assert "the other way round" in doubtful_sign([scaled(given, y=-1.0)])
     assert not doubtful_time([scaled(given)])
@@ -105,24 +106,20 @@ def test_sign_and_time_are_doubted(given: tuple[FloatArray, FloatArray, FloatArr
     assert "the other way round" in found.warnings[0]
 
 
-def test_a_stray_voltage_is_named_with_its_time(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
+def test_a_stray_voltage_is_named_with_its_time(given: Record) -> None:
+    voltage = given.voltage
     stray = np.where(np.arange(600) == 300, 1e6, voltage)
     with pytest.raises(InputError, match=r"voltage is 1e\+06 V at 1.5 s, and all others lie with"):
-        refuse_unusable([Record(name="r", time=time, voltage=stray, displacement=y)])
+        refuse_unusable([replace(given, voltage=stray)])
     with pytest.raises(InputError, match=r"reaches 1e[+]09 V, and changes by 60 V.*has an offset"):
-        refuse_unusable([Record(name="r", time=time, voltage=voltage + 1e9, displacement=y)])
+        refuse_unusable([replace(given, voltage=voltage + 1e9)])
     with pytest.raises(InputError, match=r"voltage changes by .* V only: that drives no stack"):
-        refuse_unusable(
-            [Record(name="r", time=time, voltage=50.0 + 1e-7 * voltage, displacement=y)]
-        )
+        refuse_unusable([replace(given, voltage=50.0 + 1e-7 * voltage)])
 
 
 @pytest.mark.parametrize(("t", "bound"), [(1e5, "R_s"), (1e-6, "c_P")])
 def test_however_slow_the_sampling_the_start_is_within_bounds(
-    t: float, bound: str, given: tuple[FloatArray, FloatArray, FloatArray]
+    t: float, bound: str, given: Record
 ) -> None:
     """A start outside would blame a parameter that nobody has given."""
     model = starting_model([scaled(given, t=t)])
@@ -130,24 +127,18 @@ def test_however_slow_the_sampling_the_start_is_within_bounds(
     assert low <= model.values[bound] <= high
 
 
-def test_a_spike_of_a_million_metres_moves_nothing(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
+def test_a_spike_of_a_million_metres_moves_nothing(given: Record) -> None:
+    y = np.asarray(given.displacement)
     spoiled = np.where(np.arange(600) == 300, 1e6, y)
-    found = diagnose(
-        [Record(name="r", time=time, voltage=voltage, displacement=spoiled)], effects=TABLE
-    )
+    found = diagnose([replace(given, displacement=spoiled)], effects=TABLE)
     assert found.verdict == "adequate"
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 0.6), (0.4, 1.0), (0.2, 0.8), (0.0, 0.95)])
-def test_a_saturated_sensor_is_named_and_masked(
-    low: float, high: float, given: tuple[FloatArray, FloatArray, FloatArray]
-) -> None:
-    time, voltage, y = given
+def test_a_saturated_sensor_is_named_and_masked(low: float, high: float, given: Record) -> None:
+    y = np.asarray(given.displacement)
     ends = y.min() + np.array([low, high]) * np.ptp(y)
-    record = Record(name="r", time=time, voltage=voltage, displacement=np.clip(y, *ends))
+    record = replace(given, displacement=np.clip(y, *ends))
     found = suspects(record)
     flat = (y <= ends[0]) & (low > 0.0) | (y >= ends[1]) & (high < 1.0)
     assert np.mean(found.mask != flat) < 0.01
@@ -156,125 +147,83 @@ def test_a_saturated_sensor_is_named_and_masked(
     assert f"{value:.6g} um" in found.saturation("r")[-1]
 
 
-def test_a_saturated_record_is_diagnosed_without_its_flat_top(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
-    record = Record(
-        name="r", time=time, voltage=voltage, displacement=np.minimum(y, y.min() + 0.6 * np.ptp(y))
-    )
+def test_a_saturated_record_is_diagnosed_without_its_flat_top(given: Record) -> None:
+    y = np.asarray(given.displacement)
+    record = replace(given, displacement=np.minimum(y, y.min() + 0.6 * np.ptp(y)))
     found = diagnose([record], effects=TABLE)
     assert found.verdict == "adequate"
     assert "the largest value, while the voltage moves the stack: the sensor" in found.notes[-1]
 
 
-def test_what_is_flat_for_other_reasons_is_not_a_saturated_sensor(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
+def test_what_is_flat_for_other_reasons_is_not_a_saturated_sensor(given: Record) -> None:
+    voltage, y = given.voltage, np.asarray(given.displacement)
     quantum = np.ptp(y) / 50.0
-    assert not suspects(
-        Record(
-            name="coarse", time=time, voltage=voltage, displacement=quantum * np.round(y / quantum)
-        )
-    ).ends
+    assert not suspects(replace(given, displacement=quantum * np.round(y / quantum))).ends
     held = np.minimum(voltage, 0.6 * voltage.max())
-    assert not suspects(
-        Record(name="held", time=time, voltage=held, displacement=np.round(1e-6 * held, 9))
-    ).ends
-    assert not suspects(Record(name="as it is", time=time, voltage=voltage, displacement=y)).ends
+    assert not suspects(replace(given, voltage=held, displacement=np.round(1e-6 * held, 9))).ends
+    assert not suspects(given).ends
 
 
-def test_a_coarse_sensor_is_named(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
-    time, voltage, y = given
+def test_a_coarse_sensor_is_named(given: Record) -> None:
+    y = np.asarray(given.displacement)
     quantum = np.ptp(y) / 9.0
-    found = diagnose(
-        [
-            Record(
-                name="r", time=time, voltage=voltage, displacement=quantum * np.round(y / quantum)
-            )
-        ],
-        effects=TABLE,
-    )
+    found = diagnose([replace(given, displacement=quantum * np.round(y / quantum))], effects=TABLE)
     assert "r: the sensor resolves 9 steps over the whole range." in found.notes[-1]
 
 
-def test_hardly_a_reading_left_is_refused_with_the_reason(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
+def test_hardly_a_reading_left_is_refused_with_the_reason(given: Record) -> None:
+    y = np.asarray(given.displacement)
     tenth = np.sort(y)[12]
     with pytest.raises(InputError, match=r"(?s)sensor is saturated there.*Only 12 of 600 reading"):
-        identify([Record(name="r", time=time, voltage=voltage, displacement=np.minimum(y, tenth))])
+        identify([replace(given, displacement=np.minimum(y, tenth))])
 
 
 @pytest.mark.parametrize("command", [identify, diagnose])
 def test_a_sensor_that_wraps_round_is_named(
-    command: Callable[[list[Record]], object], given: tuple[FloatArray, FloatArray, FloatArray]
+    command: Callable[[list[Record]], object], given: Record
 ) -> None:
-    time, voltage, y = given
+    y = np.asarray(given.displacement)
     period = 0.6 * np.ptp(y)
-    wrapped = Record(
-        name="r", time=time, voltage=voltage, displacement=(y - y.min() + 0.1 * period) % period
-    )
+    wrapped = replace(given, displacement=(y - y.min() + 0.1 * period) % period)
     with pytest.raises(
         InputError, match=r"jumps \d+ times by 1[67].\d+ um, up or down, and follows"
     ):
         command([wrapped])
 
 
-def test_what_jumps_otherwise_is_not_wrapped(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
+def test_what_jumps_otherwise_is_not_wrapped(given: Record) -> None:
+    time, voltage, y = given.time, given.voltage, np.asarray(given.displacement)
     switched = np.where(time % 1.0 < 0.5, 0.0, voltage)
-    refuse_wrapped(
-        [
-            scaled(given),
-            Record(name="steps", time=time, voltage=switched, displacement=4e-7 * switched),
-        ]
-    )
+    steps = replace(given, voltage=switched, displacement=4e-7 * switched)
+    refuse_wrapped([scaled(given), steps])
     stray = np.where(np.isin(np.arange(600), (200, 400)), y - np.ptp(y), y)
-    refuse_wrapped([Record(name="stray", time=time, voltage=voltage, displacement=stray)])
+    refuse_wrapped([replace(given, displacement=stray)])
 
 
-def test_a_rate_an_integral_and_a_rectified_displacement_are_doubted(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
+def test_a_rate_an_integral_and_a_rectified_displacement_are_doubted(given: Record) -> None:
+    time, y = given.time, np.asarray(given.displacement)
     assert not doubtful_quantity([scaled(given)])
-    integral = Record(
-        name="r", time=time, voltage=voltage, displacement=np.cumsum(y - y.mean()) * 5e-3
-    )
+    integral = replace(given, displacement=np.cumsum(y - y.mean()) * 5e-3)
     assert "the rate of the displacement follows the voltage" in doubtful_quantity([integral])
-    rectified = Record(
-        name="r", time=time, voltage=voltage, displacement=np.abs(y - y.min() - 0.5 * np.ptp(y))
-    )
+    rectified = replace(given, displacement=np.abs(y - y.min() - 0.5 * np.ptp(y)))
     assert "V the displacement follows the voltage" in doubtful_quantity([rectified])
-    rate = Record(name="r", time=time, voltage=voltage, displacement=np.gradient(y, time))
+    rate = replace(given, displacement=np.gradient(y, time))
     assert "the integral of the displacement follows" in doubtful_quantity([rate])
 
 
-def test_a_voltage_in_counts_is_doubted(given: tuple[FloatArray, FloatArray, FloatArray]) -> None:
-    time, voltage, y = given
+def test_a_voltage_in_counts_is_doubted(given: Record) -> None:
+    voltage = given.voltage
     assert not doubtful_voltage([scaled(given)])
-    counts = Record(
-        name="r", time=time, voltage=np.round(32768.0 + 200.0 * voltage), displacement=y
-    )
+    counts = replace(given, voltage=np.round(32768.0 + 200.0 * voltage))
     found = diagnose([counts], effects=[])
     assert "no stack bears such a voltage, and what depends on its level" in found.doubt
     assert any("no stack bears more than 2000 V" in note for note in found.notes)
 
 
-def test_hardly_a_reading_that_differs_is_refused(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
+def test_hardly_a_reading_that_differs_is_refused(given: Record) -> None:
+    y = np.asarray(given.displacement)
     ordered = np.sort(y)
-    hardly, enough = (
-        Record(name="r", time=time, voltage=voltage, displacement=np.maximum(y, ordered[-k]))
-        for k in (16, 17)
-    )
+    hardly, enough = (replace(given, displacement=np.maximum(y, ordered[-k])) for k in (16, 17))
     with pytest.raises(InputError, match=r"Only 15 readings of the displacement differ from"):
         refuse_few([hardly], [hardly], [])
     refuse_few([enough], [enough], [])
@@ -297,23 +246,21 @@ def _torn(y: FloatArray) -> FloatArray:
 def test_an_odd_record_of_a_sound_stack_is_adequate(
     late: float,
     change: Callable[[FloatArray], FloatArray],
-    given: tuple[FloatArray, FloatArray, FloatArray],
+    given: Record,
 ) -> None:
     """A record that starts late, noise with heavy tails, runs of missing readings."""
-    time, voltage, y = given
+    y = np.asarray(given.displacement)
     found = diagnose(
-        [Record(name="r", time=time + late, voltage=voltage, displacement=change(y))], effects=TABLE
+        [replace(given, time=given.time + late, displacement=change(y))], effects=TABLE
     )
     assert found.verdict == "adequate"
     assert not found.doubt
 
 
 @pytest.mark.slow
-def test_a_voltage_with_the_other_sign_is_told(
-    given: tuple[FloatArray, FloatArray, FloatArray],
-) -> None:
-    time, voltage, y = given
-    found = diagnose([Record(name="r", time=time, voltage=-voltage, displacement=y)], effects=TABLE)
+def test_a_voltage_with_the_other_sign_is_told(given: Record) -> None:
+    voltage = given.voltage
+    found = diagnose([replace(given, voltage=-voltage)], effects=TABLE)
     assert found.verdict == "not_driven"
     assert any("connected the other way round" in note for note in found.notes)
     assert found.next_experiment.why.startswith("Correct the record")

@@ -25,7 +25,7 @@ from psa_casadi.effects.strain import (
 )
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.form import forms_of
+from psa_casadi.identification.start.ordinary import forms_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.scales import stiffness_scale, stroke_scale
 from psa_casadi.simulation.compiler import functions_of

@@ -7,7 +7,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.identification.start.electrical import capacitance_of
+from psa_casadi.identification.start.ordinary import capacitance_of
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import parameter_table

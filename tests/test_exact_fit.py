@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.certainty.determinacy import covariance_of
+from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.search.multistart import free_parameters
+from psa_casadi.identification.search import free_parameters
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole

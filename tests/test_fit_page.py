@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from psa_casadi.errors import InputError
-from psa_casadi.identification.advice.advice import Advice
-from psa_casadi.identification.certainty.combinations import Combination
+from psa_casadi.identification.advice import Advice
+from psa_casadi.identification.combinations import Combination
 from psa_casadi.report.page.results import (
     MOST_RECORDS,
     fit_page,
@@ -39,9 +39,9 @@ def text(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("fit") / "fit.html"
     found = replace(
         identification(),
-        warnings=("Tom & <Jerry> disagree.",),
-        combinations=(Combination(("k_L", "A"), "k_L + A", 1e-3, "k_L and A only as their sum"),),
-        advice=(Advice("Hold 60 V.", ("tau",), None),),
+        doubts=("Tom & <Jerry> disagree.",),
+        combinations=(Combination("group", ("k_L", "A")),),
+        advice=(Advice("ringing", ("m_P",)),),
     )
     write_fit_report(found, path, origin="synthetic", still=True)
     assert [p.name for p in path.parent.iterdir()] == ["fit.html"]
@@ -56,7 +56,7 @@ def test_the_page_of_a_fit_tells_all_of_it(text: str) -> None:
     assert "The model misses the synthetic displacement by" in page.text
     assert "measured" not in page.text
     assert "Tom & <Jerry> disagree." in page.text
-    assert "k_L and A only as their sum" in page.text
+    assert "k_L and A trade off; no simple formula of them is known." in page.text
     assert "What to measure next" in page.text
     for e in found.experiments:
         assert e.record.sha256 in page.text
@@ -69,7 +69,7 @@ def test_the_page_of_a_fit_tells_all_of_it(text: str) -> None:
 
 
 def test_sections_without_content_are_left_out() -> None:
-    found = replace(identification(), warnings=(), starts=(), combinations=(), advice=())
+    found = replace(identification(), doubts=(), starts=(), combinations=(), advice=())
     page = Page(fit_page(found, series_of_fit(found)))
     for title in ("Warning", "Starts", "leave open", "What to measure next"):
         assert title not in page.text

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 import psa_casadi as psa
-from psa_casadi.design.online.drifting_stack import DriftingStack
+from psa_casadi.examples.linearisation_trial import DriftingStack
 from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
 from psa_casadi.export.fixed_step.probe import Probe

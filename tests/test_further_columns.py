@@ -18,13 +18,12 @@ from psa_casadi.components.surroundings import FLEXURE
 from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.fit import Objective, fit
 from psa_casadi.identification.fitting.further import COLUMNS, scaled
-from psa_casadi.identification.fitting.minimum import objective
-from psa_casadi.identification.start.columns import columns_of, with_levels
-from psa_casadi.identification.start.electrical import capacitance_of
-from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.prepare import columns_of, with_levels
+from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.compose import compose
+from psa_casadi.notes import texts
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
@@ -104,7 +103,7 @@ def test_the_derivatives_of_further_columns_are_those_of_their_residuals() -> No
     experiments = with_levels([whole(r)], found.fitted)
     some = fit(found.model, experiments, ["k_L", "A", "R_s"], sigma=[1e-8], evaluations=1)
     way = Way(1e-9, 1e-9)
-    evaluate = objective(found.model, experiments, some.unknowns, np.full(300, 1e-8), way)
+    evaluate = Objective(found.model, experiments, some.unknowns, [1e-8], way)
     theta, rows = some.theta, slice(300, 900)
     at = evaluate(theta)
     assert at is not None
@@ -133,11 +132,11 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
         columns_of(compose([FLEXURE]), [r])
     found = columns_of(starting_model([r]), [r])
     assert found.fitted == ("monitor_voltage",)
-    assert found.left_out == ("strain is left out: it never changes.",)
+    assert texts(found.left_out) == ("strain is left out: it never changes.",)
     assert "monitor_voltage" in found.model.output_names
     turned = replace(r, current=-np.gradient(time), monitor_voltage=None, strain=None)
     (said,) = columns_of(starting_model([turned]), [turned]).left_out
-    assert "does not follow the voltage as a capacitance's does" in said
+    assert "does not follow the voltage as a capacitance's does" in str(said)
     with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
         replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
 
@@ -166,7 +165,7 @@ def test_a_turned_sign_is_told() -> None:
         found = columns_of(starting_model([record]), [record])
         experiments = with_levels([whole(record)], found.fitted)
         (further,) = fit(found.model, experiments, [], sigma=[1e-8], evaluations=1).further
-        assert ("its sign is probably turned" in further.sentence) is told
+        assert ("its sign is probably turned" in texts(further.notes)[-1]) is told
 
 
 @pytest.mark.parametrize(
@@ -206,7 +205,7 @@ def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> Non
     model, (beside,) = scaled(some.model, some.further)
     assert model.values == pytest.approx(some.model.values)  # the scale is in the model already
     assert beside.factors == pytest.approx([1.0])
-    assert "displacement_2: fitted beside the displacement" in further.sentence
+    assert "displacement_2: fitted beside the displacement" in str(further.notes[0])
 
 
 @slow

@@ -1,25 +1,22 @@
 """What `identify` finds, against independent plants, the reference, and a real instrument."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from psa_casadi import reference
 from psa_casadi.components import BASE
+from psa_casadi.identification import refitting
 from psa_casadi.identification.identify import identify
-from psa_casadi.identification.search import refitting
-from psa_casadi.identification.search.refitting import refit_or_keep
+from psa_casadi.identification.refitting import refit_or_keep
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, multisine, read_record, time_grid
+from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.simulation.stepper import SimulationError
 from tests.identified_plants import (
     combinations,
     identified,
     noise,
     plant,
-    same_as_the_named_stack,
     standard_errors,
     values_of,
 )
@@ -173,8 +170,8 @@ def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
 def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any("cut off" in w for w in identified(2).warnings)
     record = plant(2)[1].slice(0, 600)
-    monkeypatch.setattr("psa_casadi.identification.search.refitting.POLISH", 1)
-    monkeypatch.setattr("psa_casadi.identification.search.refinement._LAST", 1)
+    monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 1)
+    monkeypatch.setattr("psa_casadi.identification.refitting._LAST", 1)
     found = identify([record])
     assert found.warnings[0].startswith("The fit was cut off before it converged")
 
@@ -189,18 +186,3 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     first = found.fit
     monkeypatch.setattr(refitting, "fit", fails)
     assert refit_or_keep(first, found.experiments, first.unknowns.names, first.sigma) is first
-
-
-@slow
-@pytest.mark.parametrize(
-    ("record", "limit"), [pytest.param("sine_1hz", 0.49, marks=slow), ("minor_loops", 0.64)]
-)
-def test_the_micromanipulator_is_met_within_its_floors(
-    measured_data: Path, record: str, limit: float
-) -> None:
-    r = read_record(measured_data / "micromanipulator" / f"{record}.csv")
-    found = identify([r])
-    assert found.fit.converged
-    assert 100.0 * found.fit.rms / r.range_m <= limit
-    if record == "minor_loops":
-        same_as_the_named_stack(found.fit.rms, r, "micromanipulator")

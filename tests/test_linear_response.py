@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from psa_casadi.identification.start.linear import arrangements
 from psa_casadi.identification.start.linear_response import (
+    Response,
     mechanics_poles,
     numerator_time,
     plays,
     respond,
     transfer,
+    vector_fit,
 )
-from psa_casadi.identification.start.vector_fitting import Response, vector_fit
+from psa_casadi.identification.start.starting_points import arrangements
 
 
 def test_the_response_is_exact_between_samples() -> None:

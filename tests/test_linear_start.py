@@ -9,13 +9,14 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.start.linear import LinearStart, linear_start
-from psa_casadi.identification.start.linear_response import FloatArray, transfer
+from psa_casadi.identification.start.linear_response import transfer
 from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.start.starting_points import LinearStart, linear_start
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
 from tests.benchmarks.records import loop_voltage, multisine_voltage, step_voltage
 from tests.tiers import slow, slow_but
 

@@ -6,16 +6,17 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from psa_casadi import reference
-from psa_casadi.design.online.drifting_stack import DriftingStack
-from psa_casadi.design.online.linearisation_trial import Drive, ageing, driven, off_values
-from psa_casadi.design.online.observer import FeedForward, HysteresisObserver, stack_values
-from psa_casadi.design.online.recursive_least_squares import (
-    AdaptiveFeedForward,
-    identifier_for,
-)
 from psa_casadi.errors import InputError
+from psa_casadi.examples.linearisation_trial import DriftingStack, Drive, ageing, driven, off_values
 from psa_casadi.model.parts import compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.online import (
+    AdaptiveFeedForward,
+    FeedForward,
+    HysteresisObserver,
+    identifier_for,
+    stack_values,
+)
 from psa_casadi.simulation.stepper import run
 from tests.plants.base import simulate_base
 from tests.plants.stack import draw_stack

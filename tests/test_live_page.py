@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.design.tracking.verification import respond
+from psa_casadi.design.tracking.targets import respond
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.model_file import loads

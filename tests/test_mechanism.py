@@ -10,19 +10,21 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from psa_casadi.design.mechanism.loop import (
+    Mounting,
+    bandwidth,
+    mechanical_poles,
+    mechanics_of,
+    step_response,
+)
 from psa_casadi.design.mechanism.mechanism import (
     Limits,
     MechanismDesign,
-    Mounting,
-    bandwidth,
     design_mechanism,
-    mechanical_poles,
-    mechanics_of,
     mechanism_model,
     mounted_model,
     port_model,
     root_locus,
-    step_response,
 )
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError

@@ -10,7 +10,7 @@ from scipy.signal import lsim
 
 import psa_casadi as psa
 from psa_casadi.effects.mechanics import MODAL_SERIES
-from psa_casadi.identification.start.modes import Shaken, modes_of
+from psa_casadi.identification.start.linear_response import Shaken, modes_of
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine
 from tests.plants.base import simulate_base

@@ -10,10 +10,9 @@ import pytest
 from psa_casadi.cli import diagnose as command
 from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.design.experiment import experiment
-from psa_casadi.design.experiment.designs import Separated
-from psa_casadi.design.experiment.experiment import resolving_experiment
+from psa_casadi.design.experiment.criteria import noise_of_fit, rival_of_fit
+from psa_casadi.design.experiment.experiment import Separated, resolving_experiment
 from psa_casadi.design.experiment.limits import excess
-from psa_casadi.design.experiment.rivals import noise_of_fit, rival_of_fit
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.design.online.linearisation_trial import Drive, driven, off_values
-from psa_casadi.design.online.recursive_least_squares import OnlineIdentification, identifier_for
+from psa_casadi.examples.linearisation_trial import Drive, driven, off_values
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.online import OnlineIdentification, identifier_for
 from tests.modelica_runs import simulated
 from tests.online_numpy import TRACKED, NumpyIdentification
 from tests.tiers import slow_but

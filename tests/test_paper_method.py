@@ -9,17 +9,17 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.identification.paper.factors import mechanics_of
 from psa_casadi.identification.paper.hysteresis import hysteresis_part
-from psa_casadi.identification.paper.method import identify_by_paper, paper_method
-from psa_casadi.identification.paper.moments import (
+from psa_casadi.identification.paper.linear import (
     COEFFICIENTS,
     coefficients_of_limits,
-    coefficients_of_values,
+    find_loops,
+    find_steps,
     linear_part,
+    mechanics_of,
     moment_coefficients,
 )
-from psa_casadi.identification.paper.shapes import find_loops, find_steps
+from psa_casadi.identification.paper.method import identify_by_paper, paper_method
 from psa_casadi.model.model_file import load_model
 from psa_casadi.records import (
     Record,
@@ -35,6 +35,7 @@ from tests.paper_cases import (
     LINEAR,
     changed,
     closed_step,
+    coefficients_of_values,
     compliance,
     loop,
     noisy,
@@ -95,8 +96,8 @@ def test_factors_reproduce_the_coefficients(name: str) -> None:
     p = values(name)
     exact = coefficients_of_values(p)
     named = dict(zip(COEFFICIENTS, exact.tolist(), strict=True))
-    found, sentences = mechanics_of(named, p["k_P"], p["k_B"])
-    assert sentences == ()
+    found, notes = mechanics_of(named, p["k_P"], p["k_B"])
+    assert notes == ()
     np.testing.assert_allclose(coefficients_of_values({**p, **found}), exact, rtol=1e-6)
     for key in ("tau", "m_P", "c_P", "m_B", "c_B") if name == "PTBS200" else ("tau",):
         assert found[key] == pytest.approx(p[key], rel=1e-4)
@@ -105,8 +106,8 @@ def test_factors_reproduce_the_coefficients(name: str) -> None:
 def test_a_zero_that_the_poles_do_not_allow_is_told() -> None:
     p = values("PTBS200")
     named = dict(zip(COEFFICIENTS, coefficients_of_values(p).tolist(), strict=True))
-    found, sentences = mechanics_of({**named, "b_1": 1e-3}, p["k_P"], p["k_B"])
-    assert "the poles allow" in sentences[0]
+    found, notes = mechanics_of({**named, "b_1": 1e-3}, p["k_P"], p["k_B"])
+    assert "the poles allow" in str(notes[0])
     assert found["tau"] == pytest.approx(p["tau"], rel=1e-4)
 
 
@@ -126,9 +127,7 @@ def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
     assert n == pytest.approx(p["n"], rel=0.04)
     assert (beta + gamma) * unit == pytest.approx(p["beta"] + p["gamma"], rel=0.02)
     assert (gamma - beta) * unit == pytest.approx(p["gamma"] - p["beta"], rel=0.02)
-    assert [s.startswith("The logarithm of (34)") for s in found.sentences] == [True] * (
-        not leading
-    )
+    assert [n.code for n in found.notes] == ["lagging_loop"] * (not leading)
 
 
 @slow
@@ -240,7 +239,7 @@ def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
 
 @slow
 def test_nothing_is_said_against_a_step_that_serves() -> None:
-    assert linear_part(find_steps([_quiet(6e-3, 40001)])[0]).sentences == ()
+    assert linear_part(find_steps([_quiet(6e-3, 40001)])[0]).notes == ()
     found = paper_method([_quiet(6e-3, 40001), loop()])
     assert not any("not to be trusted" in s or "no stack's" in s for s in found.sentences)
     assert set(found.found) >= {"k_L", "A", "beta", "gamma", "delta", "n", "tau", "m_B", "c_B"}

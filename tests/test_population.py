@@ -7,13 +7,9 @@ import pytest
 from scipy import optimize, stats
 
 from psa_casadi.errors import InputError
-from psa_casadi.population.difference import differences
 from psa_casadi.population.finding import Finding, Found
-from psa_casadi.population.groups import batch_test, drift
-from psa_casadi.population.mixed_regression import mixed_regression
-from psa_casadi.population.outliers import outliers
-from psa_casadi.population.population import frequencies, population
-from psa_casadi.population.several_tests import adjusted
+from psa_casadi.population.population import differences, frequencies, population
+from psa_casadi.population.statistics import adjusted, batch_test, drift, mixed_regression, outliers
 from psa_casadi.units import FloatArray
 from tests.tiers import slow_but
 

@@ -12,11 +12,9 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.posterior import packages
+from psa_casadi.posterior import chains
 from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.density import Block, Density
-from psa_casadi.posterior.task import Task, task_of
-from psa_casadi.posterior.within import Within
+from psa_casadi.posterior.task import Block, Density, Task, Within, task_of
 from psa_casadi.report.documents.schemas import schema_texts
 from tests.stack_models import stack
 
@@ -152,6 +150,6 @@ def test_what_cannot_be_sampled_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     def absent(name: str) -> None:
         raise ModuleNotFoundError(name, name=name)
 
-    monkeypatch.setattr(packages, "import_module", absent)
+    monkeypatch.setattr(chains, "import_module", absent)
     with pytest.raises(psa.InputError, match=r"pip install 'psa-casadi\[sample\]'"):
         psa.sample(TRUTH, record())

@@ -10,19 +10,15 @@ from scipy.signal import lfilter
 
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.identification.certainty.determinacy import determinacy
-from psa_casadi.identification.certainty.profile import (
-    PROFILE_LIMIT,
-    Profile,
-    profile,
-    profile_sentences,
-)
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.profile import PROFILE_LIMIT, profile
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.report.plots.findings import profile_plot
+from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.simulation.simulate import simulate
 
 FloatArray = NDArray[np.float64]
@@ -135,6 +131,8 @@ def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
     assert p.low is None
     assert p.high is not None
     assert p.high > 1e3
+    assert p.values[0] == pytest.approx(p.bounds[0], rel=1e-6)  # six decades below the limit
+    assert 0.0 < p.increase[0] < PROFILE_LIMIT
     sentence = profile_sentences(p)[0]
     assert sentence.startswith("c_P is below")
     assert "nothing bounds it from below" in sentence
@@ -161,28 +159,12 @@ def test_a_parameter_that_was_not_searched_has_no_profile() -> None:
         profile(found, experiments, "m_P")
 
 
-def test_progress_names_the_parameter_and_the_value() -> None:
+def test_sentence_and_plot_show_profile_limit_and_interval() -> None:
     found, experiments = fitted("k_L", "tau")
-    seen: list[str] = []
-    p = profile(found, experiments, "tau", progress=seen.append)
-    assert len(seen) == len(p.values)
-    assert all(s.startswith("profile of tau, ") for s in seen)
-    assert len(p.values) <= 21
-
-
-@pytest.fixture
-def closed() -> Profile:
-    found, experiments = fitted("k_L", "tau")
-    return profile(found, experiments, "tau")
-
-
-def test_the_sentence_uses_the_display_unit(closed: Profile) -> None:
+    closed = profile(found, experiments, "tau")
     (sentence,) = profile_sentences(closed)
     assert sentence.startswith("tau lies between 2.")
     assert sentence.endswith("ms.")
-
-
-def test_the_plot_shows_profile_limit_and_interval(closed: Profile) -> None:
     plot = profile_plot(closed)
     assert plot.layout["xaxis"]["title"]["text"] == "tau [ms]"
     np.testing.assert_allclose(plot.data[0]["x"], 1e3 * closed.values)
@@ -195,11 +177,3 @@ def test_the_plot_shows_profile_limit_and_interval(closed: Profile) -> None:
     # where the cost is quadratic the dotted parabola passes through the profile's points
     parabola = np.interp(plot.data[0]["x"], plot.data[1]["x"], plot.data[1]["y"])
     np.testing.assert_allclose(parabola, closed.increase, atol=0.3)
-
-
-def test_a_cost_that_levels_off_is_followed_to_the_bound() -> None:
-    """Below the sampling the cost stays under the limit for six decades."""
-    found, experiments = fitted("k_L", "tau", "c_P")
-    p = profile(found, experiments, "c_P")
-    assert p.values[0] == pytest.approx(p.bounds[0], rel=1e-6)
-    assert 0.0 < p.increase[0] < PROFILE_LIMIT

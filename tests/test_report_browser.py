@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from psa_casadi.identification.advice.advice import Advice
+from psa_casadi.identification.advice import Advice
 from psa_casadi.report.page.results import write_fit_report, write_report
 from tests.browser import DARK, PHONE, Browser, find_browser, on_a_phone
 from tests.report_cases import diagnosis, identification
@@ -42,8 +42,7 @@ def of_diagnosis(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _written(kind: str, folder: Path) -> Path:
     path = folder / f"{kind}.html"
     if kind == "fit":
-        said = "Play a voltage that is held for ten times the creep lag at three levels."
-        found = replace(identification(), advice=(Advice(said, ("tau",), None),))
+        found = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))
         write_fit_report(found, path, origin="synthetic")
     else:
         write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")

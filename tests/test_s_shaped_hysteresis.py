@@ -6,7 +6,7 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import compose
 from psa_casadi.records.split import whole

@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.result import Alternative
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.check.check import CheckReport
 from psa_casadi.export.check.rows import CheckRow, stopped
-from psa_casadi.identification.certainty.profile import Profile
+from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import dumps
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.documents.files import check_file, identification_file

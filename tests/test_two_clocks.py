@@ -8,6 +8,7 @@ import pytest
 
 from psa_casadi import two_clocks
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.notes import texts
 from psa_casadi.records import Record, read_record
 from psa_casadi.units import FloatArray
 from tests.plants.base import Run, simulate_base
@@ -73,7 +74,7 @@ def test_the_finding_is_told_and_repeats(run: Run) -> None:
     assert again.period == pytest.approx(found.period, rel=0.01)
     assert again.height == pytest.approx(found.height, rel=0.01)
     ready, said = prepared(given)
-    assert any("sampled by two clocks" in s for s in said)
+    assert any("sampled by two clocks" in s for s in texts(said))
     assert two_clocks(ready) is None
     assert (ready.name, ready.sha256) == (given.name, given.sha256)
     gaps[100:110] = np.nan

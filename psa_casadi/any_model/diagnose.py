@@ -32,7 +32,7 @@ from psa_casadi.diagnosis.task import Method
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
 from psa_casadi.identification.identify import Identification
-from psa_casadi.identification.start.form import Hysteresis
+from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.read.reading import Records

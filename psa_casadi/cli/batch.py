@@ -80,9 +80,8 @@ def batch(
     """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.devices.batch import batch as run
-    from psa_casadi.devices.dask_client import dask_client
-    from psa_casadi.devices.jobs import jobs_given
-    from psa_casadi.devices.task import Options
+    from psa_casadi.devices.executors import dask_client
+    from psa_casadi.devices.jobs import Options, jobs_given
 
     given = Given(effects)
     given.stiffness(stiffness)

@@ -29,7 +29,7 @@ def compare(
     A model and a diagnosis of the same records are one device. The page needs no network.
     """
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.devices.results import read_results
+    from psa_casadi.devices.batch import read_results
     from psa_casadi.population.population import population
     from psa_casadi.report.documents.findings import read_findings
     from psa_casadi.report.page.devices import write_comparison, write_population

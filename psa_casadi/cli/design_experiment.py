@@ -24,8 +24,8 @@ from psa_casadi.cli.screen import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from psa_casadi.design.experiment.designs import Informative, Separated
-    from psa_casadi.design.experiment.rivals import Rival
+    from psa_casadi.design.experiment.criteria import Rival
+    from psa_casadi.design.experiment.experiment import Informative, Separated
     from psa_casadi.model.compose import Model
 
 

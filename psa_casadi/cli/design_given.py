@@ -8,11 +8,9 @@ if TYPE_CHECKING:
 
     from psa_casadi.cli.inputs import Given
     from psa_casadi.component import Component
-    from psa_casadi.design.experiment.candidates import Kind
-    from psa_casadi.design.experiment.designs import Informative, Separated
-    from psa_casadi.design.experiment.information import Optimality
-    from psa_casadi.design.experiment.limits import Limits
-    from psa_casadi.design.experiment.rivals import Rival, SensorNoise
+    from psa_casadi.design.experiment.criteria import Optimality, Rival, SensorNoise
+    from psa_casadi.design.experiment.experiment import Informative, Separated
+    from psa_casadi.design.experiment.limits import Kind, Limits
     from psa_casadi.design.experiment.search import Effort
     from psa_casadi.model.compose import Model
     from psa_casadi.records.record import Record
@@ -33,7 +31,7 @@ class Plan:
     @property
     def kinds(self) -> "tuple[Kind, ...]":
         """The families to search."""
-        from psa_casadi.design.experiment.candidates import KINDS
+        from psa_casadi.design.experiment.limits import KINDS
 
         return KINDS if self.family == "any" else tuple(k for k in KINDS if k == self.family)
 
@@ -90,7 +88,7 @@ def noise(
     model: "Model", limits: "Limits", noise: float | None, correlation: float
 ) -> "SensorNoise":
     """Return the noise [nm] as given, else a share of the stroke within the limits."""
-    from psa_casadi.design.experiment.rivals import SensorNoise
+    from psa_casadi.design.experiment.criteria import SensorNoise
     from psa_casadi.simulation.simulate import simulate
 
     if noise is not None:
@@ -144,10 +142,10 @@ def rivals(
     progress: "Callable[[str], None]",
 ) -> "tuple[Rival | None, list[Rival], SensorNoise | None]":
     """Return the base, the rivals and the noise, fitted to records if there are any."""
+    from psa_casadi.design.experiment.criteria import noise_of_fit, rival_of_fit
     from psa_casadi.design.experiment.experiment import rival_of_effect
-    from psa_casadi.design.experiment.rivals import noise_of_fit, rival_of_fit
     from psa_casadi.diagnosis.search.steps import fit_contenders
-    from psa_casadi.identification.search.multistart import CORE
+    from psa_casadi.identification.search import CORE
 
     if not records:
         plain = model.without(e.name for e in effects)
@@ -161,8 +159,8 @@ def rivals(
 
 def whole(model: "Model", wanted: "Sequence[str]") -> "Rival":
     """Return the model with what records of loops determine as its unknowns, and what is wanted."""
-    from psa_casadi.design.experiment.rivals import rival_of_model
-    from psa_casadi.identification.search.multistart import CORE
+    from psa_casadi.design.experiment.criteria import rival_of_model
+    from psa_casadi.identification.search import CORE
 
     own = [n for e in model.effects for n in e.fitted]
     free = [n for n in CORE if n in model.parameter_names]

@@ -53,8 +53,7 @@ def input_(
     """Design the voltage for a path or for a quickest move; test it on simulator and FMU."""
     from psa_casadi.cli import design_input_runs as runs
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-    from psa_casadi.design.tracking.targets import read_target
+    from psa_casadi.design.tracking.targets import AmplifierLimits, read_target
 
     given = Given(effects)
     given.outputs({"--output": output, "--report": report}, [model, target, measured])

@@ -10,15 +10,20 @@ import numpy as np
 
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.screen import show, show_table, tell_written, working
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
+from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
 from psa_casadi.design.tracking.minimum_time import QuickMove, quickest_move
-from psa_casadi.design.tracking.saturation import binding
-from psa_casadi.design.tracking.targets import Target
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Response,
+    Target,
+    TrackingError,
+    binding,
+    error_of,
+    uncompensated,
+)
 from psa_casadi.design.tracking.tracking import TrackedInput
 from psa_casadi.design.tracking.tracking import track as tracked
-from psa_casadi.design.tracking.trial import corrected
-from psa_casadi.design.tracking.verification import Response, TrackingError, error_of, uncompensated
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record, write_record
 from psa_casadi.report.page.designs import (

@@ -74,9 +74,9 @@ def mechanism(
     MECHANISM.json is a model: `psa export fmu --model MECHANISM.json` makes an FMU of it.
     """
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.design.mechanism.goals import check_goals
     from psa_casadi.design.mechanism.mechanism import (
         Limits,
+        check_goals,
         design_mechanism,
         mechanism_model,
         port_model,

@@ -96,9 +96,9 @@ def c(
 ) -> None:
     """Write a model as C99 for a controller: a step of fixed length and constant cost."""
     from psa_casadi.cli.inputs import Given, step_seconds
-    from psa_casadi.design.online.part_for import part_for
     from psa_casadi.export.fixed_step.code import limit_words
     from psa_casadi.export.fixed_step.export import export_c
+    from psa_casadi.online import part_for
 
     given = Given(effects)
     seconds = given.attempt(lambda: step_seconds(step))

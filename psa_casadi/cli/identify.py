@@ -27,8 +27,8 @@ from psa_casadi.cli.screen import (
 from psa_casadi.cli.steps import IDENTIFY
 
 if TYPE_CHECKING:
-    from psa_casadi.identification.certainty.profile import Profile
     from psa_casadi.identification.identify import Identification
+    from psa_casadi.identification.profile import Profile
 
 
 class Method(StrEnum):
@@ -74,9 +74,9 @@ def identify(
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine."""
     from psa_casadi.cli.inputs import Given
-    from psa_casadi.identification.certainty.profile import profile_sentences
     from psa_casadi.identification.identify import identify as run
     from psa_casadi.identification.paper.method import identify_by_paper as by_paper
+    from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
     given = Given(effects, quiet=quiet)
@@ -132,7 +132,7 @@ def _finish(
     """
     from psa_casadi.cli.failures import kept
     from psa_casadi.files import atomic_write
-    from psa_casadi.identification.certainty.profile import profile
+    from psa_casadi.identification.profile import profile
     from psa_casadi.model.model_file import save_model
     from psa_casadi.report.documents.files import identification_file
     from psa_casadi.report.page.results import write_fit_report

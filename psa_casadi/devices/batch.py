@@ -1,27 +1,200 @@
-"""Many devices, each identified or diagnosed by itself, on whatever takes work."""
+"""Many devices, each identified or diagnosed by itself, on whatever takes work.
 
+The folder of a batch's results: a folder for each device, and tables over all of them.
+
+    RESULTS/
+      DEVICE/device.json          how its work ended, for which files and options
+      DEVICE/identification.json  or diagnosis.json: what was found
+      DEVICE/model.json           the model
+      summary.csv                 one row for each device; summary.parquet where pyarrow is
+
+Every file is written whole or not at all, device.json last: without it a device is done again.
+"""
+
+import csv
+import io
 import os
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
-from psa_casadi.devices.jobs import Job, Jobs, jobs_given
-from psa_casadi.devices.processes import Processes
-from psa_casadi.devices.ready import make_ready
-from psa_casadi.devices.results import Results
-from psa_casadi.devices.submission import Executor, outcomes
-from psa_casadi.devices.summary import write_summary
-from psa_casadi.devices.task import DeviceTask, Options, key_of
+from psa_casadi.component import Component
+from psa_casadi.devices.device import make_ready
+from psa_casadi.devices.executors import Executor, Processes, outcomes
+from psa_casadi.devices.jobs import (
+    DeviceOutcome,
+    DeviceTask,
+    Job,
+    Jobs,
+    Options,
+    jobs_given,
+    key_of,
+)
 from psa_casadi.errors import InputError
-from psa_casadi.identification.search.refitting import Progress
+from psa_casadi.files import atomic_path, atomic_write, make_folder
+from psa_casadi.identification.refitting import Progress
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding
-from psa_casadi.report.documents.files import DeviceFile
+from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
+from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of
+from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding, finding_content
+from psa_casadi.strict_json import decode, json_text, read_json
+from psa_casadi.version import __version__
+
+
+class Results:
+    """The results in a folder, which is made where it is not there.
+
+    Raises:
+        InputError: the folder cannot be made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        make_folder(folder)
+
+    def kept(self, job: Job, key: str) -> DeviceFile | None:
+        """Return how a device ended if that holds for the same files and options, else None."""
+        told = self.told(job.device)
+        if told is None or told.key != key or told.status == "failed":
+            return None
+        whole = len(told.sha256) == len(told.files) and not damage(self.folder / job.device, told)
+        return told if whole else None
+
+    def told(self, device: str) -> DeviceFile | None:
+        """Return how a device ended, None where that is not known."""
+        path = self.folder / device / DEVICE_FILE
+        try:
+            content = read_json(path, "the device is done again.")
+            return decode(DeviceFile, content, str(path))
+        except InputError:  # never done, or damaged
+            return None
+
+    def write(self, job: Job, options: Options, key: str, outcome: DeviceOutcome) -> DeviceFile:
+        """Write the files of a device, and last how it ended.
+
+        Raises:
+            InputError: they cannot be written.
+        """
+        here = self.folder / job.device
+        make_folder(here)
+        (here / DEVICE_FILE).unlink(missing_ok=True)
+        for name, text in outcome.files:
+            atomic_write(here / name, text)
+        told = DeviceFile(
+            FORMAT,
+            job.device,
+            job.batch,
+            job.day.isoformat() if job.day else "",
+            options.work,
+            outcome.status,
+            outcome.problems,
+            round(outcome.seconds, 3),
+            key,
+            __version__,
+            tuple(DeviceRecord(name, sha) for name, sha in outcome.records),
+            tuple(name for name, _ in outcome.files),
+            tuple(hash_of(text.encode()) for _, text in outcome.files),
+        )
+        atomic_write(here / DEVICE_FILE, json_text(asdict(told)))
+        return told
+
+    def restated(self, job: Job, told: DeviceFile) -> DeviceFile:
+        """Return how a kept device ended with the batch and date that it has now, written too."""
+        day = job.day.isoformat() if job.day else ""
+        if (told.batch, told.date) == (job.batch, day):
+            return told
+        told = replace(told, batch=job.batch, date=day)
+        atomic_write(self.folder / job.device / DEVICE_FILE, json_text(asdict(told)))
+        return told
+
+    def findings(
+        self, devices: Sequence[DeviceFile], effects: Sequence[Component] = ()
+    ) -> Iterator[tuple[DeviceFile, Finding | None]]:
+        """Yield devices with what was found, None where nothing was.
+
+        A device whose files are damaged has failed, with what is wrong among its problems.
+        """
+        for told in devices:
+            try:
+                found = None
+                if told.status == "done":
+                    found = device_finding(self.folder / told.device, told, effects)
+                yield told, found
+            except ValueError as error:
+                yield replace(told, status="failed", problems=(str(error),)), None
+
+
+def read_results(
+    folder: Path, effects: Sequence[Component] = ()
+) -> tuple[tuple[Finding, ...], tuple[tuple[str, str, str], ...]]:
+    """Return the findings in a folder of results, and device, status and problems of the others.
+
+    Raises:
+        InputError: there are no devices in it.
+    """
+    results = Results(folder)
+    names = sorted(d.name for d in folder.iterdir() if (d / DEVICE_FILE).is_file())
+    if not names:
+        raise InputError(
+            f"{folder}: holds no results of devices; give the folder that `psa batch` wrote to, or"
+            " two files or more."
+        )
+    devices = {name: results.told(name) for name in names}
+    rows = list(results.findings([d for d in devices.values() if d is not None], effects))
+    lost = [(d.device, d.status, " ".join(d.problems)) for d, f in rows if f is None]
+    lost += [
+        (n, "failed", f"{folder / n / DEVICE_FILE}: is damaged; run `psa batch` again.")
+        for n, d in devices.items()
+        if d is None
+    ]
+    return tuple(f for _, f in rows if f is not None), tuple(sorted(lost))
+
+
+CSV, PARQUET = "summary.csv", "summary.parquet"
+#: Columns that hold no numbers.
+_TEXTS = ("device", "batch", "date", "work", "status", "verdict", "cause", "problems")
+
+
+def write_summary(
+    folder: Path, rows: Iterable[tuple[DeviceFile, Finding | None]]
+) -> tuple[Path, ...]:
+    """Write the tables of devices; return the files.
+
+    A parameter has the columns `NAME [UNIT]`, `NAME low` and `NAME high` (95 % interval, SI units),
+    empty where the records of a device do not determine it.
+    """
+    table = [_row(told, found) for told, found in rows]
+    columns = list(dict.fromkeys(name for row in table for name in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    atomic_write(folder / CSV, text.getvalue())
+    if find_spec("pyarrow") is None:
+        return (folder / CSV,)
+    arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+    kinds = {n: arrow.string() if n in _TEXTS else arrow.float64() for n in columns}
+    with atomic_path(folder / PARQUET) as temporary:
+        parquet.write_table(
+            arrow.Table.from_pylist(table, schema=arrow.schema(kinds.items())), temporary
+        )
+    return (folder / CSV, folder / PARQUET)
+
+
+def _row(told: DeviceFile, found: Finding | None) -> dict[str, Any]:
+    names = ("device", "batch", "date", "work", "status", "seconds")
+    row = {name: getattr(told, name) for name in names} | {"problems": " ".join(told.problems)}
+    return row if found is None else row | finding_content(found)
+
 
 #: Devices that are submitted for each that can run at once: none waits for the next.
 _AHEAD = 2
@@ -80,7 +253,12 @@ def batch(
     given = jobs_given(jobs)
     effects = [c for module in o.modules for c in own_effects(module).values()]
     results = Results(Path(output))
-    keys = _keys(given, o)
+    try:
+        keys = {job.device: key_of(job, o) for job in given}
+    except OSError as error:
+        raise InputError(
+            f"{error.filename}: cannot be read ({error.strerror}); correct its permissions."
+        ) from error
     ended: dict[str, DeviceFile] = {}
     for job in given:
         told = results.kept(job, keys[job.device])
@@ -111,15 +289,6 @@ def batch(
     found = tuple(f for _, f in rows if f is not None)
     devices = tuple(told for told, _ in rows)
     return BatchRun(results.folder, devices, found, kept, time.monotonic() - began, files)
-
-
-def _keys(jobs: Sequence[Job], options: Options) -> dict[str, str]:
-    try:
-        return {job.device: key_of(job, options) for job in jobs}
-    except OSError as error:
-        raise InputError(
-            f"{error.filename}: cannot be read ({error.strerror}); correct its permissions."
-        ) from error
 
 
 @contextmanager

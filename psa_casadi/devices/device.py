@@ -2,21 +2,20 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
-from psa_casadi.component import Component
-from psa_casadi.devices.task import DeviceOutcome, DeviceTask
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.errors import InputError, MachineError, PsaError
 from psa_casadi.identification.identify import identify
+from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.interruption import Work, interruptible_work
-from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.records import Record, read_records
 from psa_casadi.report.documents.files import Status, identification_file
-from psa_casadi.simulation.side_by_side import one_thread
+from psa_casadi.simulation.side_by_side import compiled, one_thread
 from psa_casadi.strict_json import json_text
 
 IDENTIFICATION, DIAGNOSIS, MODEL = "identification.json", "diagnosis.json", "model.json"
@@ -32,15 +31,17 @@ def work_on(task: DeviceTask) -> DeviceOutcome:
     Raises KeyboardInterrupt where the run was stopped.
     """
     began = time.monotonic()
+    status: Status = "refused"
     with _part_of(task.run), one_thread():
         try:
             return _worked(task, began)
         except InputError as error:
-            return _ended(task, "refused", error.problems, began)
+            status, problems = "refused", error.problems
         except PsaError as error:
-            return _ended(task, "refused", (str(error),), began)
+            status, problems = "refused", (str(error),)
         except Exception as error:  # noqa: BLE001 - no device may stop the others
-            return _ended(task, "failed", (f"{type(error).__name__}: {error}",), began)
+            status, problems = "failed", (f"{type(error).__name__}: {error}",)
+    return DeviceOutcome(task.job.device, status, time.monotonic() - began, problems=problems)
 
 
 def stop(run: str) -> None:
@@ -49,12 +50,6 @@ def stop(run: str) -> None:
         _STOPPED.add(run)
         for work in _RUNNING.get(run, ()):
             work.stop()
-
-
-def _ended(
-    task: DeviceTask, status: Status, problems: tuple[str, ...], began: float
-) -> DeviceOutcome:
-    return DeviceOutcome(task.job.device, status, time.monotonic() - began, problems=problems)
 
 
 @contextmanager
@@ -72,7 +67,6 @@ def _part_of(run: str) -> Iterator[None]:
 
 
 def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
-
     o = task.options
     effects = [c for module in o.modules for c in own_effects(module).values()]
     start = None if o.model is None else loads(o.model, effects=effects)
@@ -80,10 +74,17 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
         task.job.files, need_excitation=True, columns=o.columns, sample_time=o.sample_time
     )
     _refuse_twins(records)
-    does: Callable[..., tuple[str, str, Model]] = _identified
     if o.work == "diagnose":
-        does = _diagnosed
-    name, text, model = does(task, records, start, effects)
+        d = diagnose(
+            records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis,
+            effects=tuple(known_effects(effects).values()),
+        )  # fmt: skip
+        name, text, model = DIAGNOSIS, d.to_json(), d.model
+    else:
+        found = identify(records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis)
+        if found.interrupted:
+            raise KeyboardInterrupt
+        name, text, model = IDENTIFICATION, json_text(identification_file(found)), found.model
     return DeviceOutcome(
         task.job.device,
         "done",
@@ -104,30 +105,17 @@ def _refuse_twins(records: tuple[Record, ...]) -> None:
         seen[r.sha256] = r.source
 
 
-def _identified(
-    task: DeviceTask,
-    records: tuple[Record, ...],
-    start: Model | None,
-    effects: list[Component],
-) -> tuple[str, str, Model]:
+def make_ready(job: Job, options: Options) -> None:
+    """Compile what the first device will need; what fails is told by the device's own work.
 
-    o = task.options
-    found = identify(records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis)
-    if found.interrupted:
-        raise KeyboardInterrupt
-    return IDENTIFICATION, json_text(identification_file(found)), found.model
-
-
-def _diagnosed(
-    task: DeviceTask,
-    records: tuple[Record, ...],
-    start: Model | None,
-    effects: list[Component],
-) -> tuple[str, str, Model]:
-
-    o = task.options
-    table = tuple(known_effects(effects).values())
-    found = diagnose(
-        records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis, effects=table
-    )
-    return DIAGNOSIS, found.to_json(), found.model
+    They lie in the cache of the user, where every process on this machine finds them.
+    """
+    with suppress(PsaError, MachineError):
+        records = read_records(job.files, columns=options.columns, sample_time=options.sample_time)
+        start = starting_model(records, options.stiffness)
+        models = [start]
+        if options.work == "diagnose":
+            own = [c for module in options.modules for c in own_effects(module).values()]
+            table = known_effects(own).values()
+            models += [start.with_effect(e) for e in table if not e.needs_column]
+        compiled(models)

@@ -1,16 +1,34 @@
-"""The jobs of a batch: a device with its records, from a folder, a table or Python."""
+"""The jobs of a batch: a device with its records, from a folder, a table or Python.
 
+The table of jobs, jobs.csv: device, and where they are known batch, date and files.
+
+    device,batch,date,files
+    A1,2026-03,2026-03-14,A1/slow.csv;A1/fast.csv
+
+Files lie beside the table or in folders below it, with semicolons between. Without the column, the
+records of a device are its folder or the file of its name. Rows of one device are joined.
+"""
+
+import csv
+import hashlib
+import io
+import json
 import os
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from datetime import date
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import date, datetime
 from pathlib import Path
 
-from psa_casadi.devices.job_table import job_rows
+from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.records.read.formats import READERS
+from psa_casadi.report.documents.files import Status, Work
+from psa_casadi.version import __version__
 
+COLUMNS = ("device", "batch", "date", "files")
+_MOST_BYTES = 2**24
 #: The table of jobs that is looked for in a folder of records.
 TABLE = "jobs.csv"
 #: Endings of files that are records; text of other endings is named in a table.
@@ -71,59 +89,100 @@ def _of_path(path: Path) -> tuple[Job, ...]:
         raise InputError(f"{path}: there is no such folder or table of jobs; correct its name.")
     if (path / TABLE).is_file():
         return _of_table(path / TABLE)
-    jobs = []
-    for entry in sorted(path.iterdir()):
-        files = _records_in(entry) if entry.is_dir() else [entry] if _is_record(entry) else []
-        if files:
-            device = entry.name if entry.is_dir() else entry.stem
-            jobs.append(Job(device, tuple(str(f) for f in files)))
+    jobs = tuple(
+        Job(entry.name if entry.is_dir() else entry.stem, files)
+        for entry in sorted(path.iterdir())
+        if (files := _records_of(entry))
+    )
     if not jobs:
         raise InputError(
             f"{path}: holds no records; give a folder with a folder or file for each device,"
             f" or with {TABLE}."
         )
-    return tuple(jobs)
+    return jobs
 
 
 def _of_table(path: Path) -> tuple[Job, ...]:
     """Return the jobs of a table; rows of one device are joined."""
     jobs: dict[str, Job] = {}
     problems = Problems()
-    for row in job_rows(path, problems):
-        files = tuple(str(path.parent / name) for name in row.files) or _usual(path, row.device)
-        known = jobs.get(row.device)
-        if known is None:
-            jobs[row.device] = Job(row.device, files, row.batch, row.day)
-        elif (known.batch, known.day) != (row.batch, row.day):
+    for where, row in _rows(path, problems):
+        device, names = row["device"], [n.strip() for n in row.get("files", "").split(";")]
+        files = tuple(str(path.parent / n) for n in names if n) or _usual(path, device)
+        job = Job(device, files, row.get("batch", ""), _day(row.get("date"), where, problems))
+        known = jobs.setdefault(device, job)
+        if (known.batch, known.day) != (job.batch, job.day):
             problems.add(
-                f"{path} line {row.line}: device '{row.device}' has another batch or date than"
-                " before; give a device one of each."
+                f"{where}: device '{device}' has another batch or date than before; give a device"
+                " one of each."
             )
-        else:
-            jobs[row.device] = Job(row.device, (*known.files, *files), row.batch, row.day)
+        elif known is not job:
+            jobs[device] = replace(known, files=(*known.files, *files))
     problems.raise_if_any()
     return tuple(jobs.values())
 
 
+def _rows(path: Path, problems: Problems) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the rows of a table by their columns, each with its place.
+
+    Raises:
+        InputError: the table cannot be read or has no column `device`, or another one.
+    """
+    reader = csv.reader(io.StringIO(_text(path)), skipinitialspace=True)
+    head = [name.strip().lower() for name in next(reader, [])]
+    if "device" not in head or set(head) - set(COLUMNS) or len(set(head)) < len(head):
+        raise InputError(
+            f"{path}: the first line is '{','.join(head)[:80]}'; a table of jobs has the columns"
+            f" {', '.join(COLUMNS)}, of which only the first must be there, each once."
+        )
+    for cells in reader:
+        where = f"{path} line {reader.line_num}"
+        if len(cells) == len(head):
+            yield where, {n: plain(c.strip()) for n, c in zip(head, cells, strict=True)}
+        elif any(cell.strip() for cell in cells):
+            problems.add(
+                f"{where}: {len(cells)} cells for {len(head)} columns; quote cells with commas,"
+                " and put semicolons between files."
+            )
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path}: is larger than any table of jobs; give another file.")
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path}: cannot be read as a table of jobs ({error}); save it as CSV in UTF-8."
+        ) from error
+
+
+def _day(text: str | None, where: str, problems: Problems) -> date | None:
+    try:
+        return datetime.fromisoformat(text).date() if text else None
+    except ValueError:
+        problems.add(f"{where}: the date is '{text}'; write it as 2026-03-14.")
+        return None
+
+
 def _usual(table: Path, device: str) -> tuple[str, ...]:
     """Return the records that have a device's name beside its table: a folder, or a file."""
-    folder = table.parent / device
-    if folder.is_dir():
-        return tuple(str(f) for f in _records_in(folder))
-    if not folder.parent.is_dir() or _BARRED.search(device):
+    if _BARRED.search(device):
         return ()
+    beside = sorted(f for f in table.parent.iterdir() if f.is_file() and f.stem == device)
+    return _records_of(table.parent / device) or tuple(n for f in beside for n in _records_of(f))
+
+
+def _records_of(place: Path) -> tuple[str, ...]:
+    """Return the records in a folder, or the file if it is one."""
     return tuple(
-        str(f) for f in sorted(table.parent.iterdir()) if f.stem == device and _is_record(f)
+        str(f)
+        for f in (sorted(place.iterdir()) if place.is_dir() else [place])
+        if f.is_file()
+        and not f.name.startswith(".")
+        and f.name != TABLE
+        and f.suffix.lower() in ENDINGS
     )
-
-
-def _records_in(folder: Path) -> Sequence[Path]:
-    return [f for f in sorted(folder.iterdir()) if _is_record(f)]
-
-
-def _is_record(path: Path) -> bool:
-    hidden = path.name.startswith(".") or path.name == TABLE
-    return path.is_file() and not hidden and path.suffix.lower() in ENDINGS
 
 
 def _check_names(jobs: Sequence[Job], problems: Problems) -> None:
@@ -142,3 +201,57 @@ def _check_names(jobs: Sequence[Job], problems: Problems) -> None:
                 " rename one of them."
             )
         seen.add(name.casefold())
+
+
+@dataclass(frozen=True)
+class Options:
+    """How every device is worked on; plain values, so that a process elsewhere can take them.
+
+    `model` is the text of the MODEL.json to start from, `stiffness` in N/m, `columns` and
+    `sample_time` [s] as for `read_record`, `modules` those that hold own effects.
+    """
+
+    work: Work = "identify"
+    model: str | None = None
+    stiffness: float | None = None
+    hysteresis: Hysteresis | None = None
+    columns: str | None = None
+    sample_time: float | None = None
+    modules: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class DeviceTask:
+    """One device with all that its work needs; `run` names the run that it belongs to."""
+
+    job: Job
+    options: Options
+    run: str
+
+
+@dataclass(frozen=True)
+class DeviceOutcome:
+    """How the work on a device ended: files by their names, or problems in sentences."""
+
+    device: str
+    status: Status
+    seconds: float
+    files: tuple[tuple[str, str], ...] = ()
+    problems: tuple[str, ...] = ()
+    records: tuple[tuple[str, str], ...] = ()
+
+
+def key_of(job: Job, options: Options) -> str:
+    """Return the SHA-256 of a device's files, the options, and the version of this package.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    files = [(Path(name).name, _hash(Path(name))) for name in job.files]
+    told = {"version": __version__, "options": asdict(options), "files": files}
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

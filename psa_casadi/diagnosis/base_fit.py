@@ -30,13 +30,11 @@ from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import trace_record
-from psa_casadi.identification.search.force_start import force_of, retuned
-from psa_casadi.identification.search.multistart import search
-from psa_casadi.identification.search.refinement import without_blur
-from psa_casadi.identification.search.refitting import Progress, quick_from, refit
-from psa_casadi.identification.start.linear import linear_start
+from psa_casadi.identification.force_start import force_of, retuned
+from psa_casadi.identification.refitting import Progress, quick_from, refit, without_blur
+from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import ordinary_values
-from psa_casadi.identification.start.starting_points import resolved
+from psa_casadi.identification.start.starting_points import linear_start, resolved
 from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record

@@ -12,8 +12,7 @@ from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
 from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
 from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.start.doubts import doubtful_voltage
-from psa_casadi.identification.start.other_quantities import doubtful_quantity
+from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment, Kind, counts

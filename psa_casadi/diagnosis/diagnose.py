@@ -21,27 +21,29 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import COLUMNS
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import unfinished
-from psa_casadi.identification.prepare import averaged
-from psa_casadi.identification.search.forms import search_forms
-from psa_casadi.identification.search.measured_load import (
+from psa_casadi.identification.prepare import averaged, columns_of, with_levels
+from psa_casadi.identification.refitting import Progress, relevelled
+from psa_casadi.identification.search import (
     LOAD,
+    fit_base,
     is_measured,
     loads_as_curves,
+    search_forms,
     without_column,
 )
-from psa_casadi.identification.search.multistart import fit_base
-from psa_casadi.identification.search.refitting import Progress, relevelled
-from psa_casadi.identification.start.columns import columns_of, with_levels
 from psa_casadi.identification.start.doubts import (
     correlation,
+    doubtful_quantity,
+    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
+    refuse_few,
+    refuse_other_time,
+    refuse_still,
+    refuse_stuck,
+    refuse_wrapped,
 )
-from psa_casadi.identification.start.form import Hysteresis, forms_of
-from psa_casadi.identification.start.ordinary import chosen_start
-from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
-from psa_casadi.identification.start.readings import refuse_few, refuse_still, refuse_stuck
-from psa_casadi.identification.start.time_unit import doubtful_time, refuse_other_time
+from psa_casadi.identification.start.ordinary import Hysteresis, chosen_start, forms_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
@@ -358,13 +360,14 @@ def _in_form(
     hysteresis: Hysteresis | None,
     experiments: Sequence[Experiment],
     progress: Progress,
-) -> tuple[Model, tuple[str, ...]]:
+) -> tuple[Model, tuple[Note, ...]]:
     """Return where the base fit starts, in the form that is asked for; and why it is the best."""
     forms = forms_of(start, hysteresis)
     if len(forms) == 1:
         return forms[0], ()
     found, why = search_forms(forms, experiments, progress=progress)
-    return next(m for m in forms if m.components == found.best.model.components), (why,)
+    best = next(m for m in forms if m.components == found.best.model.components)
+    return best, () if why is None else (why,)
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
@@ -429,7 +432,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
-    turned = [f.turned for f in steps[0].fit.further if f.turned]
+    turned = [n for f in steps[0].fit.further for n in f.turned]
     remarks = (*seen.notes, *between, *([note("stuck", count=stuck)] if stuck else []), *turned)
     return replace(found, remarks=(*found.remarks, *remarks))
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.held_out import Budget, Share, errors_of, held_out_parts, jackknife
-from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance

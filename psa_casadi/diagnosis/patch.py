@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.search.refitting import POLISH
+from psa_casadi.identification.refitting import POLISH
 from psa_casadi.notes import note
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError

@@ -27,8 +27,7 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
 from psa_casadi.diagnosis.task import thresholds
-from psa_casadi.identification.fitting.fitted import Fitted
-from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR, Fitted
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 
 _PACKAGE = "psa_casadi.examples"
-_NOT_EXAMPLES = ("index",)
+_NOT_EXAMPLES = ("index", "linearisation_trial")
 _BLOCK = re.compile(r"^```(\w+) +(\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

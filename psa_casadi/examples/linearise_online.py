@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import psa_casadi as psa
-from psa_casadi.design.online.linearisation_trial import Drive, ageing, driven, off_values
-from psa_casadi.design.online.recursive_least_squares import identifier_for
+from psa_casadi.examples.linearisation_trial import Drive, ageing, driven, off_values
+from psa_casadi.online import identifier_for
 
 FloatArray = NDArray[np.float64]
 

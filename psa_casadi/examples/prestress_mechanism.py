@@ -18,15 +18,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import psa_casadi as psa
+from psa_casadi.design.mechanism.loop import Mounting, step_response
 from psa_casadi.design.mechanism.mechanism import (
     Limits,
     MechanismDesign,
-    Mounting,
     design_mechanism,
     mechanism_model,
     port_model,
     root_locus,
-    step_response,
 )
 
 FloatArray = NDArray[np.float64]

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from psa_casadi.design.experiment.designs import Separated
-from psa_casadi.design.experiment.experiment import resolving_experiment, usual_records
+from psa_casadi.design.experiment.experiment import Separated, resolving_experiment, usual_records
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose

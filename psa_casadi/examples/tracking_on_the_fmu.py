@@ -13,8 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import psa_casadi as psa
-from psa_casadi.design.tracking.dynamics import Dynamics
-from psa_casadi.design.tracking.targets import Target, checked_target
+from psa_casadi.design.tracking.targets import Dynamics, Target, checked_target
 from psa_casadi.design.tracking.tracking import TrackedInput, track
 
 #: A smooth move there and back of 8 um in 2 ms, in 80 samples.

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from psa_casadi.identification.certainty.determinacy import Determinacy
+from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import OUTPUT, measured, record_start
 from psa_casadi.model.compose import Model
@@ -20,9 +19,8 @@ from psa_casadi.records.noise import fast_noise, runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval
-
-FloatArray = npt.NDArray[np.float64]
 
 #: The most samples of a reference run, and what straight lines between them may miss the voltage
 #: by, over its range.

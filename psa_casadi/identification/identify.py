@@ -6,32 +6,36 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.identification.advice.advice import Advice, advice
-from psa_casadi.identification.certainty.combinations import Combination, free_combinations
-from psa_casadi.identification.certainty.determinacy import Determinacy, assumed_ratio, determinacy
+from psa_casadi.identification.advice import Advice, advice
+from psa_casadi.identification.combinations import Combination, free_combinations
+from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.prepare import prepared
-from psa_casadi.identification.search.forms import search_forms
-from psa_casadi.identification.search.measured_load import loads_as_curves
-from psa_casadi.identification.search.multistart import Search, StartOutcome
-from psa_casadi.identification.search.refitting import Progress, record_rms, refit, relevelled
-from psa_casadi.identification.start.columns import columns_of, with_levels
+from psa_casadi.identification.prepare import columns_of, prepared, with_levels
+from psa_casadi.identification.refitting import Progress, record_rms, refit, relevelled
+from psa_casadi.identification.search import Search, StartOutcome, loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
+    doubtful_quantity,
     doubtful_sign,
+    doubtful_time,
     doubtful_unit,
     doubtful_voltage,
+    refuse_few,
+    refuse_other_time,
+    refuse_still,
+    refuse_wrapped,
 )
-from psa_casadi.identification.start.electrical import capacitance_of
-from psa_casadi.identification.start.form import Hysteresis, forms_of
-from psa_casadi.identification.start.linear import linear_start
-from psa_casadi.identification.start.ordinary import chosen_start
-from psa_casadi.identification.start.other_quantities import doubtful_quantity, refuse_wrapped
-from psa_casadi.identification.start.readings import refuse_few, refuse_still
-from psa_casadi.identification.start.time_unit import doubtful_time, refuse_other_time
+from psa_casadi.identification.start.ordinary import (
+    Hysteresis,
+    capacitance_of,
+    chosen_start,
+    forms_of,
+)
+from psa_casadi.identification.start.starting_points import linear_start
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -46,21 +50,17 @@ _MISSED = 1.5
 #: Rounds of fitting with every record's own residual as its noise level.
 _LEVEL_ROUNDS = 2
 
-INTERRUPTED = (
-    "The search was interrupted; this is the best fit so far, and its values are not final."
-)
-FORCE_NOTE = (
-    "Force scale assumed: voltage and displacement determine the displacement only. Forces, masses"
-    " and stiffnesses are right in proportion, not in size; give a stiffness to fix them."
-)
+FORCE_NOTE = note("force_assumed")
+INTERRUPTED = note("interrupted")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Reported):
-    """An identified model with the fit behind it, what the data determine, and warnings.
+    """An identified model with the fit behind it, what the data determine, and doubts.
 
-    `starts` tells what became of every start of the search; `sentences` what was done to the
-    records (samples masked, averaged), which is no warning. `combinations` holds what is known of
+    `starts` tells what became of every start of the search; `notes` what was done to the records
+    (samples masked, averaged), which is no doubt. `warnings` and `sentences` are both in words.
+    `combinations` holds what is known of
     parameters that trade off; `advice` the further records that would determine what is open.
     `read_off` names parameters that were found without a fit (the paper's method). `interrupted`
     says that a keyboard interrupt ended the search, or the advice after it.
@@ -70,13 +70,23 @@ class Identification(Reported):
     fit: Fit
     determinacy: Determinacy
     experiments: tuple[Experiment, ...]
-    warnings: tuple[str, ...]
+    doubts: tuple[Note | str, ...]
     starts: tuple[StartOutcome, ...] = ()
-    sentences: tuple[str, ...] = ()
+    notes: tuple[Note | str, ...] = ()
     combinations: tuple[Combination, ...] = ()
     advice: tuple[Advice, ...] = ()
     read_off: tuple[str, ...] = ()
     interrupted: bool = False
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be doubted, in words."""
+        return texts(self.doubts)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was done to the records and found in them, in words."""
+        return texts(self.notes)
 
     def to_frame(self) -> Any:
         """Return the parameters as a pandas DataFrame: value, 95 % interval, unit, meaning."""
@@ -124,7 +134,7 @@ def identify(
     fitted, long = excerpts(every)
     known = {r.sha256: r for r in parts}
     said = [*cut, *(s for _, own in ready for s in own), *long]
-    refuse_few(given_records, fitted, said)
+    refuse_few(given_records, fitted, texts(tuple(said)))
     start, given = chosen_start(every, model, stiffness)
     columns = columns_of(start, fitted)
     forms = forms_of(columns.model, hysteresis)
@@ -178,13 +188,13 @@ def identify(
         fit=best,
         determinacy=determined,
         experiments=experiments,
-        warnings=(*_doubts(fitted), *_warnings(best, determined, found, experiments)),
+        doubts=(*_of_records(fitted), *_of_fit(best, determined, found, experiments)),
         starts=found.starts,
-        sentences=(
+        notes=(
             *said,
             *((preferred,) if preferred else ()),
             *columns.left_out,
-            *(f.sentence for f in best.further),
+            *(" ".join(texts(f.notes)) for f in best.further),
         ),
         combinations=open_ones,
         advice=advised or (),
@@ -214,8 +224,8 @@ def with_provenance(
         force_scale="given" if stiffness_given else "assumed",
         interrupted=interrupted,
         notes=(
-            *((INTERRUPTED,) if interrupted else ()),
-            *(() if stiffness_given else (FORCE_NOTE,)),
+            *((str(INTERRUPTED),) if interrupted else ()),
+            *(() if stiffness_given else (str(FORCE_NOTE),)),
             *((current.sentence(c_p),) if current is not None else ()),
         ),
     )
@@ -229,7 +239,7 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
         package_version=__version__,
         free=best.unknowns.names,
         force_scale="given" if stiffness_given else "assumed",
-        notes=(INTERRUPTED, *(() if stiffness_given else (FORCE_NOTE,))),
+        notes=(str(INTERRUPTED), *(() if stiffness_given else (str(FORCE_NOTE),))),
         interrupted=True,
     )
     return replace(best.model, provenance=provenance, evidence=None)
@@ -253,67 +263,34 @@ def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Pro
     return best
 
 
-def _warnings(
+def _of_fit(
     best: Fit, found: Determinacy, searched: Search, experiments: Sequence[Experiment]
-) -> tuple[str, ...]:
-    sentences = []
+) -> list[Note]:
+    """Return what of a fit is to be doubted: its end, its minimum, bounds, what it misses."""
+    notes = []
     if best.interrupted:
-        sentences.append(INTERRUPTED)
+        notes.append(INTERRUPTED)
     elif not best.converged:
-        sentences.append("The fit was cut off before it converged; its values are not final.")
-    sentences += _disagreement(searched)
-    sentences += [
-        f"'{name}' sits on a bound of its range; its interval means nothing."
-        for name in found.on_bound
-    ]
+        notes.append(note("cut_off"))
+    followed = [s for s in searched.starts if s.agrees is not None]
+    if searched.not_unique:
+        notes.append(note("not_unique", names=searched.not_unique))
+    elif sum(bool(s.agrees) for s in followed) == 1:
+        notes.append(note("one_start", starts=len(searched.starts)))
+    notes += [note("on_bound", name=name) for name in found.on_bound]
     alone = [n for n in found.undetermined if n not in searched.not_unique]
     if alone:
-        names = ", ".join(f"'{n}'" for n in alone)
-        verb = "is" if len(alone) == 1 else "are"
-        sentences.append(f"{names} {verb} not determined by these records.")
-    return (*sentences, *_missed(best, experiments))
-
-
-def _doubts(records: Sequence[Record]) -> list[str]:
-    """Say what of the records is unlike a stack's: unit, voltage, time, sign."""
-    doubts = (
-        doubtful_unit,
-        doubtful_voltage,
-        doubtful_time,
-        doubtful_sign,
-        doubtful_quantity,
-    )
-    return [s for doubt in doubts if (s := doubt(records))]
-
-
-def _disagreement(searched: Search) -> list[str]:
-    """Say where starts that were followed to the end did not lead to one minimum."""
-    sentences = []
-    if searched.not_unique:
-        names = ", ".join(f"'{n}'" for n in searched.not_unique)
-        sentences.append(
-            f"Two starts led to equally good fits that differ in {names}: these records cannot tell"
-            " which is right."
-        )
-    followed = [s for s in searched.starts if s.agrees is not None]
-    if not searched.not_unique and sum(bool(s.agrees) for s in followed) == 1:
-        sentences.append(
-            f"Of {len(searched.starts)} starts only one led to this minimum; it is the best found,"
-            " and may not be the best there is."
-        )
-    return sentences
-
-
-def _missed(best: Fit, experiments: Sequence[Experiment]) -> list[str]:
-    """Name the records whose residual is far above their own fast noise."""
-    sentences = []
+        notes.append(note("undetermined", names=alone))
     for e, residual in zip(experiments, best.residuals_of(experiments), strict=True):
         if len(residual) < 8:
             continue
         rms, noise = float(np.sqrt(np.mean(residual**2))), high_frequency_noise(residual)
         if noise > 0 and rms > _MISSED * noise:
-            sentences.append(
-                f"Record '{e.record.name}' is missed by {rms / noise:.2g} times its noise: the"
-                " model lacks something there; `psa diagnose` looks for the cause."
-            )
-    return sentences
+            notes.append(note("missed", record=e.record.name, times=rms / noise))
+    return notes
+
+
+def _of_records(records: Sequence[Record]) -> list[str]:
+    """Say what of the records is unlike a stack's: unit, voltage, time, sign, quantity."""
+    doubts = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_sign, doubtful_quantity)
+    return [s for doubt in doubts if (s := doubt(records))]

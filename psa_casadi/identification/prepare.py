@@ -1,16 +1,22 @@
-"""What is done to a record before it is fitted: readings masked, put on one clock, averaged."""
+"""What is done to records before they are fitted: masks, one clock, averages, further columns."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.further import COLUMNS, with_column
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
+from psa_casadi.identification.start.ordinary import capacitance_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
+from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import MOST
+from psa_casadi.records.split import MOST, Experiment, Level
 from psa_casadi.records.suspects import cleaned, masked, suspects
 
 
@@ -19,21 +25,21 @@ def as_read(record: Record) -> Record:
     return on_one_clock(cleaned(record))[0]
 
 
-def prepared(record: Record) -> tuple[Record, tuple[str, ...]]:
-    """Return the record to fit, and sentences on what was done to it.
+def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
+    """Return the record to fit, and what was done to it.
 
     Outliers, drop-outs and a stuck sensor are masked; where the sampling is so fast that block
     averages lose nothing, they take the samples' place.
     """
     found = suspects(record)
     clean, clocks = on_one_clock(masked(record, found))
-    said = [*found.sentences(record.name), *clocks]
+    said: tuple[Note | str, ...] = (*found.sentences(record.name), *clocks)
     shorter, averages = _averaged(clean)
     return shorter, (*said, *averages)
 
 
-def averaged(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
-    """Return records with block averages where these lose nothing, and sentences that tell it.
+def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
+    """Return records with block averages where these lose nothing, and notes that tell it.
 
     As they are where all of their samples can be fitted.
     """
@@ -43,8 +49,8 @@ def averaged(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     return [r for r, _ in ready], [s for _, said in ready for s in said]
 
 
-def _averaged(record: Record) -> tuple[Record, tuple[str, ...]]:
-    """Return a record of block averages, where they lose nothing, and a sentence that tells it."""
+def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
+    """Return a record of block averages, where they lose nothing, and a note that tells it."""
     y = measured(record)
     noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([record])
     if noise <= 0 or slope == 0:
@@ -52,7 +58,79 @@ def _averaged(record: Record) -> tuple[Record, tuple[str, ...]]:
     shorter, factor = decimated(record, noise, slope)
     if factor == 1:
         return record, ()
-    return shorter, (
-        f"{record.name}: {record.n} samples are averaged in blocks of {factor}, which loses"
-        " nothing of voltage or displacement beyond a tenth of the noise.",
-    )
+    return shorter, (note("averaged", record=record.name, samples=record.n, block=factor),)
+
+
+#: Noise level of a column before a fit has told it, over the standard deviation of the column.
+_FIRST_LEVEL = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The model with what shows the further columns, their names, and what was left out and why."""
+
+    model: Model
+    fitted: tuple[str, ...]
+    left_out: tuple[Note, ...] = ()
+
+
+def columns_of(model: Model, records: Sequence[Record]) -> Columns:
+    """Return the further columns to fit. A column that says nothing of a stack is left out.
+
+    Raises InputError for a column that the model cannot give, or that has samples missing.
+    """
+    fitted, said, problems = [], [], []
+    for column, shown in COLUMNS.items():
+        given = [r for r in records if getattr(r, column) is not None]
+        if not given:
+            continue
+        wider = model
+        if shown.sensor is not None and shown.sensor.name not in (c.name for c in model.components):
+            wider = _with_sensor(model, column)
+        missing = [o for o in shown.outputs if o not in wider.output_names]
+        if missing:
+            problems.append(
+                f"The records have the column '{column}', but the model '{model.name}' does not"
+                f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
+            )
+        elif why := _says_nothing(column, given):
+            said.append(note(why, column=column))
+        else:
+            model = wider
+            fitted.append(column)
+    if problems:
+        raise InputError(problems)
+    return Columns(model, tuple(fitted), tuple(said))
+
+
+def with_levels(
+    experiments: Sequence[Experiment], columns: Sequence[str]
+) -> tuple[Experiment, ...]:
+    """Return the experiments with first noise levels of the columns that are fitted."""
+    levels = []
+    for column in columns:
+        own = [experiments[k] for k in with_column(experiments, column)]
+        values = [getattr(e.record, column)[e.used] for e in own]
+        if values:
+            noise = max(fast_noise(v) for v in values)
+            spread = max(float(np.std(v)) for v in values)
+            levels.append(Level(column, max(noise, _FIRST_LEVEL * spread)))
+    return tuple(replace(e, further=tuple(levels)) for e in experiments)
+
+
+def _with_sensor(model: Model, column: str) -> Model:
+    """Return the model with the sensor of a column; as it is where that finds nothing to show."""
+    sensor = COLUMNS[column].sensor
+    if sensor is None:
+        return model
+    try:
+        return model.with_components((*model.components, sensor))
+    except InputError:
+        return model
+
+
+def _says_nothing(column: str, records: Sequence[Record]) -> str:
+    """Return why a column is no use, as the code of a note, "" where it is."""
+    if all(float(np.ptp(getattr(r, column))) == 0.0 for r in records):
+        return "still_column"
+    return "stray_current" if column == "current" and capacitance_of(records) is None else ""

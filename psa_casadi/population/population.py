@@ -1,19 +1,117 @@
-"""A population of devices: what is common, what spreads, who stands out, batches and drift."""
+"""A population of devices: what is common, what spreads, who stands out, batches and drift.
 
+Parameters that differ between two or more findings by more than their noise.
+
+Cochran's Q: with weights w_i = 1/s_i^2 and the weighted mean m,
+
+    Q = sum_i w_i (theta_i - m)^2  ~  chi^2(k - 1)
+
+where all k devices have one value; for two it is the square of the z test. (W. G. Cochran,
+Biometrics 10 (1954) 101.) p values are adjusted over the parameters (Holm).
+"""
+
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import scipy
 
+from psa_casadi.components import COMPONENTS
+from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.population.finding import Finding
-from psa_casadi.population.groups import BatchTest, Drift, batch_test, drift
-from psa_casadi.population.mixed_regression import MixedFit, mixed_regression
-from psa_casadi.population.outliers import FEWEST, Outliers, outliers
-from psa_casadi.population.parameters import Estimates, estimates, names_of
-from psa_casadi.population.several_tests import LIMIT, Adjustment, adjusted
+from psa_casadi.population.finding import NORMAL_95, Finding, Found
+from psa_casadi.population.statistics import (
+    FEWEST,
+    LIMIT,
+    Adjustment,
+    BatchTest,
+    Drift,
+    MixedFit,
+    Outliers,
+    adjusted,
+    batch_test,
+    drift,
+    mixed_regression,
+    outliers,
+)
+from psa_casadi.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Estimates (n,) and standard errors (n,) of a parameter, `places` of the devices that have it.
+
+    On a logarithmic scale theta is ln(value/unit); else both are in the SI unit.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    log: bool
+    places: tuple[int, ...]
+    theta: FloatArray
+    errors: FloatArray
+
+    def value(self, theta: float) -> float:
+        """Return a theta as a value in the SI unit."""
+        return math.exp(theta) if self.log else theta
+
+
+def estimates(findings: Sequence[Finding], name: str) -> Estimates:
+    """Return what the devices tell of a parameter; devices that do not tell it are left out.
+
+    A 95 % interval [low, high] has the standard error ln(high/low)/3.92 on a logarithmic scale,
+    else (high - low)/3.92, as the intervals of a fit are made.
+    """
+    rows = [(k, f.parameters[name]) for k, f in enumerate(findings) if name in f.parameters]
+    told = [(k, p) for k, p in rows if _tells(p)]
+    log = name in _logarithmic() and all(_positive(p) for _, p in told)
+    theta = np.array([math.log(p.value) if log else p.value for _, p in told])
+    errors = np.array([_error(p, log) for _, p in told])
+    first = rows[0][1] if rows else Found(0.0, "", None)
+    return Estimates(name, first.unit, first.meaning, log, tuple(k for k, _ in told), theta, errors)
+
+
+def names_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """Return the names of the parameters that a device tells, in the order of the first files."""
+    found = (n for f in findings for n, p in f.parameters.items() if _tells(p))
+    return tuple(dict.fromkeys(found))
+
+
+def _tells(p: Found) -> bool:
+    return p.told and p.interval is not None and p.interval[1] > p.interval[0]
+
+
+def _positive(p: Found) -> bool:
+    return p.value > 0.0 and p.interval is not None and p.interval[0] > 0.0
+
+
+def _error(p: Found, log: bool) -> float:
+    low, high = p.interval or (math.nan, math.nan)
+    width = math.log(high / low) if log else high - low
+    return width / (2.0 * NORMAL_95)
+
+
+@cache
+def _logarithmic() -> frozenset[str]:
+    """Return the parameters that are fitted on a logarithmic scale."""
+    every = (*COMPONENTS.values(), *EFFECTS.values())
+    return frozenset(p.name for c in every for p in c.parameters if p.log)
+
+
+def display_unit(name: str, unit: str) -> str:
+    """Return the unit that a parameter is shown in."""
+    return _display_units().get(name, unit)
+
+
+@cache
+def _display_units() -> dict[str, str]:
+    every = (*COMPONENTS.values(), *EFFECTS.values())
+    return {p.name: p.display_unit for c in every for p in c.parameters if p.display_unit}
+
 
 #: Days in a year, the unit of time of drifts.
 YEAR = 365.25
@@ -176,3 +274,27 @@ def _causes(findings: Sequence[Finding]) -> tuple[Frequency, ...]:
     diagnosed = [f for f in findings if f.verdict]
     words = [" or ".join((c.effect, *c.or_else)) for f in diagnosed for c in f.causes]
     return frequencies(words, len(diagnosed)) if words else ()
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """A parameter that two findings or more tell; p values of "all have one value"."""
+
+    estimates: Estimates
+    p_value: float
+    p_adjusted: float
+
+    @property
+    def differs(self) -> bool:
+        """Whether the values differ beyond noise."""
+        return self.p_adjusted < LIMIT
+
+
+def differences(findings: Sequence[Finding]) -> tuple[Difference, ...]:
+    """Return the parameters that two findings or more tell, in the order of the files."""
+    shared = [e for n in names_of(findings) if len((e := estimates(findings, n)).places) > 1]
+    p_values = [mixed_regression(e.theta, e.errors).p_value for e in shared]
+    corrected = adjusted(p_values, "bonferroni")
+    return tuple(
+        Difference(e, p, float(c)) for e, p, c in zip(shared, p_values, corrected, strict=True)
+    )

@@ -1,17 +1,122 @@
-"""Chains of the No-U-Turn sampler on a density with its gradient."""
+"""Chains of the No-U-Turn sampler, what they predict, and the data tree of both."""
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import Context, copy_context
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.prediction import measured, predict
+from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.interruption import current_work
-from psa_casadi.posterior.packages import sampler_and_arviz
+from psa_casadi.model.compose import Model
+from psa_casadi.posterior.task import Task
+from psa_casadi.units import FloatArray
+from psa_casadi.version import __version__
 
-FloatArray = npt.NDArray[np.float64]
+
+def sampler_and_arviz() -> tuple[Any, Any]:
+    """Return the modules nutpie and arviz. Raises InputError where one is not installed."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # arviz tells of its next version
+            return import_module("nutpie"), import_module("arviz")
+    except ImportError as error:
+        raise InputError(
+            f"A posterior needs nutpie and ArviZ ({error.name} is not installed); run"
+            " `pip install 'psa-casadi[sample]'`. `psa identify` gives intervals without them."
+        ) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Predictive:
+    """Draws that were predicted: `theta` (draws, size), and per record displacement and noise.
+
+    `displacement` (draws, samples) [m] holds noise of the level `noise` (draws,) [m]. `failed` of
+    the draws could not be simulated and are left out.
+    """
+
+    theta: FloatArray
+    displacement: tuple[FloatArray, ...]
+    noise: tuple[FloatArray, ...]
+    failed: int
+
+
+def prior_draws(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return draws of the priors (count, size): normal about their centre, cut at the bounds.
+
+    Offsets have flat priors and stay 0.
+    """
+    known = np.isfinite(task.unknowns.prior)
+    width, found = task.unknowns.prior[known], np.zeros((count, task.unknowns.size))
+    low, high = (edge[known] / width for edge in task.unknowns.bounds())
+    found[:, known] = width * scipy.stats.truncnorm.rvs(
+        low, high, size=(count, int(known.sum())), random_state=rng
+    )
+    return found
+
+
+def predictive(
+    task: Task, draws: FloatArray, rng: np.random.Generator, *, fit_offset: bool
+) -> Predictive:
+    """Predict all records at draws of theta (n, size), with white noise at the records' level.
+
+    The level is drawn from its conditional posterior, sigma^2 = S / (c chi^2) with the sum of
+    squares S at the draw, c samples counting as one, and n / c degrees of freedom. With
+    `fit_offset`, for draws of the prior, whose offsets are flat, the sensor's offset is the one
+    that fits best, and the level is that of the fit.
+    """
+    kept, shown, noise = [], [], []
+    for theta in draws:
+        try:
+            parts = predict(
+                task.model, task.experiments, task.unknowns, theta,
+                way=task.way, everything=True, differentiated=False,
+            )  # fmt: skip
+        except PsaError:
+            continue
+        clean = [p.displacement for p in parts]
+        if fit_offset:
+            clean = [y + np.mean(r) for y, r in zip(clean, _left(task, clean), strict=True)]
+            levels = list(task.levels)
+        else:
+            levels = [
+                _level(r, c, rng) for r, c in zip(_left(task, clean), task.inflation, strict=True)
+            ]
+        kept.append(theta)
+        noise.append(levels)
+        shown.append(
+            [y + s * rng.standard_normal(len(y)) for y, s in zip(clean, levels, strict=True)]
+        )
+    count = len(task.experiments)
+    return Predictive(
+        theta=np.array(kept).reshape(len(kept), draws.shape[1]),
+        displacement=tuple(
+            np.array([own[k] for own in shown]).reshape(len(kept), e.record.n)
+            for k, e in enumerate(task.experiments)
+        ),
+        noise=tuple(np.array([own[k] for own in noise]) for k in range(count)),
+        failed=len(draws) - len(kept),
+    )
+
+
+def _left(task: Task, clean: Sequence[FloatArray]) -> list[FloatArray]:
+    """Return what is left of the used samples of every record [m]."""
+    pairs = zip(task.experiments, clean, strict=True)
+    return [(measured(e.record) - y)[e.used] for e, y in pairs]
+
+
+def _level(residual: FloatArray, inflation: float, rng: np.random.Generator) -> float:
+    power = float(residual @ residual) / inflation
+    return float(np.sqrt(power / rng.chisquare(len(residual) / inflation)))
+
+
 Progress = Callable[[str], None]
 
 #: Spread of the chains' starts, in standard deviations of the fit.
@@ -121,3 +226,98 @@ def _waited(running: Any, progress: Progress) -> Any:
         current_work().stop()
         running.cancel()
         raise
+
+
+_RECORD = "record"
+
+
+def columns_of_records(task: Task) -> tuple[str, ...]:
+    """Return the name of each record's displacement in the tree."""
+    if len(task.experiments) == 1:
+        return ("displacement",)
+    return tuple(f"displacement_{k + 1}" for k in range(len(task.experiments)))
+
+
+def data_tree(
+    task: Task, chains: Chains, theta: FloatArray, prior: Predictive, posterior: Predictive
+) -> Any:
+    """Return an `arviz.InferenceData` of all groups; `theta` is (chains, draws, size)."""
+    _, arviz = sampler_and_arviz()
+    own = {name: [_RECORD] for name in _per_record(task.unknowns)}
+    columns = columns_of_records(task)
+    times = {f"time_{c}": e.record.time for c, e in zip(columns, task.experiments, strict=True)}
+    dims = {**own, "noise": [_RECORD], **{c: [f"time_{c}"] for c in columns}}
+    seen = {c: measured(e.record) for c, e in zip(columns, task.experiments, strict=True)}
+    applied = {
+        f"voltage_{c}": e.record.voltage for c, e in zip(columns, task.experiments, strict=True)
+    }
+    tree = arviz.from_dict(
+        posterior=quantities(task, theta),
+        sample_stats=chains.statistics,
+        prior=quantities(task, prior.theta[None]),
+        posterior_predictive=_predicted(columns, posterior),
+        prior_predictive=_predicted(columns, prior),
+        observed_data=seen,
+        constant_data=applied,
+        coords={_RECORD: [e.record.name for e in task.experiments], **times},
+        dims={**dims, **{f"voltage_{c}": [f"time_{c}"] for c in columns}},
+    )
+    told = _units(task.model, task.unknowns)
+    for group in tree.groups():
+        _describe(tree[group], told)
+    tree.posterior.attrs["inference_library"] = "nutpie"
+    tree.posterior.attrs["created_by"] = f"psa_casadi {__version__}"
+    return tree
+
+
+def quantities(task: Task, theta: FloatArray) -> dict[str, FloatArray]:
+    """Return parameters, starts and offsets in SI units, each (chains, draws[, records])."""
+    u, shape = task.unknowns, theta.shape[:2]
+    flat = theta.reshape(-1, theta.shape[2])
+    rows = [u.values(t) for t in flat]
+    found = {n: np.array([r[n] for r in rows]).reshape(shape) for n in u.names}
+    starts = [[u.start(t, k) for k in range(u.records)] for t in flat]
+    for name in _states(u):
+        own = [[s.get(name, np.nan) for s in each] for each in starts]
+        found[f"start_{name}"] = np.array(own).reshape(*shape, u.records)
+    offsets = [[u.offset(t, k) for k in range(u.records)] for t in flat]
+    found["offset"] = np.array(offsets).reshape(*shape, u.records)
+    return found
+
+
+def _states(u: Unknowns) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(n for started in u.started for n in started))
+
+
+def _per_record(u: Unknowns) -> tuple[str, ...]:
+    return (*(f"start_{n}" for n in _states(u)), "offset")
+
+
+def _predicted(columns: Sequence[str], found: Predictive) -> dict[str, FloatArray]:
+    shown = {c: y[None] for c, y in zip(columns, found.displacement, strict=True)}
+    return {**shown, "noise": np.stack(found.noise, axis=-1)[None]}
+
+
+def _units(model: Model, u: Unknowns) -> dict[str, tuple[str, str]]:
+    """Return unit and meaning of every variable."""
+    told = {n: (model.parameter(n).unit, model.parameter(n).description) for n in u.names}
+    states = {s.name: s for s in model.structure.states}
+    for name in _states(u):
+        meaning = f"Start of a record: {states[name].description}, as a deviation from rest"
+        told[f"start_{name}"] = (states[name].unit, meaning)
+    told["offset"] = ("m", "Offset of the displacement sensor in a record")
+    told["noise"] = ("m", "Standard deviation of the noise of a record")
+    return told
+
+
+def _describe(group: Any, told: Mapping[str, tuple[str, str]]) -> None:
+    for name in group.variables:
+        unit, meaning = told.get(name, ("", ""))
+        if name.startswith("displacement"):
+            unit, meaning = "m", "Displacement"
+        elif name.startswith("voltage"):
+            unit, meaning = "V", "Voltage"
+        elif name.startswith("time"):
+            unit, meaning = "s", "Time"
+        if unit:
+            group[name].attrs |= {"units": unit, "long_name": meaning}

@@ -1,21 +1,172 @@
 """`psa.sample`: the whole posterior of a stack's parameters, given its records."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from psa_casadi.errors import InputError, Problems
+from psa_casadi.files import atomic_write, temporary_folder
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
-from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.packages import sampler_and_arviz
-from psa_casadi.posterior.predictive import predictive, prior_draws
-from psa_casadi.posterior.result import Posterior, figures_of, warnings_of
-from psa_casadi.posterior.task import task_of
-from psa_casadi.posterior.tree import data_tree
+from psa_casadi.notes import Note, note, texts
+from psa_casadi.posterior.chains import (
+    Chains,
+    chains_of,
+    data_tree,
+    predictive,
+    prior_draws,
+    sampler_and_arviz,
+)
+from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.records.read.reading import Records, records_given
+from psa_casadi.shown import Shown, frame
 from psa_casadi.simulation.side_by_side import one_thread, one_thread_of_algebra
 from psa_casadi.simulation.simulate import output_of
+
+#: Share of the highest density interval, and its ends.
+HDI = 0.94
+#: The chains disagree above this r-hat (Vehtari and others, Bayesian Analysis 16, 2021), and tell
+#: too little below so many effective draws per chain.
+MOST_RHAT, LEAST_ESS = 1.01, 100.0
+#: A posterior wider than this share of its prior tells of the prior.
+_PRIOR_SHARE = 0.5
+#: Samples count as correlated where so many are worth one.
+_COLOURED = 1.5
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A parameter's posterior, in its `unit`: mean, sd, 94 % HDI, effective draws, r-hat.
+
+    `mc_error` is the standard error of the mean by the chains' length; `prior_share` the posterior
+    standard deviation over the prior's, nan where the prior is not that of a parameter alone.
+    """
+
+    name: str
+    unit: str
+    mean: float
+    sd: float
+    low: float
+    high: float
+    mc_error: float
+    ess: float
+    r_hat: float
+    prior_share: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Shown):
+    """Draws of parameters, starts and offsets, given records, with all that stands behind them.
+
+    `model` has the values of the fit that the chains start at; `tree` is an
+    `arviz.InferenceData` with the groups posterior, sample_stats, prior, prior_predictive,
+    posterior_predictive, observed_data and constant_data, in SI units, which variables name.
+    """
+
+    model: Model
+    tree: Any
+    figures: tuple[Figures, ...]
+    divergences: int
+    chains: int
+    draws: int
+    seed: int
+    task: Task
+    doubts: tuple[Note, ...]
+    notes: tuple[Note | str, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be doubted, in words."""
+        return texts(self.doubts)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was done to the records and the prior's draws, in words."""
+        return texts(self.notes)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the data tree as netCDF 4, whole or not at all; `arviz.from_netcdf` reads it.
+
+        Raises InputError when `path` cannot be written to.
+        """
+        with temporary_folder() as folder:
+            whole = folder / "posterior.nc"
+            self.tree.to_netcdf(str(whole), engine="h5netcdf")
+            atomic_write(path, whole.read_bytes())
+
+    def to_frame(self) -> Any:
+        """Return the figures of every parameter as a pandas data frame."""
+        rows = self.figures
+        columns = {
+            name: [getattr(f, name) for f in rows]
+            for name in ("name", "unit", "mean", "sd", "low", "high", "mc_error", "ess", "r_hat")
+        }
+        return frame(columns)
+
+
+def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
+    """Return the figures of every parameter."""
+    _, arviz = sampler_and_arviz()
+    table = arviz.summary(
+        tree, var_names=list(task.unknowns.names), hdi_prob=HDI, round_to="none", kind="all"
+    )
+    edge = 50.0 * (1.0 - HDI)
+    found = []
+    for name in task.unknowns.names:
+        row = table.loc[name]
+        spread = float(tree.prior[name].std())
+        found.append(
+            Figures(
+                name=name,
+                unit=task.model.parameter(name).unit,
+                mean=float(row["mean"]),
+                sd=float(row["sd"]),
+                low=float(row[f"hdi_{edge:g}%"]),
+                high=float(row[f"hdi_{100.0 - edge:g}%"]),
+                mc_error=float(row["mcse_mean"]),
+                ess=float(min(row["ess_bulk"], row["ess_tail"])),
+                r_hat=float(row["r_hat"]),
+                prior_share=_share(task, name, tree.posterior[name].to_numpy(), spread),
+            )
+        )
+    return tuple(found)
+
+
+def _share(task: Task, name: str, values: Any, spread: float) -> float:
+    """Return posterior over prior standard deviation, in ln units where these are searched."""
+    u = task.unknowns
+    k = u.names.index(name)
+    if u.loop is not None and k in u.loop:
+        return float(np.std(values) / spread) if spread > 0.0 else float("nan")
+    moved = np.log(values) if u.log[k] else values / u.scale[k]
+    return float(np.std(moved) / u.prior[k])
+
+
+def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple[Note, ...]:
+    """Return what of the chains, the records and the priors is to be doubted."""
+    count, draws, _ = chains.u.shape
+    doubts = []
+    if chains.divergences:
+        doubts.append(note("diverged", count=chains.divergences, transitions=count * draws))
+    apart = [f.name for f in figures if not f.r_hat <= MOST_RHAT]
+    if apart:
+        doubts.append(note("chains_disagree", names=apart, limit=MOST_RHAT))
+    few = [f.name for f in figures if f.ess < LEAST_ESS * count]
+    if few:
+        doubts.append(note("few_draws", names=few, limit=LEAST_ESS))
+    if not task.converged:
+        doubts.append(note("start_cut_off"))
+    for e, worth in zip(task.experiments, task.inflation, strict=True):
+        if worth > _COLOURED:
+            doubts.append(note("coloured", record=e.record.name, worth=worth))
+    held = [f.name for f in figures if f.prior_share > _PRIOR_SHARE]
+    if held:
+        doubts.append(note("of_the_prior", names=held))
+    return tuple(doubts)
+
 
 Progress = Callable[[str], None]
 
@@ -86,10 +237,7 @@ def sample(
         after = predictive(task, flat[some], rng, fit_offset=False)
     tree = data_tree(task, found, theta, before, after)
     figures = figures_of(task, tree)
-    failed = (
-        (f"{before.failed} of {_PREDICTED} draws of the prior cannot be simulated; they are left"
-        " out of the prior's groups.",) if before.failed else ()
-    )  # fmt: skip
+    failed = [note("prior_fails", count=before.failed, draws=_PREDICTED)] if before.failed else []
     return Posterior(
         model=task.model.with_values(task.unknowns.values(task.theta)),
         tree=tree,
@@ -99,8 +247,8 @@ def sample(
         draws=draws,
         seed=seed,
         task=task,
-        warnings=warnings_of(task, found, figures),
-        sentences=(*task.sentences, *failed),
+        doubts=doubts_of(task, found, figures),
+        notes=(*task.sentences, *failed),
     )
 
 

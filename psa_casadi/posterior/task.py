@@ -8,26 +8,135 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.identification.fitting.fit import FIT_RTOL
+from psa_casadi.identification.fitting.fit import (
+    Objective,
+    accurate_minimum,
+    unknowns_around,
+    weights_of,
+)
 from psa_casadi.identification.fitting.further import further_of
-from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum
-from psa_casadi.identification.fitting.minimum import Effort, accurate_minimum, objective
-from psa_casadi.identification.fitting.prediction import measured, motions_of
-from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
-from psa_casadi.identification.prepare import prepared
-from psa_casadi.identification.search.multistart import free_parameters
-from psa_casadi.identification.search.refitting import noise_levels
-from psa_casadi.identification.start.columns import columns_of, with_levels
+from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum
+from psa_casadi.identification.fitting.unknowns import Unknowns
+from psa_casadi.identification.prepare import columns_of, prepared, with_levels
+from psa_casadi.identification.refitting import noise_levels
+from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
-from psa_casadi.posterior.density import Block, Density
-from psa_casadi.posterior.within import Within
+from psa_casadi.notes import Note
 from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level, whole, without_gaps
 from psa_casadi.simulation.simulate import Way
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
+
+@dataclass(frozen=True, eq=False)
+class Within:
+    """theta within `low` and `high` (size,) as a function of z on the whole line, one by one.
+
+    Between two bounds theta = low + (high - low) / (1 + exp(-z)), beyond one alone theta = low +
+    exp(z) or high - exp(z), elsewhere theta = z.
+    """
+
+    low: FloatArray
+    high: FloatArray
+
+    @property
+    def bounded(self) -> npt.NDArray[np.bool_]:
+        """Which coordinates have a bound (size,)."""
+        return np.isfinite(self.low) | np.isfinite(self.high)
+
+    def z(self, theta: FloatArray) -> FloatArray:
+        """Return z (size,) of a theta strictly within the bounds."""
+        below, above = np.isfinite(self.low), np.isfinite(self.high)
+        from_low, to_high = theta - self.low, self.high - theta
+        with np.errstate(all="ignore"):  # of the branches that are not taken
+            return np.where(
+                below & above,
+                np.log(from_low) - np.log(to_high),
+                np.where(below, np.log(from_low), np.where(above, np.log(to_high), theta)),
+            )
+
+    def theta(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return theta, d theta / d z and d ln |d theta / d z| / d z, each (size,)."""
+        below, above = np.isfinite(self.low), np.isfinite(self.high)
+        share = 0.5 * (1.0 + np.tanh(0.5 * z))
+        with np.errstate(over="ignore", invalid="ignore"):
+            size, grown = self.high - self.low, np.exp(z)
+            both, one = below & above, below ^ above
+            theta = np.where(both, self.low + size * share, z)
+            theta = np.where(one & below, self.low + grown, theta)
+            theta = np.where(one & above, self.high - grown, theta)
+            slope = np.where(both, size * share * (1.0 - share), 1.0)
+            slope = np.where(one, np.where(below, grown, -grown), slope)
+        bend = np.where(both, 1.0 - 2.0 * share, np.where(one, 1.0, 0.0))
+        return theta, slope, bend
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """The weighted residuals `rows` of one record, whose noise level is unknown.
+
+    `count` is how many independent samples they are worth: fewer than rows where they are coloured.
+    """
+
+    rows: slice
+    count: float
+
+
+@dataclass(frozen=True, eq=False)
+class Density:
+    """ln p(u | records), up to a constant, with its gradient, in whitened coordinates u.
+
+    ln p = -sum_b (m_b / 2) ln |r_b|^2 - |r_p|^2 / 2 + ln |d theta / d z|, with the weighted
+    residuals r_b of every block and m_b the samples that they are worth: each record's noise level
+    has Jeffreys' prior 1 / sigma and is integrated out. r_p are the rows outside the blocks: weak
+    priors and further columns, whose levels are known. theta lies within its bounds (`Within`), and
+    z = z_0 + L u, with the factor L of the covariance at the fit, so that u has nearly the
+    covariance 1. The gradient is that of J^T r, with the sensitivities' exact Jacobian.
+    """
+
+    evaluate: Evaluate
+    blocks: tuple[Block, ...]
+    within: Within
+    centre: FloatArray
+    factor: FloatArray
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.centre)
+
+    def theta(self, u: FloatArray) -> FloatArray:
+        """Return the fit's coordinates (size,) at u."""
+        return self.within.theta(self.centre + self.factor @ u)[0]
+
+    def __call__(self, u: FloatArray) -> tuple[float, FloatArray]:
+        """Return ln p and its gradient (size,) at u; -inf where the model cannot be simulated."""
+        z = self.centre + self.factor @ u
+        theta, slope, bend = self.within.theta(z)
+        with np.errstate(all="ignore"):
+            found = self.evaluate(theta) if np.isfinite(theta).all() else None
+            value, by_theta = (-np.inf, np.zeros_like(u)) if found is None else self._sum(*found)
+            value += float(np.sum(np.log(np.abs(slope))))
+            gradient = self.factor.T @ (by_theta * slope + bend)
+        if not (np.isfinite(value) and np.isfinite(gradient).all()):
+            return -np.inf, np.zeros_like(u)
+        return value, gradient
+
+    def _sum(self, residual: FloatArray, jacobian: FloatArray) -> tuple[float, FloatArray]:
+        rest = np.ones(len(residual), dtype=bool)
+        value, pull = 0.0, np.zeros_like(residual)
+        for block in self.blocks:
+            own = residual[block.rows]
+            power = float(own @ own)
+            value -= 0.5 * block.count * float(np.log(power))
+            pull[block.rows] = own * (block.count / power)
+            rest[block.rows] = False
+        pull[rest] = residual[rest]
+        value -= 0.5 * float(residual[rest] @ residual[rest])
+        return value, -(jacobian.T @ pull)
+
 
 _EVALUATIONS, _TOLERANCE, _ROUNDS = 60, 1e-6, 2
 #: A start nearer to a bound than this share of a standard deviation is moved inwards.
@@ -55,7 +164,7 @@ class Task:
     inflation: tuple[float, ...]
     way: Way
     converged: bool
-    sentences: tuple[str, ...]
+    sentences: tuple[Note | str, ...]
 
 
 def task_of(
@@ -83,7 +192,11 @@ def task_of(
     centre = columns.model.with_values(_centres(columns.model, fitted, names, prior or {}))
     values = {n: columns.model.values[n] for n in names}
     sigma = noise_levels(experiments)
-    unknowns = _unknowns(centre, experiments, names, sigma, widths or {})
+    unknowns = unknowns_around(centre, names, experiments, sigma, placed=centre)
+    for name, width in (widths or {}).items():
+        if not width > 0.0:
+            raise InputError(f"The prior of '{name}' has the width {width:g}; give one above 0.")
+        unknowns.prior[names.index(name)] = width
     theta = np.zeros(unknowns.size)
     theta[: len(names)] = unknowns.coordinates(values)
     for r in range(unknowns.records):
@@ -132,26 +245,6 @@ def _centres(
     return {**centre, **given}
 
 
-def _unknowns(
-    centre: Model,
-    experiments: Sequence[Experiment],
-    names: Sequence[str],
-    sigma: Sequence[float],
-    widths: Mapping[str, float],
-) -> Unknowns:
-    """Return the coordinates around the priors' centre, with the widths that were given."""
-    motions = [motions_of(centre, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
-    first = [float(e.record.voltage[0]) for e in experiments]
-    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in experiments)
-    found = unknowns_of(centre, names, motions, first, 30.0 * max(scale, 1e-12))
-    prior = found.prior.copy()
-    for name, width in widths.items():
-        if not width > 0.0:
-            raise InputError(f"The prior of '{name}' has the width {width:g}; give one above 0.")
-        prior[names.index(name)] = width
-    return replace(found, prior=prior)
-
-
 def _fitted(
     model: Model,
     experiments: Sequence[Experiment],
@@ -160,16 +253,13 @@ def _fitted(
     sigma: Sequence[float],
 ) -> tuple[Minimum, Way, list[float], tuple[Experiment, ...]]:
     """Return the fit, and the levels that its residuals suggest: of records and of columns."""
-    counts = [int(e.used.sum()) for e in experiments]
-    weights = np.repeat(np.array(sigma), counts)
-    linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
-    effort = Effort(_TOLERANCE, _EVALUATIONS, np.inf, linear, FIRST_RADIUS)
     found, way, _ = accurate_minimum(
-        model, experiments, unknowns, weights, theta, sigma, FIT_RTOL, effort
+        model, experiments, unknowns, theta, sigma, tolerance=_TOLERANCE, evaluations=_EVALUATIONS
     )
     if found.interrupted:
         raise KeyboardInterrupt
-    own = np.split(found.residual[: len(weights)] * weights, np.cumsum(counts)[:-1])
+    weights, ends = weights_of(experiments, sigma), np.cumsum([e.used.sum() for e in experiments])
+    own = np.split(found.residual[: len(weights)] * weights, ends[:-1])
     rms = [max(float(np.sqrt(np.mean(r**2))), 1e-15) for r in own]
     beside = further_of(model, experiments, unknowns, found.theta, way=way)
     levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in beside)
@@ -183,10 +273,10 @@ def _task(
     found: Minimum,
     way: Way,
     sigma: Sequence[float],
-    sentences: tuple[str, ...],
+    sentences: tuple[Note | str, ...],
 ) -> Task:
     counts = [int(e.used.sum()) for e in experiments]
-    evaluate = objective(model, experiments, unknowns, np.repeat(np.array(sigma), counts), way)
+    evaluate = Objective(model, experiments, unknowns, sigma, way)
     low, high = unknowns.bounds()
     again = evaluate(found.theta)
     if again is None:

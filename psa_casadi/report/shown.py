@@ -15,7 +15,7 @@ from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Population
-from psa_casadi.posterior.result import Posterior
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.record import Record
 from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
 from psa_casadi.report.page.devices import write_comparison, write_population

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from psa_casadi.devices.batch import BatchRun, batch
-from psa_casadi.devices.dask_client import LOCAL, dask_client
+from psa_casadi.devices.executors import LOCAL, dask_client
 from psa_casadi.population.population import Population, population
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table

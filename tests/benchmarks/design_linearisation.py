@@ -6,21 +6,23 @@ from collections.abc import Callable
 import numpy as np
 
 from psa_casadi.design.mechanism.mechanism import Limits, design_mechanism
-from psa_casadi.design.online.linearisation_trial import (
+from psa_casadi.examples.linearisation_trial import (
     Drive,
     ageing,
     driven,
     off_values,
     wanted_voltage,
 )
-from psa_casadi.design.online.observer import FeedForward, HysteresisObserver, stack_values
-from psa_casadi.design.online.recursive_least_squares import (
-    AdaptiveFeedForward,
-    OnlineIdentification,
-    identifier_for,
-)
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.online import (
+    AdaptiveFeedForward,
+    FeedForward,
+    HysteresisObserver,
+    OnlineIdentification,
+    identifier_for,
+    stack_values,
+)
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.table import Progress, TitledTable

@@ -11,8 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.design.experiment.designs import ASKED, PLAYS, Separated
+from psa_casadi.design.experiment.criteria import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.experiment import (
+    ASKED,
+    PLAYS,
+    Separated,
     informative_experiment,
     resolving_experiment,
     rival_of_effect,
@@ -20,7 +23,6 @@ from psa_casadi.design.experiment.experiment import (
     usual_records,
 )
 from psa_casadi.design.experiment.limits import Limits
-from psa_casadi.design.experiment.rivals import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.search import GRID
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
@@ -30,7 +32,7 @@ from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
-from psa_casadi.identification.search.multistart import CORE, fit_base
+from psa_casadi.identification.search import CORE, fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model

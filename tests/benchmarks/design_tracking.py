@@ -10,12 +10,17 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares, linprog
 
 from psa_casadi import reference
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
 from psa_casadi.design.tracking.inversion import correct, invert
 from psa_casadi.design.tracking.minimum_time import INTERVALS, QuickMove, quickest_move
-from psa_casadi.design.tracking.targets import Target, raster_scan
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Target,
+    TrackingError,
+    error_of,
+    raster_scan,
+    uncompensated,
+)
 from psa_casadi.design.tracking.tracking import track
-from psa_casadi.design.tracking.verification import TrackingError, error_of, uncompensated
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model

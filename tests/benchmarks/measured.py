@@ -15,8 +15,8 @@ from psa_casadi.diagnosis.held_out import errors_of
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.search.multistart import search
-from psa_casadi.identification.search.refitting import refit
+from psa_casadi.identification.refitting import refit
+from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.split import Experiment, split
 from psa_casadi.report.plots.figures import narrow_figure

@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import Searched
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.search.multistart import fit_base
+from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.split import divided

@@ -18,13 +18,13 @@ from psa_casadi.components import BASE
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.paper.hysteresis import hysteresis_part
-from psa_casadi.identification.paper.moments import (
+from psa_casadi.identification.paper.linear import (
     COEFFICIENTS,
-    coefficients_of_values,
+    find_loops,
+    find_steps,
     moment_coefficients,
 )
-from psa_casadi.identification.paper.shapes import find_loops, find_steps
-from psa_casadi.identification.search.refitting import noise_levels
+from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
@@ -33,6 +33,7 @@ from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from tests.benchmarks.records import loop_voltage, response, slowest, with_noise
 from tests.benchmarks.table import Outcome, Progress, TitledTable
+from tests.paper_cases import coefficients_of_values
 
 FloatArray = npt.NDArray[np.float64]
 

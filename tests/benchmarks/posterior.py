@@ -13,8 +13,7 @@ import numpy.typing as npt
 from scipy.stats import binom, chi2, kstest
 
 import psa_casadi as psa
-from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.predictive import prior_draws
+from psa_casadi.posterior.chains import chains_of, prior_draws
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread

@@ -10,8 +10,7 @@ from scipy.stats import multivariate_normal, norm
 import psa_casadi as psa
 from psa_casadi.effects import EFFECTS
 from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.density import Block, Density
-from psa_casadi.posterior.task import Task, task_of
+from psa_casadi.posterior.task import Block, Density, Task, task_of
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread
 from tests.benchmarks.table import Progress, TitledTable

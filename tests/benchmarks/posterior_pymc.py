@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 import psa_casadi as psa
-from psa_casadi.posterior.chains import chains_of
-from psa_casadi.posterior.packages import sampler_and_arviz
+from psa_casadi.posterior.chains import chains_of, sampler_and_arviz
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
@@ -136,7 +135,7 @@ def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
 
 
 def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
-    """Return `psa_casadi.posterior.density`'s ln p of theta, with PyMC's solution.
+    """Return `psa_casadi.posterior.task`'s ln p of theta, with PyMC's solution.
 
     x = C (k_L u + f_H) + x_0 at rest of the mechanics, with C = 1/k_P + 1/k_B; f_H by its equation.
     """

@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 from psa_casadi.components import BASE
-from psa_casadi.identification.fitting import minimum as fitting
+from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
@@ -113,7 +113,7 @@ def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
 
 def _ours(record: Record, sigma: float) -> tuple[_Trace, int]:
     trace = _Trace()
-    objective = fitting.objective
+    objective = fitting.Objective
 
     def traced(*arguments: object) -> Callable[[FloatArray], object]:
         # whatever the fit passes is passed on
@@ -128,11 +128,11 @@ def _ours(record: Record, sigma: float) -> tuple[_Trace, int]:
         return wrapped
 
     # the fit's own objective is replaced by one that also keeps a trace
-    fitting.objective = traced  # type: ignore[assignment]
+    fitting.Objective = traced  # type: ignore[assignment,misc]
     try:
         found = fit(_stack(), [whole(record)], FREE, sigma=[sigma], start=_wrong())
     finally:
-        fitting.objective = objective
+        fitting.Objective = objective  # type: ignore[misc]
     return trace, found.evaluations
 
 

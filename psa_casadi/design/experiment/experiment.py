@@ -2,32 +2,174 @@
 
 import time as clock
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from psa_casadi.component import Component
-from psa_casadi.design.experiment.candidates import KINDS, Kind, rest_of
-from psa_casadi.design.experiment.chances import chances_of, plays_of, tells
-from psa_casadi.design.experiment.designs import Informative, Pair, Separated
-from psa_casadi.design.experiment.information import Information, Optimality
-from psa_casadi.design.experiment.limits import Limits, limits_of
-from psa_casadi.design.experiment.rivals import (
+from psa_casadi.design.experiment.criteria import (
+    LEAST,
+    Information,
+    Optimality,
     Rival,
     SensorNoise,
+    Separation,
     noise_of_fit,
+    overall,
     rival_of_fit,
     rival_of_model,
 )
+from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
 from psa_casadi.design.experiment.search import BRIEF, GRID, Best, Effort, Progress, coarse, search
-from psa_casadi.design.experiment.separation import Separation, overall
 from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
-from psa_casadi.diagnosis.task import FAST
-from psa_casadi.errors import InputError
+from psa_casadi.diagnosis.task import FAST, thresholds
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import note
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
+
+#: How often a record may be played until it tells, and the probability that is asked for.
+PLAYS, ASKED = (1, 2, 3, 5), 0.9
+
+
+@dataclass(frozen=True)
+class Pair:
+    """How surely a record would tell: growth of ln of the Bayes factor if `truth` is the cause.
+
+    `designed` for the designed record, `usual` for a sine and a triangle of the same length and
+    amplitude.
+    """
+
+    truth: str
+    other: str
+    designed: float
+    usual: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Separated:
+    """A record that tells effects apart.
+
+    `record` is the voltage to play (no displacement), of the family `kind` ("sine" or "triangle"
+    where no designed one was better); `chance` is for each
+    effect the probability that a diagnosis of the data at hand with the record names it alone if it
+    is the cause, as the rivals' fits predict it; `usual_chance` the same with sine and triangle.
+    `plays` is how often the record must be played, each time from rest, until every chance is at
+    least 90 %; None where `PLAYS[-1]` times are not enough.
+    """
+
+    record: Record
+    kind: str
+    limits: Limits
+    pairs: tuple[Pair, ...]
+    chance: Mapping[str, float]
+    usual_chance: Mapping[str, Mapping[str, float]]
+    plays: int | None
+    evaluations: int
+    seconds: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects to tell apart."""
+        return tuple(self.chance)
+
+    def factor(self, usual: str) -> float:
+        """Return the least ln of the Bayes factor over that with a usual voltage."""
+        least = min(p.designed for p in self.pairs)
+        return least / max(min(p.usual[usual] for p in self.pairs), 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class Informative:
+    """A record that sharpens parameters.
+
+    `intervals` are the predicted 95 % intervals with it (and the data at hand), `before` those
+    without, each in the parameter's unit; `factor` says by how much the mean standard error of the
+    criterion is smaller than with a usual voltage of the same length and amplitude.
+    """
+
+    record: Record
+    kind: str
+    limits: Limits
+    optimality: Optimality
+    intervals: Mapping[str, tuple[float, float]]
+    before: Mapping[str, tuple[float, float]]
+    factor: Mapping[str, float]
+    evaluations: int
+    seconds: float
+
+
+#: Chance to be named from which on no better voltage is looked for, at distances this many times
+#: smaller: rivals are not the true equations.
+_CERTAIN, _MARGIN = 0.999, 10.0
+
+
+def naming_probability(
+    truth: Rival, others: Sequence[Rival], distances: Mapping[tuple[str, str], float], over: float
+) -> float:
+    """Return the probability that a diagnosis names `truth` if it is the cause.
+
+    Against each other rival ln B is normal with mean (what the data at hand say) + T/2 and
+    variance T; to be named alone it must exceed temperature * ln(c/(1 - c)), c = 0.95, where the
+    temperature grows with the evidence over the base, of which the new record adds `over`/2.
+    """
+    credible = thresholds().credible
+    needed = temperature(truth.evidence + 0.5 * over) * float(np.log(credible / (1.0 - credible)))
+    chances = []
+    for other in others:
+        t = distances[truth.name, other.name]
+        gained = truth.evidence - other.evidence + 0.5 * t - needed
+        chances.append(float(scipy.special.ndtr(gained / np.sqrt(max(t, LEAST)))))
+    return min(chances, default=1.0)
+
+
+def tells(criterion: Separation, base: Rival | None, record: Record) -> bool:
+    """Whether a record names every rival for sure, even with a fraction of its distances."""
+    try:
+        less = {pair: t / _MARGIN for pair, t in criterion.distances(record).items()}
+        return min(chances_of(criterion, less, base, record).values()) > _CERTAIN
+    except PsaError:  # a base that cannot follow: another voltage may be better
+        return False
+
+
+def plays_of(
+    criterion: Separation, base: Rival | None, record: Record, chance: Mapping[str, float]
+) -> int | None:
+    """Return how often a record must be played until it tells; None if `PLAYS[-1]` do not.
+
+    k records of the same voltage are one whose noise has 1/k of the variance.
+    """
+    for plays in PLAYS:
+        if plays > 1:
+            colour = replace(criterion.noise, level=criterion.noise.level / np.sqrt(plays))
+            often = replace(criterion, noise=colour)
+            chance = chances_of(often, often.distances(record), base, record)
+        if min(chance.values()) >= ASKED:
+            return plays
+    return None
+
+
+def chances_of(
+    criterion: Separation,
+    distances: Mapping[tuple[str, str], float],
+    base: Rival | None,
+    record: Record,
+) -> dict[str, float]:
+    """Return the probability of every rival that it is named if it is the cause.
+
+    `distances` are those of the record; `base` is the model without any of the rivals.
+    """
+    chances = {}
+    for truth in criterion.rivals:
+        others = [r for r in criterion.rivals if r is not truth]
+        over = 0.0 if base is None else criterion.distance(truth, base, record)
+        chances[truth.name] = naming_probability(truth, others, distances, over)
+    return chances
+
 
 #: Periods of the usual sine and triangle that a design is compared with.
 USUAL_PERIODS = 10

@@ -1,11 +1,18 @@
-"""What a designed voltage may be: range, length, rate, current and bandwidth."""
+"""What a designed voltage may be, and families of voltages to choose from.
 
-from collections.abc import Mapping, Sequence
+Families of voltages to choose from: free-form, triangles, steps, multisines.
+
+Each waveform is a function of a vector p within bounds; the optimiser changes p. All begin with a
+rest at the lowest voltage and are linear between samples.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from psa_casadi.errors import Problems
+from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.excitation import time_grid
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
@@ -101,20 +108,14 @@ def limits_of(records: Sequence[Record], **changes: float | None) -> Limits:
     `changes` replace fields that are not None.
     """
     longest = max(records, key=lambda r: r.duration)
-    own: dict[str, float] = {
+    own: dict[str, Any] = {
         "low": min(float(np.min(r.voltage)) for r in records),
         "high": max(float(np.max(r.voltage)) for r in records),
         "duration": longest.duration * longest.n / (longest.n - 1),
         "samples": longest.n,
     }
-    own.update({k: v for k, v in changes.items() if v is not None})
-    return _limits(own)
-
-
-def _limits(given: Mapping[str, float]) -> Limits:
-    fields = dict(given)
-    samples = int(fields.pop("samples"))
-    return Limits(fields.pop("low"), fields.pop("high"), fields.pop("duration"), samples, **fields)
+    own |= {name: value for name, value in changes.items() if value is not None}
+    return Limits(**own | {"samples": int(own["samples"])})
 
 
 def excess(record: Record, limits: Limits, capacitance: float | None) -> tuple[str, ...]:
@@ -132,3 +133,191 @@ def excess(record: Record, limits: Limits, capacitance: float | None) -> tuple[s
             f"a rate of {slope:g} V/s is above the largest, {limits.steepest(capacitance):g} V/s"
         )
     return tuple(found)
+
+
+Kind = Literal["free", "triangles", "steps", "multisine"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+#: Corners of free-form voltages, turns of triangles, levels of steps, lines of multisines, at most.
+CORNERS, TURNS, LEVELS, LINES = 24, 14, 12, 14
+#: Longest over shortest drawn part of a waveform, in natural logarithms.
+_SPREAD = 3.0
+_FASTEST_RAMP = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Waveform:
+    """One voltage of a family and how it may change.
+
+    `start` (k,) lies between `lower` and `upper`; `voltage(p, time)` [V] is the voltage at instants
+    [s]; `slack(p)` is not negative, up to rounding, where rates and times between turns are
+    allowed.
+    """
+
+    kind: Kind
+    start: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    voltage: Callable[[FloatArray, FloatArray], FloatArray]
+    slack: Callable[[FloatArray], FloatArray]
+
+
+def draw(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
+    """Draw a waveform of a family at random within the limits; `steepest` [V/s] bounds its rate.
+
+    Raises InputError for an unknown family, and where the rate allows no swing worth the name.
+    """
+    if kind not in KINDS:
+        raise InputError(f"There is no family '{kind}'; there are {', '.join(KINDS)}.")
+    if steepest * limits.duration < 0.05 * limits.span:
+        raise InputError(
+            f"At most {steepest:g} V/s for {limits.duration:g} s moves the voltage by less than 5 %"
+            f" of its range of {limits.span:g} V; lengthen the record, or allow more rate or"
+            " current."
+        )
+    if kind == "multisine":
+        return _multisine(limits, steepest, rng)
+    if kind == "free":
+        return _free(limits, steepest, rng)
+    return _timed(kind, limits, steepest, rng)
+
+
+def rest_of(limits: Limits) -> float:
+    """Return the length of the rest before a waveform [s]."""
+    return limits.duration * max(REST_SHARE, REST_SAMPLES / limits.samples)
+
+
+def _count(limits: Limits, most: int) -> int:
+    """Return how many parts fit between turns, at most `most` and at least two."""
+    room = (limits.duration - rest_of(limits)) / limits.shortest
+    return int(np.clip(room / 2.0, 2, most))
+
+
+def _durations(shares: FloatArray, limits: Limits) -> FloatArray:
+    """Return durations [s] that fill the record, each at least the shortest; ln shares (k,)."""
+    room = limits.duration - rest_of(limits)
+    least = min(limits.shortest, 0.9 * room / len(shares))
+    weights = np.exp(shares - np.max(shares))
+    filled: FloatArray = least + (room - least * len(shares)) * weights / np.sum(weights)
+    return filled
+
+
+def _reachable(levels: FloatArray, durations: FloatArray, per_second: float) -> FloatArray:
+    """Return levels whose changes the rate allows, from 0, each moved as little as needed."""
+    found, now = np.empty_like(levels), 0.0
+    for k, (level, duration) in enumerate(zip(levels, durations, strict=True)):
+        now += float(np.clip(level - now, -0.999 * per_second * duration,
+                             0.999 * per_second * duration))  # fmt: skip
+        found[k] = now
+    return found
+
+
+def _free(limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
+    """Levels at fixed corners; the corners' distances are drawn over a decade or more."""
+    count = _count(limits, CORNERS)
+    durations = _durations(rng.uniform(0.0, _SPREAD, count), limits)
+    corners = np.concatenate([[0.0, rest_of(limits)], rest_of(limits) + np.cumsum(durations)])
+    per_second = steepest / limits.span
+
+    def voltage(p: FloatArray, time: FloatArray) -> FloatArray:
+        levels = np.concatenate([[0.0, 0.0], p])
+        inside: FloatArray = limits.low + limits.span * np.interp(time, corners, levels)
+        return inside
+
+    def slack(p: FloatArray) -> FloatArray:
+        change = np.diff(p, prepend=0.0)
+        return np.concatenate([per_second * durations - change, per_second * durations + change])
+
+    start = _reachable(rng.uniform(0.0, 1.0, count), durations, per_second)
+    bounded = slack if np.isfinite(per_second) else _nothing
+    return Waveform("free", start, np.zeros(count), np.ones(count), voltage, bounded)
+
+
+def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
+    """Levels and their durations: triangles ramp from one to the next, steps jump and hold."""
+    count = _count(limits, TURNS if kind == "triangles" else LEVELS)
+    per_second = steepest / limits.span
+    sample = limits.duration / limits.samples
+    ramp = max(sample, 1.0 / per_second if np.isfinite(per_second) else 0.0)
+
+    def voltage(p: FloatArray, time: FloatArray) -> FloatArray:
+        levels, durations = p[:count], _durations(p[count:], limits)
+        ends = rest_of(limits) + np.cumsum(durations)
+        if kind == "triangles":
+            nodes = np.concatenate([[0.0, rest_of(limits)], ends])
+            heights = np.concatenate([[0.0, 0.0], levels])
+        else:
+            begins = ends - durations
+            tops = begins + np.minimum(ramp, durations)
+            nodes = np.concatenate([[0.0], np.column_stack([begins, tops]).ravel(), ends[-1:]])
+            before = np.concatenate([[0.0], levels[:-1]])
+            heights = np.column_stack([before, levels]).ravel()
+            heights = np.concatenate([[0.0], heights, levels[-1:]])
+        inside: FloatArray = limits.low + limits.span * np.interp(time, nodes, heights)
+        return inside
+
+    def slack(p: FloatArray) -> FloatArray:
+        durations = _durations(p[count:], limits)
+        change = np.diff(p[:count], prepend=0.0)
+        room = per_second * (durations if kind == "triangles" else np.minimum(durations, ramp))
+        return np.concatenate([room - change, room + change])
+
+    shares = rng.uniform(0.0, _SPREAD, count)
+    levels = rng.uniform(0.0, 1.0, count)
+    if kind == "triangles":
+        levels = np.where(np.arange(count) % 2 == 0, 0.5 + 0.5 * levels, 0.5 * levels)
+        if rng.integers(2):  # loops in the lower half of the range, then in the upper one
+            levels = 0.5 * levels + np.where(2 * np.arange(count) < count, 0.0, 0.5)
+    if np.isfinite(per_second):
+        durations = _durations(shares, limits)
+        usable = durations if kind == "triangles" else np.minimum(durations, ramp)
+        levels = _reachable(levels, usable, per_second)
+    lower = np.concatenate([np.zeros(count), np.full(count, -_SPREAD)])
+    upper = np.concatenate([np.ones(count), np.full(count, 2.0 * _SPREAD)])
+    bounded = slack if np.isfinite(per_second) else _nothing
+    return Waveform(kind, np.concatenate([levels, shares]), lower, upper, voltage, bounded)
+
+
+def _multisine(limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
+    """Cosines and sines at lines of 1/T, closer together at low frequencies.
+
+    The sum is scaled to the voltage range, shrunk towards the lowest voltage where its rate would
+    be too large, and grows from rest over the first tenth.
+    """
+    period = limits.duration - rest_of(limits)
+    highest = max(1, int(limits.band * period))
+    lines = np.unique(np.round(np.geomspace(1.0, highest, LINES)))
+    first, grow = rest_of(limits), 0.1 * period
+    fine = limits.grid()
+
+    def raw(p: FloatArray, time: FloatArray) -> FloatArray:
+        angle = 2.0 * np.pi * np.outer(np.maximum(time - first, 0.0) / period, lines)
+        waves: FloatArray = np.cos(angle) @ p[: len(lines)] + np.sin(angle) @ p[len(lines) :]
+        return waves
+
+    def voltage(p: FloatArray, time: FloatArray) -> FloatArray:
+        shape = _risen(raw(p, fine), raw(p, fine), fine, first, grow)
+        slope = float(np.max(np.abs(np.diff(shape)))) / (fine[1] - fine[0]) * limits.span
+        share = min(1.0, steepest / max(slope, _FASTEST_RAMP))
+        wave = _risen(raw(p, time), raw(p, fine), time, first, grow)
+        inside: FloatArray = limits.low + limits.span * share * np.clip(wave, 0.0, 1.0)
+        return inside
+
+    amplitude = lines**-0.6
+    phase = rng.uniform(0.0, 2.0 * np.pi, len(lines))
+    start = np.concatenate([amplitude * np.cos(phase), amplitude * np.sin(phase)])
+    edge = np.full(len(start), 2.0)
+    return Waveform("multisine", start, -edge, edge, voltage, _nothing)
+
+
+def _risen(
+    wave: FloatArray, whole: FloatArray, time: FloatArray, first: float, grow: float
+) -> FloatArray:
+    """Scale a wave to 0 to 1 by its extremes over the `whole` record and let it grow from 0."""
+    low, high = float(np.min(whole)), float(np.max(whole))
+    risen: FloatArray = (wave - low) / max(high - low, 1e-12)
+    return risen * np.clip((time - first) / grow, 0.0, 1.0)
+
+
+def _nothing(p: FloatArray) -> FloatArray:
+    return np.zeros(0)

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from psa_casadi.design.experiment.candidates import KINDS, Kind, Waveform, draw
-from psa_casadi.design.experiment.criterion import Criterion, Point
-from psa_casadi.design.experiment.limits import Limits
+from psa_casadi.design.experiment.criteria import Criterion, Point
+from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, Waveform, draw
 from psa_casadi.errors import PsaError
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra, side_by_side

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 #: Where a mechanism acts.

@@ -16,20 +16,57 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 import scipy
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.dynamics import demand_stack, rest_at
-from psa_casadi.design.tracking.saturation import held
-from psa_casadi.design.tracking.targets import Target
-from psa_casadi.design.tracking.verification import Response, TrackingError, error_of, respond
-from psa_casadi.design.tracking.zero_phase import zero_phase_inverse
-from psa_casadi.errors import InputError
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Response,
+    Target,
+    TrackingError,
+    demand_stack,
+    error_of,
+    held,
+    respond,
+    rest_at,
+)
+from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
+from psa_casadi.records import Record
 from psa_casadi.simulation.start import LinearPart, linear_part
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
+#: Response over that at rest, below which the inverse rolls off.
+ROLL_OFF = 0.03
+
+
+def zero_phase_inverse(part: LinearPart, wanted: FloatArray, step: float) -> FloatArray:
+    """Return the voltage (n,) for a displacement (n,) sampled every `step` [s].
+
+    V(w) = D(w) H*(w) / (|H(w)|^2 + (ROLL_OFF |H(0)|)^2), H the linear part's response times
+    sinc^2(w step / 2) of the line between samples: the exact inverse where the stack responds,
+    rolling off without phase where it does not. The path is taken as settled before its first
+    sample, and comes back to it behind the last one.
+    """
+    n = len(wanted)
+    pad = _padding(part, step, n)
+    back = 0.5 * (1.0 + np.cos(np.pi * np.arange(1, pad + 1) / (pad + 1)))
+    tail = wanted[0] + (wanted[-1] - wanted[0]) * back
+    path = np.concatenate([np.full(pad, wanted[0]), wanted, np.full(pad, wanted[-1]), tail])
+    omega: FloatArray = np.asarray(2.0 * np.pi * np.fft.rfftfreq(len(path), step), dtype=float)
+    response = part.response(omega) * np.sinc(omega * step / (2.0 * np.pi)) ** 2
+    floor = (ROLL_OFF * abs(part.response(np.zeros(1))[0])) ** 2
+    inverse = response.conj() / (np.abs(response) ** 2 + floor)
+    inverse[0] = 1.0 / response[0].real
+    voltage = np.fft.irfft(np.fft.rfft(path) * inverse, len(path))
+    return np.asarray(voltage[pad : pad + n])
+
+
+def _padding(part: LinearPart, step: float, n: int) -> int:
+    """Return the samples in which all but slow creep settles, at most as many as the path has."""
+    decay = -np.linalg.eigvals(part.a).real
+    slowest = 1.0 / np.min(decay) if np.all(decay > 0) else 0.0
+    return int(np.clip(10.0 * slowest / step, 50, max(n, 50)))
+
 
 _PARTS = 4  # sub-intervals of a sample for the hysteresis inverse
 _LEAST_SLOPE = 0.05  # of k_L; a stack whose force falls with rising voltage has no inverse
@@ -204,3 +241,76 @@ def _march(model: Model) -> ca.Function:
     du, df = increments(state[0], state[1])
     du, df = increments(state[0] + 0.5 * du, state[1] + 0.5 * df)
     return ca.Function("step", [state, change, dt], [state + ca.vertcat(du, df)])
+
+
+#: Steps of a path that differ by more than this share of their median are not uniform.
+_UNIFORM = 1e-3
+#: Share of a step by which a trial may end before the path does.
+_SHORT = 1.5
+#: Least range of the measured displacement, over that of the path.
+_MOVED = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedInput:
+    """A corrected voltage, and the trial it comes from.
+
+    `played` (n,) [V] and `measured` (n,) [m] are the trial at the path's instants, `error` is the
+    trial's; `response` is the model's to the corrected voltage, which knows nothing of the trial.
+    """
+
+    target: Target
+    limits: AmplifierLimits
+    played: FloatArray
+    measured: FloatArray
+    error: TrackingError
+    response: Response
+
+
+def corrected(
+    model: Model, target: Target, record: Record, limits: AmplifierLimits | None = None
+) -> CorrectedInput:
+    """Return the voltage for a path, corrected by a record of an earlier voltage for it.
+
+    The record's first sample counts as the path's; see `inversion.correct` for what is done. The
+    voltage is cut by the limits.
+
+    Raises InputError for a model that is no stack, a path whose instants are not uniform, a record
+    that is too short for the path, has gaps or no scale, or shows no motion to speak of.
+    """
+    demand_stack(model)
+    _check(target, record)
+    time = record.time - record.time[0]
+    played = np.interp(target.time, time, record.voltage)
+    measured = np.interp(target.time, time, np.asarray(record.displacement, dtype=float))
+    bounds = limits or AmplifierLimits()
+    voltage = held(model, bounds, target.time, correct(model, target, played, measured))
+    error = error_of(target, measured)
+    response = respond(model, target.time, voltage)
+    return CorrectedInput(target, bounds, played, measured, error, response)
+
+
+def _check(target: Target, record: Record) -> None:
+    problems, name = Problems(), record.source or record.name
+    if np.ptp(np.diff(target.time)) > _UNIFORM * target.step:
+        problems.add(
+            "The path's instants are not uniform; resample it evenly, design the voltage for that,"
+            " and measure the trial again."
+        )
+    if record.time[-1] - record.time[0] < target.time[-1] - _SHORT * target.step:
+        problems.add(
+            f"{name}: lasts {record.time[-1] - record.time[0]:.4g} s, the path"
+            f" {target.time[-1]:.4g} s; record the whole path, from its first sample on."
+        )
+    shown = record.displacement
+    if shown is None or record.displacement_unit != "m" or not np.isfinite(shown).all():
+        problems.add(
+            f"{name}: a trial needs a displacement in a unit of length at every sample; fill"
+            " the gaps, or convert counts by the sensor's scale."
+        )
+    elif np.ptp(shown) < _MOVED * target.span:
+        problems.add(
+            f"{name}: the stack moved by {1e6 * np.ptp(shown):.3g} um, the path moves by"
+            f" {1e6 * target.span:.3g} um; this is no trial of it, or in another unit."
+        )
+    problems.raise_if_any()

@@ -15,18 +15,215 @@ value.
 import time as clocks
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
+import scipy
 
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.dynamics import move_ends
-from psa_casadi.design.tracking.linear_move import LinearMove, Offsets, linear_move
-from psa_casadi.design.tracking.verification import Response, respond
+from psa_casadi.design.tracking.targets import AmplifierLimits, Response, move_ends, respond
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.start import slopes_at_rest
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
+_SLACK = 1e-7  # sum of the distances from rest, over nominal, that counts as arrived
+_PRECISION = 1e-3  # of the length
+_PERIODS = 100.0  # longest move, over the slowest time constant
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """What the linear part does not know: of the state (nf,), its rates (nf,), the position [m]."""
+
+    state: FloatArray
+    rates: FloatArray
+    position: float
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMove:
+    """A move of the states without memory (over nominal): x' = a x + b v, d = c x [m].
+
+    `fast` are their rows in the state vector; the voltage starts at `rest` [V] with the state
+    `start` (nf,), and has n intervals.
+    """
+
+    model: Model
+    fast: list[int]
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+    start: FloatArray
+    rest: float
+    end: float
+    travel: float
+    limits: AmplifierLimits
+    n: int
+
+    def no_offsets(self) -> Offsets:
+        """Return the offsets of the linear part alone."""
+        return Offsets(np.zeros(len(self.fast)), np.zeros(len(self.fast)), 0.0)
+
+    def forces(self, time: float, state: FloatArray, voltage: float) -> Offsets:
+        """Return what is left of the model's rates and displacement without the linear part."""
+        m = self.model
+        u = [voltage if i.name == "voltage" else i.start for i in m.structure.inputs]
+        xdot, y = m.structure.f(time, state, u, m.parameter_vector())
+        size = m.state_nominals()[self.fast]
+        x = state[self.fast] / size
+        rates = np.array(xdot).ravel()[self.fast] / size - self.a @ x - self.b * voltage
+        shown = float(y[m.output_names.index("displacement")])
+        return Offsets(np.zeros(len(x)), rates, shown - float(self.c @ x))
+
+    def offsets(
+        self, length: float, voltage: FloatArray, arrival: FloatArray, forces: Offsets
+    ) -> Offsets:
+        """Return the offsets for which the program arrives (nf,) where the simulator did."""
+        gain, free = self._march(length)
+        size = self.model.state_nominals()[self.fast]
+        state = arrival / size - gain @ voltage[1:] - free
+        return Offsets(state, forces.rates, forces.position)
+
+    def shortest(self, offsets: Offsets) -> tuple[float, FloatArray]:
+        """Return the least length [s] by halving, and its voltage (n + 1,) [V]."""
+        slowest = float(np.max(1.0 / np.abs(np.linalg.eigvals(self.a))))
+        low, high = 0.0, slowest
+        found = self._arrive(high, offsets)
+        while found is None:
+            low, high = high, 2.0 * high
+            if high > _PERIODS * slowest:
+                raise PsaError(
+                    "No voltage within the limits makes the move; widen them, or move less far."
+                )
+            found = self._arrive(high, offsets)
+        while high - low > _PRECISION * high:
+            middle = 0.5 * (low + high)
+            tried = self._arrive(middle, offsets)
+            if tried is None:
+                low = middle
+            else:
+                high, found = middle, tried
+        return high, np.concatenate([[self.rest], found])
+
+    def nearest(self, length: float, voltage: FloatArray, offsets: Offsets) -> FloatArray | None:
+        """Return the voltage that arrives and differs least, at most, from another; None if none.
+
+        Unknowns: the voltage and its largest difference, both over the span of the limits.
+        """
+        matrix, right = self._conditions(length, offsets)
+        rows, tops = self._limited(length)
+        n, near = self.n, voltage[1:]
+        bound = -np.ones((n, 1))
+        upper = np.vstack(
+            [
+                np.hstack([rows, np.zeros((len(rows), 1))]),
+                np.hstack([np.eye(n), bound]),
+                np.hstack([-np.eye(n), bound]),
+            ]
+        )
+        answer: Any = scipy.optimize.linprog(
+            np.r_[np.zeros(n), 1.0],
+            A_ub=upper, b_ub=np.concatenate([tops, near, -near]),
+            A_eq=np.hstack([matrix, np.zeros((len(matrix), 1))]), b_eq=right,
+            bounds=[(self.limits.min_voltage, self.limits.max_voltage)] * n + [(0.0, None)],
+        )  # fmt: skip
+        return np.concatenate([[self.rest], answer.x[:n]]) if answer.status == 0 else None
+
+    def _arrive(self, length: float, offsets: Offsets) -> FloatArray | None:
+        """Return a voltage (n,) that arrives in a length [s], None if none does."""
+        matrix, right = self._conditions(length, offsets)
+        rows, tops = self._limited(length)
+        k, n = len(right), self.n
+        answer: Any = scipy.optimize.linprog(
+            np.r_[np.zeros(n), np.ones(2 * k)],
+            A_ub=np.hstack([rows, np.zeros((len(rows), 2 * k))]) if len(rows) else None,
+            b_ub=tops if len(rows) else None,
+            A_eq=np.hstack([matrix, np.eye(k), -np.eye(k)]), b_eq=right,
+            bounds=[(self.limits.min_voltage, self.limits.max_voltage)] * n + [(0.0, None)] * 2 * k,
+        )  # fmt: skip
+        return np.asarray(answer.x[:n]) if answer.status == 0 and answer.fun < _SLACK else None
+
+    def _conditions(self, length: float, offsets: Offsets) -> tuple[FloatArray, FloatArray]:
+        """Return the rows of rest and position, times the voltage (n,), and what they must give.
+
+        Rest is asked as x(T) = -a^-1 (b v_N + f), so that every row counts in nominals.
+        """
+        gain, free = self._march(length)
+        free = free + offsets.state
+        level = -np.linalg.solve(self.a, self.b)
+        still = -np.linalg.solve(self.a, offsets.rates)
+        rest = gain.copy()
+        rest[:, -1] -= level
+        size = abs(self.travel)
+        place = (self.c @ gain) / size
+        reach = (self.end - offsets.position - self.c @ free) / size
+        return np.vstack([rest, place]), np.concatenate([still - free, [reach]])
+
+    def _limited(self, length: float) -> tuple[FloatArray, FloatArray]:
+        """Return rows times the voltage (n,) that must not pass `tops`: rate and current."""
+        n, h, rows, tops = self.n, length / self.n, [], []
+        change = np.eye(n) - np.eye(n, k=-1)
+        if np.isfinite(self.limits.max_rate):
+            first = np.r_[self.rest, np.zeros(n - 1)]
+            rows += [change, -change]
+            tops += [self.limits.max_rate * h + first, self.limits.max_rate * h - first]
+        if np.isfinite(self.limits.max_current):
+            gain, free = self._current(h)
+            rows += [gain, -gain]
+            tops += [self.limits.max_current - free, self.limits.max_current + free]
+        return (np.vstack(rows) if rows else np.zeros((0, n))), np.concatenate([*tops, []])
+
+    def _current(self, h: float) -> tuple[FloatArray, FloatArray]:
+        """Return i_k = (G v_k - u_k) / R_s at the knots: times the voltage, and rest."""
+        p = self.model.values
+        decay = np.exp(-h / (p["R_s"] * p["C_p"]))
+        later = 1.0 - p["R_s"] * p["C_p"] / h * (1.0 - decay)
+        before = 1.0 - decay - later
+        u, free = np.zeros((self.n, self.n)), np.zeros(self.n)
+        row, left = np.zeros(self.n), self.rest
+        for k in range(self.n):
+            row, left = decay * row, decay * left + (before * self.rest if k == 0 else 0.0)
+            if k:
+                row[k - 1] += before
+            row[k] += later
+            u[k], free[k] = row, left
+        scale = p["G"] / p["R_s"]
+        return scale * (np.eye(self.n) - u), -scale * free
+
+    def _march(self, length: float) -> tuple[FloatArray, FloatArray]:
+        """Return x(T) as `gain` (nf, n) times the voltage plus `free` (nf,), for lines between."""
+        nf, n, h = len(self.a), self.n, length / self.n
+        block = np.zeros((nf + 2, nf + 2))
+        block[:nf, :nf], block[:nf, nf], block[nf, nf + 1] = self.a * h, self.b * h, 1.0
+        power = scipy.linalg.expm(block)
+        step, later = power[:nf, :nf], power[:nf, nf + 1]
+        before = power[:nf, nf] - later
+        gain, free = np.zeros((nf, n)), self.start
+        for k in range(n):
+            gain, free = step @ gain, step @ free
+            if k:
+                gain[:, k - 1] += before
+            else:
+                free = free + before * self.rest
+            gain[:, k] += later
+        return gain, free
+
+
+def linear_move(
+    model: Model, rest: float, end: float, limits: AmplifierLimits, intervals: int
+) -> LinearMove:
+    """Return the linear part of a stack's move from rest at a voltage [V] to a position [m]."""
+    fast = [k for k, s in enumerate(model.structure.states) if not s.memory]
+    size = model.state_nominals()[fast]
+    a, b, c = slopes_at_rest(model)
+    scaled = a[np.ix_(fast, fast)] * size / size[:, None]
+    column, row = b[fast] / size, c[fast] * size
+    start: FloatArray = np.asarray(-np.linalg.solve(scaled, column) * rest, dtype=float)
+    return LinearMove(
+        model, fast, scaled, column, row, start, rest, end, end - float(row @ start), limits,
+        intervals,
+    )  # fmt: skip
+
 
 #: Intervals of the move, and length of the hold behind it over that of the move.
 INTERVALS, HOLD = 120, 4

@@ -12,7 +12,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
-from psa_casadi.identification.search.refitting import quick_rtol, refit
+from psa_casadi.identification.refitting import quick_rtol, refit
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side

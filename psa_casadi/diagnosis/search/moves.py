@@ -27,7 +27,7 @@ from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.start.modes import MOST_DAMPED, Mode, Shaken, modes_of
+from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Shaken, modes_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment

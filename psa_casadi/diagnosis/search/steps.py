@@ -31,8 +31,8 @@ from psa_casadi.diagnosis.task import Task, same_curves, thresholds
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import as_read
-from psa_casadi.identification.search.multistart import fit_base
-from psa_casadi.identification.search.refitting import Progress
+from psa_casadi.identification.refitting import Progress
+from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note

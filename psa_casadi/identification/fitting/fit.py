@@ -1,36 +1,281 @@
-"""Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives."""
+"""Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives.
+
+Where records begin that are held out whole, of which no fit sees a sample.
+
+The stack begins as in the fitted records of the device that begin at the same voltage: what the
+first tenth of a record tells of its memories is mostly the model's own error there. A loop that is
+simulated from it drifts off by a tenth of the range, where one that begins as the device's other
+records do stays within a hundredth. Where no fitted record begins alike, the first tenth finds the
+whole start. States of drive, sensor and environment belong to the record, and the first tenth finds
+them, too; but it hardly tells a charge that leaks slowly from the sensor's offset, and what it
+leaves open grows along the record. So such a state is looked for within the size that it has where
+the fitted records begin which begin alike (their root mean square is its prior).
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.beginnings import beginnings
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.further import Further, further_of, scaled
-from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS
-from psa_casadi.identification.fitting.minimum import Effort, accurate_minimum
+from psa_casadi.identification.fitting.levenberg_marquardt import (
+    FIRST_RADIUS,
+    LEAST_RADIUS,
+    Minimum,
+    minimise,
+)
 from psa_casadi.identification.fitting.prediction import (
     Prediction,
     Simulated,
     measured,
     motions_of,
     predict,
+    simulated,
+    trace_record,
 )
 from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
+from psa_casadi.interruption import current_work
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.simulate import Way
 from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
+#: Relative tolerance of a step in fits.
+FIT_RTOL = 1e-6
+#: First voltages that differ by less than this share of the records' range are the same.
+_SAME = 0.01
+#: Coordinates of a start are of order 1: smaller than this none is known.
+_LEAST = 1e-6
+#: How far the start is sought in the first tenth.
+_EVALUATIONS, _TOLERANCE = 30, 1e-5
+
+
+def beginnings(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiments: Sequence[Experiment],
+    level: float,
+    way: Way,
+) -> FloatArray:
+    """Return theta with start and offset of the records that are held out whole; others stay.
+
+    `model` has the values of theta; `level` [m] is that of white noise which tells as little as
+    what the model misses. Raises PsaError where a record cannot be simulated.
+    """
+    found = theta.copy()
+    own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
+    for k, experiment in enumerate(experiments):
+        if not experiment.held_out_whole or not experiment.known.any():
+            continue
+        first, last = unknowns.first(k), unknowns.first(k + 1)
+        found[first:last] = 0.0
+        told = _told(unknowns, theta, experiments, k)
+        shared = {c: told[c] for c in told if unknowns.started[k][c - first] not in own}
+        found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
+        sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
+        for c in sizes.keys() & told.keys():
+            size = float(np.sqrt(np.mean(np.square(told[c]))))
+            sizes[c] = min(sizes[c], max(size, _LEAST))
+        found[list(sizes)] = _sought(model, unknowns, found, experiment, k, level, sizes, way)
+    return found
+
+
+def _told(
+    unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
+) -> dict[int, list[float]]:
+    """Return what the fitted records that begin as record k does tell of its start's coordinates.
+
+    One value for each of these records, by the coordinate's place.
+    """
+    first = unknowns.first(k)
+    size = max(float(np.ptp(e.record.voltage)) for e in experiments)
+    begins = [float(e.record.voltage[0]) for e in experiments]
+    alike = [
+        j
+        for j, other in enumerate(experiments)
+        if not other.held_out_whole and abs(begins[j] - begins[k]) <= _SAME * size
+    ]
+    found = {
+        first + place: [
+            float(theta[unknowns.first(j) + unknowns.started[j].index(name)])
+            for j in alike
+            if name in unknowns.started[j]
+        ]
+        for place, name in enumerate(unknowns.started[k])
+    }
+    return {c: values for c, values in found.items() if values}
+
+
+def _sought(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiment: Experiment,
+    k: int,
+    level: float,
+    sizes: Mapping[int, float],
+    way: Way,
+) -> FloatArray:
+    """Return the coordinates of record k with which its first tenth fits best, of such sizes."""
+    known, columns = np.flatnonzero(experiment.known), list(sizes)
+    stop = int(known[-1]) + 1
+    y, prior = measured(experiment.record)[known], 1.0 / np.array(list(sizes.values()))
+
+    def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        there = theta.copy()
+        there[columns] = own
+        try:
+            run = trace_record(
+                model, experiment.record, unknowns.start(there, k), (), stop=stop, way=way
+            )
+        except PsaError:
+            return None
+        by_start, by_offset = unknowns.place_slopes(there, k)
+        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / level
+        missed = (run.output[known] + unknowns.offset(there, k) - y) / level
+        return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
+
+    free = np.full(len(columns), np.inf)
+    found = minimise(  # the last coordinate is the offset, exactly linear
+        evaluate, np.zeros(len(columns)), (-free, free), tolerance=_TOLERANCE,
+        evaluations=_EVALUATIONS, linear=(len(columns) - 1,),
+    )  # fmt: skip
+    if found is None:
+        raise PsaError("A held-out record cannot be simulated from where the others begin.")
+    return found.theta
+
+
+#: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
+#: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
+#: then the stepper is taken.
+_OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
+#: Multiple of the whole range that is missed (rms) where a loop has diverged. It would come down by
+#: decades a step, each of which takes a hundred times as long as one of a loop that is stable.
+_DIVERGED = 1e6
+
+
+def accurate_minimum(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    theta: FloatArray,
+    sigma: Sequence[float],
+    *,
+    tolerance: float,
+    evaluations: int,
+    rtol: float = FIT_RTOL,
+    goal: float = np.inf,
+    radius: float = FIRST_RADIUS,
+    patient: bool = False,
+) -> tuple[Minimum, Way, list[Simulated]]:
+    """Return the minimum, found by a simulation that is accurate there, and how that was done.
+
+    See `minimise` for how far it is sought.
+    """
+    pairs = [(measured(e.record)[e.used], s) for e, s in zip(experiments, sigma, strict=True)]
+    allowed = [
+        max(_OF_NOISE * s, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0) for y, s in pairs
+    ]
+    if not any(e.further for e in experiments):  # a loop that diverges misses more than all
+        goal = min(goal, sum(y.size * float(np.ptp(y) / s) ** 2 for y, s in pairs if y.size))
+    ways = [Way(rtol * 0.1**k, rtol * 0.1**k, halved=k) for k in range(_TENTHS)]
+    ways.append(Way(rtol, 0.1 * rtol, stepped=True))
+    spent, before = 0, None
+    for way in ways:
+        evaluate = Objective(model, experiments, unknowns, sigma, way)
+        try:
+            found = minimise(
+                evaluate,
+                theta,
+                unknowns.bounds(),
+                tolerance=tolerance,
+                evaluations=max(evaluations - spent, 2),
+                goal=goal,
+                linear=unknowns.offsets,
+                patient=patient,
+                radius=radius if before is None else max(before[0].radius, LEAST_RADIUS),
+            )
+        except KeyboardInterrupt:
+            if before is None:  # nothing was evaluated yet
+                raise
+            current_work().stop()
+            minimum, rougher = before
+            ended = replace(minimum, evaluations=spent, interrupted=True, converged=False)
+            return ended, rougher, []
+        if found is None:
+            raise SimulationError(
+                "The model cannot be simulated at the start of the fit; start from other values."
+            )
+        minimum, theta = found, found.theta
+        before = minimum, way
+        spent += found.evaluations
+        if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
+            current_work().stop()
+            return replace(minimum, evaluations=spent), way, []
+        if minimum.cost > goal:  # of no use, however accurate
+            return replace(minimum, evaluations=spent), way, []
+        told = simulated(model, experiments, unknowns, theta, way=way)
+        if not any(t.error > a for t, a in zip(told, allowed, strict=True)):
+            break
+    return replace(minimum, evaluations=spent), way, told
+
+
+class Objective:
+    """The weighted residuals (predicted - measured, then priors) with their Jacobian, at a theta.
+
+    Those of the displacement, then those of the further columns. None where the model diverges. It
+    can be pickled with the posterior that it is part of.
+    """
+
+    def __init__(
+        self, model: Model, experiments: Sequence[Experiment], unknowns: Unknowns,
+        sigma: Sequence[float], way: Way,
+    ) -> None:  # fmt: skip
+        self._of, self._way = (model, tuple(experiments), unknowns), way
+        self._target = np.concatenate([measured(e.record)[e.used] for e in experiments])
+        weights, span = weights_of(experiments, sigma), float(np.ptp(self._target))
+        self._reach = float(np.max(span / weights)) if span > 0.0 else np.inf
+        self._used = [e.used[: e.stop] for e in experiments]
+        self._prior, self._share = 1.0 / unknowns.prior, 1.0 / weights
+
+    def __call__(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return residuals (m,) and Jacobian (m, size)."""
+        try:
+            parts = predict(*self._of, theta, way=self._way)
+            beside = further_of(*self._of, theta, way=self._way)
+        except PsaError:
+            return None
+        used, samples = self._used, len(self._target)
+        y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
+        more = [b.jacobian / b.level for b in beside]
+        given = (-b.residuals / b.level for b in beside)
+        residual = np.concatenate([(y - self._target) * self._share, *given, theta * self._prior])
+        jacobian = np.empty((len(residual), len(theta)))
+        first = 0
+        for part, u in zip(parts, used, strict=True):  # no copy but this one
+            last = first + int(np.count_nonzero(u))
+            np.compress(u, part.jacobian, axis=0, out=jacobian[first:last])
+            first = last
+        jacobian[:samples] *= self._share[:, None]
+        jacobian[samples:] = np.vstack([*more, np.diag(self._prior)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
+            far = _DIVERGED * self._reach * np.sqrt(samples)
+            near = np.linalg.norm(residual[:samples]) < far
+        return (residual, jacobian) if finite and near else None
+
+
+def weights_of(experiments: Sequence[Experiment], sigma: Sequence[float]) -> FloatArray:
+    """Return the level [m] that weights each used sample (n,)."""
+    return np.repeat(np.asarray(sigma, dtype=np.float64), [int(e.used.sum()) for e in experiments])
+
 
 #: Correlation of neighbouring residuals that counts at most: a hundred samples are then one.
 _MOST_ALIKE = 0.98
-#: Relative tolerance of a step in fits.
-FIT_RTOL = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -173,21 +418,14 @@ def fit(
     """
     if not any(e.used.any() for e in experiments):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
-    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
     placed = model.with_values(start or {})
-    motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
-    first = [float(e.record.voltage[0]) for e in experiments]
-    unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
-    unknowns = unknowns.without([k for k, e in enumerate(experiments) if not e.used.any()])
+    unknowns = unknowns_around(model, free, experiments, sigma, placed=placed)
     theta = _starting_point(model, experiments, unknowns, start or {}, start_states)
-    weights = np.concatenate(
-        [np.full(int(e.used.sum()), s) for e, s in zip(experiments, sigma, strict=True)]
-    )
-    linear = tuple(unknowns.first(r + 1) - 1 for r in range(unknowns.records))
-    effort = Effort(tolerance, evaluations, goal, linear, radius, patient)
     minimum, way, told = accurate_minimum(
-        model, experiments, unknowns, weights, theta, sigma, rtol, effort
-    )
+        model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
+        rtol=rtol, goal=goal, radius=radius, patient=patient,
+    )  # fmt: skip
+    weights = weights_of(experiments, sigma)
     further = further_of(model, experiments, unknowns, minimum.theta, way=way)
     found, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
@@ -206,6 +444,18 @@ def fit(
         radius=minimum.radius,
         further=further,
     )
+
+
+def unknowns_around(
+    model: Model, free: Sequence[str], experiments: Sequence[Experiment], sigma: Sequence[float],
+    *, placed: Model,
+) -> Unknowns:  # fmt: skip
+    """Return the coordinates of a fit around a model's values, `placed` where it begins."""
+    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
+    motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
+    first = [float(e.record.voltage[0]) for e in experiments]
+    unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
+    return unknowns.without([k for k, e in enumerate(experiments) if not e.used.any()])
 
 
 def _starting_point(

@@ -9,18 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.identification.fitting.prediction import trace_record, traced_by_theta
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Way
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True)
@@ -82,21 +81,21 @@ class Further:
         return COLUMNS[self.column].straight * self.spread
 
     @property
-    def sentence(self) -> str:
-        """What is left of the column, and what is odd about it, in words."""
+    def notes(self) -> tuple[Note, ...]:
+        """What is left of the column, and what is odd about it."""
         unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
         named = "" if unit == "1" else f" {unit}"
         return (
-            f"{self.column}: fitted beside the displacement; {self.rms:.3g}{named} rms of it are"
-            f" missed, {share:.2g} % of its own rms.{' ' + self.turned if self.turned else ''}"
+            note("column", column=self.column, rms=self.rms, unit=named, share=share),
+            *self.turned,
         )
 
     @property
-    def turned(self) -> str:
-        """Say so where a column falls while what it shows rises, else ""."""
+    def turned(self) -> tuple[Note, ...]:
+        """Say so where a column falls while what it shows rises."""
         if COLUMNS[self.column].scale is not None or self.factors[0] >= 0.0:
-            return ""
-        return f"{self.column} falls where the model's rises: its sign is probably turned."
+            return ()
+        return (note("turned_column", column=self.column),)
 
     @property
     def rms(self) -> float:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
+
 #: theta -> (residual (m,), Jacobian (m, k)), or None where the model cannot be evaluated.
 Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 

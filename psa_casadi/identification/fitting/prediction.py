@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.unknowns import Unknowns
@@ -20,8 +19,7 @@ from psa_casadi.simulation.start import (
     start_on,
     start_state,
 )
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Steps between two samples, and mean ones of a record, beyond which a trial point has failed.
 #: Dozens are ordinary: of 74 runs in 19 diagnoses the means were 25 and less, but for two. The mean

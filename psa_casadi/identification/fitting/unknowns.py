@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import State, nominal_value
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Standard deviations of the weak priors: in natural logarithms, and in ordinary changes.
 LOG_PRIOR = 3.0
@@ -74,6 +74,11 @@ class Unknowns:
     def size(self) -> int:
         """Number of coordinates."""
         return self.first(self.records)
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """Indices of the records' offsets, in which a prediction is exactly linear."""
+        return tuple(self.first(r + 1) - 1 for r in range(self.records))
 
     def values(self, theta: FloatArray) -> dict[str, float]:
         """Return the parameter values at theta, clipped to their bounds against rounding."""
@@ -293,3 +298,81 @@ def memory_priors(model: Model) -> tuple[float, ...]:
 def memory_prior(state: State) -> float:
     """Return the standard deviation of the weak prior of a state's start, in usual sizes."""
     return SETTLING_PRIOR if state.memory and state.settles else MEMORY_PRIOR
+
+
+class Searched(Protocol):
+    """The coordinates of a fit: parameters by name, then what every record has of its own.
+
+    `prior` (size,) are the standard deviations of their weak priors, infinite where there is none.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
+    @property
+    def started(self) -> tuple[tuple[str, ...], ...]:
+        """Names of what every record has of its own."""
+
+    @property
+    def prior(self) -> FloatArray:
+        """Standard deviations of the weak priors (size,)."""
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+
+    def first(self, record: int) -> int:
+        """Return the index of the first coordinate of one record."""
+
+
+class FittedColumn(Protocol):
+    """The fit of one column beside the first: samples of all records that have it, stacked.
+
+    `residuals` (n,) are measured minus predicted, `jacobian` (n, size) d prediction / d theta, both
+    without what the orthonormal `basis` (n, k) spans.
+    """
+
+    @property
+    def column(self) -> str:
+        """Name of the column."""
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Measured minus predicted (n,)."""
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Derivatives of the prediction by theta (n, size)."""
+
+    @property
+    def basis(self) -> FloatArray:
+        """What is projected out (n, k), orthonormal."""
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Numbers of samples of the records."""
+
+    @property
+    def straight(self) -> float:
+        """Rms below which nothing is known of the column."""
+
+
+class Fitted(Protocol):
+    """A fit: residuals and derivatives of the first column, and the columns beside it."""
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Measured minus predicted (n,)."""
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Derivatives of the prediction by theta (n, size)."""
+
+    @property
+    def unknowns(self) -> Searched:
+        """The coordinates of the fit."""
+
+    @property
+    def further(self) -> Sequence[FittedColumn]:
+        """The columns beside the first."""

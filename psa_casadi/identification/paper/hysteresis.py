@@ -4,19 +4,103 @@ Quasi-static, in displacement units: x = k u + h,
 h' = A u' - beta |u'| |h|^(n-1) h - gamma u' |h|^n + delta u sgn(u').
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
-from psa_casadi.identification.paper.rates import Rates, rates_of
-from psa_casadi.identification.paper.shapes import Loop
+from psa_casadi.identification.paper.linear import Loop
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import high_frequency_noise
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+
+#: Order of the local polynomial, and its shortest window in samples.
+_ORDER, _SHORTEST = 3, 5
+#: The window grows until the noise of x' is below this share of the mean speed of the loop,
+#: and to this share of a period at most.
+_QUIET, _LONGEST = 2e-3, 0.1
+#: The noise of x' over what is allowed, beyond which a sentence says so.
+_TOO_MUCH = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Rates:
+    """A loop, smoothed: u [V], u' [V/s], h = x - k u [m], x' [m/s], all (n,).
+
+    `inner` marks samples whose window holds no turn and no end; `branches` are its runs, slices of
+    samples on which the voltage goes one way.
+    """
+
+    name: str
+    k: float
+    u: FloatArray
+    u_rate: FloatArray
+    h: FloatArray
+    x_rate: FloatArray
+    inner: BoolArray
+    branches: tuple[slice, ...]
+    notes: tuple[Note, ...]
+
+    def sign(self, branch: slice) -> float:
+        """Return 1 on a branch on which the voltage rises, else -1."""
+        return float(np.sign(np.mean(self.u_rate[branch])))
+
+
+def rates_of(loop: Loop, k: float) -> Rates:
+    """Differentiate a loop by Savitzky and Golay's filter of third order.
+
+    The window is the shortest odd one with s |c| <= 0.002 * 2 f range(x), where s is the white
+    noise of the displacement, c the filter's coefficients, f the loop's frequency; it is a tenth
+    of a period at most, and a sentence says where that is not enough. Voltage and displacement
+    pass through the same filter, so that what it bends it bends alike.
+    """
+    window, excess = window_of(loop)
+    u, u_rate, x, x_rate = (
+        np.asarray(
+            scipy.signal.savgol_filter(
+                values, window, _ORDER, deriv=derivative, delta=loop.sample_time
+            ),
+            dtype=np.float64,
+        )
+        for values in (loop.voltage, loop.displacement)
+        for derivative in (0, 1)
+    )
+    margin = window // 2 + 1
+    branches = tuple(
+        slice(first + margin, last - margin + 1)
+        for first, last in pairwise([0, *loop.turns.tolist(), len(u) - 1])
+        if last - first > 2 * margin + 2
+    )
+    inner = np.zeros(len(u), dtype=np.bool_)
+    for branch in branches:
+        inner[branch] = True
+    notes = (note("rough_velocity", loop=loop.name, share=100.0 * _QUIET * excess),)
+    return Rates(
+        loop.name, k, u, u_rate, x - k * u, x_rate, inner, branches,
+        notes if excess > _TOO_MUCH else (),
+    )  # fmt: skip
+
+
+def window_of(loop: Loop) -> tuple[int, float]:
+    """Return the window in samples (odd), and the noise of x' over what is allowed."""
+    period = 1.0 / (loop.frequency * loop.sample_time)
+    longest = max(_SHORTEST, int(_LONGEST * period) // 2 * 2 - 1)
+    allowed = _QUIET * 2.0 * loop.frequency * float(np.ptp(loop.displacement))
+    noise = high_frequency_noise(loop.displacement)
+    window = _SHORTEST
+    while True:
+        weights = scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=loop.sample_time)
+        excess = noise * float(np.linalg.norm(weights)) / allowed
+        if excess <= 1.0 or window >= longest:
+            return window, excess
+        window = min(longest, max(window + 2, int(1.2 * window) // 2 * 2 + 1))
+
 
 #: Samples count in (31), (34) where h and |u'| exceed this share of their largest values.
 _CLEAR = 0.1
@@ -47,7 +131,7 @@ class HysteresisPart:
     A: float | None = None
     delta: float | None = None
     bends: Bends | None = None
-    sentences: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 class Crossing(NamedTuple):
@@ -75,46 +159,41 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
     logarithm of (beta - gamma) h^n is taken, which says the same, and a sentence tells it.
     """
     rates = [rates_of(loop, k) for loop in loops]
-    sentences = [s for r in rates for s in r.sentences]
+    notes = [note for r in rates for note in r.notes]
     pairs = [pair for r in rates for pair in crossing_pairs(r)]
     if not pairs:
-        return HysteresisPart(sentences=(*sentences, _no_crossing(rates)))
+        return HysteresisPart(notes=(*notes, _no_crossing(rates)))
     each = np.array([slope_and_asymmetry(up, down, k) for up, down in pairs])
     A, delta = (float(v) for v in each.mean(axis=0))
-    sentences += _doubts_about_k(rates, each[:, 0])
+    notes += _doubts_about_k(rates, each[:, 0])
     rising, falling = (_logarithms(rates, A, delta, sign) for sign in (1.0, -1.0))
-    sentences += _lost(rising, "rising", "beta + gamma") + _lost(falling, "falling", "gamma - beta")
+    notes += _lost(rising, "rising", "beta + gamma") + _lost(falling, "falling", "gamma - beta")
     if rising is None or falling is None:
-        return HysteresisPart(A=A, delta=delta, sentences=tuple(sentences))
+        return HysteresisPart(A=A, delta=delta, notes=tuple(notes))
     n = rising.n
     total, difference = (
         line.sign * float(np.exp(line.mean_log - n * line.mean_log_h)) for line in (rising, falling)
     )
     if falling.sign < 0.0:
-        sentences.append(_LAGGING)
+        notes.append(note("lagging_loop"))
     bends = Bends(n, 0.5 * (total - difference), 0.5 * (total + difference))
-    return HysteresisPart(A, delta, bends, tuple(sentences))
+    return HysteresisPart(A, delta, bends, tuple(notes))
 
 
-def crossing_pairs(r: Rates) -> Iterator[tuple[Crossing, Crossing]]:
-    """Yield a crossing of x = k u on a rising branch with that of the next falling branch.
+def crossing_pairs(r: Rates) -> list[tuple[Crossing, Crossing]]:
+    """Return each crossing of x = k u on a rising branch with that of the next falling branch.
 
     Where no rising branch with a crossing is followed by such a falling one, a falling branch is
     paired with the next rising one.
     """
     branches = [(r.sign(b), _crossing(r, b)) for b in r.branches]
     pairs = [
-        (first[1], then[1])
+        (first[0], first[1], then[1])
         for first, then in pairwise(branches)
-        if first[0] > 0.0 > then[0] and first[1] is not None and then[1] is not None
+        if first[0] * then[0] < 0.0 and first[1] is not None and then[1] is not None
     ]
-    if not pairs:
-        pairs = [
-            (then[1], first[1])
-            for first, then in pairwise(branches)
-            if then[0] > 0.0 > first[0] and first[1] is not None and then[1] is not None
-        ]
-    yield from pairs
+    up_first = [(first, then) for sign, first, then in pairs if sign > 0.0]
+    return up_first or [(then, first) for _, first, then in pairs]
 
 
 def slope_and_asymmetry(up: Crossing, down: Crossing, k: float) -> tuple[float, float]:
@@ -175,68 +254,34 @@ def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> 
     return _Line(common, slope, float(np.mean(logs)), float(np.mean(log_h[good])), lost)
 
 
-def _lost(line: _Line | None, branch: str, what: str) -> list[str]:
-    """Say where (31) or (34) had no samples, or logarithms of numbers of the wrong sign."""
+def _lost(line: _Line | None, branch: str, what: str) -> list[Note]:
+    """Note where (31) or (34) had no samples, or logarithms of numbers of the wrong sign."""
     if line is None:
-        return [
-            f"No samples with h = x - k u above zero are left on the {branch} branches, so {what}"
-            " has no equation, and the model has no loop (f_H = 0). Likely cause: k is wrong or the"
-            " loops did not begin at rest at 0 V; give loops that do."
-        ]
-    found = []
-    if branch == "rising" and line.sign < 0.0:
-        found.append(
-            "The logarithms of (31) are of negative numbers on the rising branches, so beta + gamma"
-            " > 0 does not hold; the logarithms of the opposite numbers are taken."
-        )
+        return [note("no_samples", branch=branch, what=what)]
+    notes = [note("negative_rising")] if branch == "rising" and line.sign < 0.0 else []
     if line.lost > _FEW:
-        found.append(
-            f"{100.0 * line.lost:.0f} % of the logarithms on the {branch} branches ({what}) are of"
-            " numbers of the wrong sign and were left out, which biases the rest. Likely cause:"
-            " noise, or a k that is wrong; give slower loops or another step."
-        )
-    return found
+        notes.append(note("wrong_sign", lost=100.0 * line.lost, branch=branch, what=what))
+    return notes
 
 
-def _no_crossing(rates: Sequence[Rates]) -> str:
+def _no_crossing(rates: Sequence[Rates]) -> Note:
     missing = [
         name
         for name, sign in (("rising", 1.0), ("falling", -1.0))
         if not any(_crossing(r, b) for r in rates for b in r.branches if r.sign(b) == sign)
     ]
-    where = f"the {' and the '.join(missing)} branches" if missing else "two branches in succession"
-    return (
-        f"x = k u is not met on {where} of the loops, so A and delta cannot be read at zero"
-        " crossings, and n, beta and gamma rest on them: the model has no loop (f_H = 0). Likely"
-        " cause: k contains a part of the hysteresis (it is the secant of the step), or the loops"
-        " did not begin at rest at 0 V; give two periods or more from rest."
-    )
+    return note("no_crossing", branches=missing)
 
 
-def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[str]:
-    """Say that k is doubtful where A scatters, or where the loop closes on the line x = k u."""
-    found = []
+def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[Note]:
+    """Note that k is doubtful where A scatters, or where the loop closes on the line x = k u."""
+    notes = []
     scatter = float(np.std(slopes) / max(abs(float(np.mean(slopes))), 1e-300))
     if scatter > _SCATTER:
-        found.append(
-            f"A scatters by {100.0 * scatter:.0f} % between the loops' periods, which it should"
-            " not: the loops are not those of eq. (8) with this k."
-        )
+        notes.append(note("scatter", share=100.0 * scatter))
     widest = max(rates, key=lambda r: float(np.ptp(r.u)))
     top = int(np.argmax(np.abs(widest.u)))
     share = abs(float(widest.h[top])) / float(np.max(np.abs(widest.h)))
     if share < _CLOSED:
-        found.append(
-            f"At its tip the loop '{widest.name}' meets the line x = k u (h there is"
-            f" {100.0 * share:.0f} % of its largest value): k, read from a step, holds what the"
-            " hysteresis adds at that voltage, and the paper takes it for the linear part alone."
-            " k, A, delta and all that rest on them are off."
-        )
-    return found
-
-
-_LAGGING = (
-    "The logarithm of (34) is of negative numbers: gamma > beta does not hold, as it cannot for a"
-    " loop that lags. The logarithm of (beta - gamma) h^n was taken instead, which is the same"
-    " equation."
-)
+        notes.append(note("secant", loop=widest.name, share=100.0 * share))
+    return notes

@@ -11,19 +11,125 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.certainty.determinacy import determinacy
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.identify import Identification, with_provenance
-from psa_casadi.identification.paper.conditions import loop_conditions, missing
-from psa_casadi.identification.paper.forces import in_forces
 from psa_casadi.identification.paper.hysteresis import Bends, HysteresisPart, hysteresis_part
-from psa_casadi.identification.paper.moments import linear_part
-from psa_casadi.identification.paper.shapes import Loop, find_loops, find_steps
-from psa_casadi.identification.search.refitting import noise_levels
+from psa_casadi.identification.paper.linear import (
+    LinearPart,
+    Loop,
+    Step,
+    find_loops,
+    find_steps,
+    linear_part,
+    mechanics_of,
+)
+from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
+
+#: The paper's loops are slower than this [Hz], and their lag should stay below this angle [rad].
+_SLOW, _QUASI_STATIC = 1.0, 0.01
+
+
+def conditions(step: Step | None, loops: Sequence[Loop], linear: LinearPart | None) -> list[Note]:
+    """Note what the records lack: a step, a loop, loops that are slow, from 0 V, without gaps."""
+    notes = [note("no_step", loops=bool(loops))] if step is None else []
+    notes += [] if loops else [note("no_loop")]
+    notes += linear.notes if linear else ()
+    if not loops:
+        return notes
+    frequency = loops[0].frequency
+    if frequency > 1.001 * _SLOW:
+        notes.append(note("fast_loops", frequency=frequency))
+    if linear is not None:
+        delay = linear.coefficients["a_1"] - linear.coefficients["b_1"]
+        angle = 2.0 * np.pi * frequency * delay
+        if angle > _QUASI_STATIC:
+            notes.append(note("lagging_step", delay=1e3 * delay, angle=angle, frequency=frequency))
+    away = [o.name for o in loops if abs(o.first_volts) > 0.02 * float(np.ptp(o.voltage))]
+    gaps = [f"{loop.name} ({loop.missing})" for loop in loops if loop.missing]
+    notes += [note("not_from_rest", names=away)] if away else []
+    notes += [note("bridged", names=gaps)] if gaps else []
+    return notes
+
+
+def in_forces(
+    start: Model,
+    k: float | None,
+    coefficients: Mapping[str, float] | None,
+    bend: HysteresisPart,
+) -> tuple[Model, tuple[str, ...], list[Note]]:
+    """Return `start` with everything that was found, k_P and k_B being those of `start`.
+
+    Beside it the names of the parameters that were found, and what could not be taken over.
+    k_L = k/C with C = 1/k_P + 1/k_B [m/N]; lag, masses and dampings are factors of the denominator.
+    Without a loop f_H is 0; without factors the parts are damped critically, c >= 2 sqrt(k m),
+    since nothing is known to ring. A value out of its bounds is refused, n is clipped.
+    """
+    p = start.values
+    compliance = static_compliance(p)
+    critical = {f"c_{q}": 2.0 * float(np.sqrt(p[f"k_{q}"] * p[f"m_{q}"])) for q in "PB"}
+    still = dict.fromkeys(("A", "beta", "gamma", "delta"), 0.0)
+    usual = start.with_values({**still, **{c: max(v, p[c]) for c, v in critical.items()}})
+    motion, notes = (
+        ({}, ()) if coefficients is None else mechanics_of(coefficients, p["k_P"], p["k_B"])
+    )
+    wanted = {**motion, **_loop(bend, compliance, p["h_ref"])}
+    if k is not None:
+        wanted["k_L"] = k / compliance
+    kept, refused = _inside(usual, wanted)
+    found = tuple(name for name in start.parameter_names if name in kept)
+    return usual.with_values(kept), found, [*notes, *refused]
+
+
+def _loop(bend: HysteresisPart, compliance: float, h_ref: float) -> dict[str, float]:
+    """Return the loop in forces, {} where it is not complete.
+
+    h = C f_H gives A/C and delta/C. As eq. (8) is in r = |f_H|/h_ref here, beta becomes
+    beta C^(n-1) h_ref^n, and gamma likewise.
+    """
+    if bend.A is None or bend.delta is None or bend.bends is None:
+        return {}
+    n = bend.bends.n
+    unit = compliance ** (n - 1.0) * h_ref**n
+    return {
+        "A": bend.A / compliance,
+        "delta": bend.delta / compliance,
+        "n": n,
+        "beta": bend.bends.beta * unit,
+        "gamma": bend.bends.gamma * unit,
+    }
+
+
+def _inside(model: Model, wanted: Mapping[str, float]) -> tuple[dict[str, float], list[Note]]:
+    """Return the values that the parameters' bounds allow, and a note for each other one."""
+    kept, refused = {}, []
+    for name, value in wanted.items():
+        p = model.parameter(name)
+        low, high = p.bounds
+        within = low <= value <= high
+        if within or (name == "n" and np.isfinite(value)):
+            kept[name] = float(np.clip(value, low, high))
+        if not within:
+            instead = kept.get(name, model.values[name])
+            refused.append(
+                note(
+                    "out_of_range",
+                    name=name,
+                    value=value,
+                    unit=p.unit,
+                    low=low,
+                    high=high,
+                    instead=instead,
+                )
+            )
+    return kept, refused
+
 
 #: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
 _TIP = (0.8, 0.97)
@@ -36,7 +142,7 @@ class PaperIdentification:
     `coefficients` are a_1 [s] to a_5 [s^5] and b_1 [s] of eq. (15). `k` [m/V], `A` [m/V], `delta`
     [m/(V.s)] and `bends` (n, beta, gamma) are in displacement units, eqs. (25), (26). `model` has
     them in forces; without a loop its f_H is 0, and what else was not found has ordinary values.
-    `found` names the parameters that the method set; `sentences` say what failed or is doubtful.
+    `found` names the parameters that the method set; `notes` tell what failed or is doubtful.
     """
 
     coefficients: Mapping[str, float] | None
@@ -46,7 +152,12 @@ class PaperIdentification:
     bends: Bends | None
     model: Model
     found: tuple[str, ...]
-    sentences: tuple[str, ...]
+    notes: tuple[Note, ...]
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What failed or is doubtful, in words."""
+        return texts(self.notes)
 
 
 def paper_method(
@@ -63,15 +174,8 @@ def paper_method(
     slowest = [loop for loop in loops if loop.frequency < 1.05 * loops[0].frequency]
     k = step.k if step is not None else _slope_at_tip(slowest)
     bend = hysteresis_part(slowest, k) if slowest and k is not None else HysteresisPart()
-    translated = in_forces(
+    model, found, notes = in_forces(
         starting_model(records, stiffness), k, linear.coefficients if linear else None, bend
-    )
-    sentences = (
-        *missing(step, slowest),
-        *(linear.sentences if linear else ()),
-        *loop_conditions(slowest, linear),
-        *bend.sentences,
-        *translated.sentences,
     )
     return PaperIdentification(
         coefficients=linear.coefficients if linear else None,
@@ -79,9 +183,9 @@ def paper_method(
         A=bend.A,
         delta=bend.delta,
         bends=bend.bends,
-        model=translated.model,
-        found=translated.found,
-        sentences=sentences,
+        model=model,
+        found=found,
+        notes=(*conditions(step, slowest, linear), *bend.notes, *notes),
     )
 
 
@@ -99,8 +203,7 @@ def identify_by_paper(
     progress("moments and zero crossings")
     paper = paper_method(records, stiffness=stiffness)
     experiments = tuple(whole(r) for r in records)
-    sigma, sentences = noise_levels(experiments), paper.sentences
-    found = paper.found
+    sigma, doubts, found = noise_levels(experiments), paper.notes, paper.found
     progress("the model on all records")
     try:
         best = fit(paper.model, experiments, [], sigma=sigma)
@@ -109,17 +212,17 @@ def identify_by_paper(
     except PsaError:
         usual = paper.model.with_values(ordinary_values(paper.model, records))
         best = fit(usual, experiments, [], sigma=sigma)
-        sentences, found = (*sentences, _RUNS_AWAY), ()
+        doubts, found = (*doubts, note("runs_away")), ()
     nothing = determinacy(best, experiments)
     model = with_provenance(best.model, nothing, records, stiffness is not None)
-    notes = (*model.provenance.notes, _note(found))
+    notes = (*model.provenance.notes, str(note("paper", names=found)))
     provenance = replace(model.provenance, notes=notes)
     return Identification(
         model=replace(model, provenance=provenance),
         fit=best,
         determinacy=nothing,
         experiments=experiments,
-        warnings=sentences,
+        doubts=doubts,
         read_off=found,
     )
 
@@ -139,18 +242,3 @@ def _slope_at_tip(loops: Sequence[Loop]) -> float | None:
     if part.sum() < 3:
         return None
     return float(np.polyfit(u[part], x[part], 1)[0])
-
-
-def _note(found: Sequence[str]) -> str:
-    named = ", ".join(found) or "nothing"
-    return (
-        "Identified by the paper's method (Yang and Zhu 2015, section 3), which gives no intervals."
-        f" It found {named}; all other parameters have ordinary values."
-    )
-
-
-_RUNS_AWAY = (
-    "The model with these values cannot be simulated on the records (with A, beta and gamma like"
-    " these the hysteresis grows without bound, or masses and dampings are out of proportion), so"
-    " its loop, lags and masses were set back to ordinary values; use --method prediction-error."
-)

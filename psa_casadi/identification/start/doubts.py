@@ -1,4 +1,4 @@
-"""Records that no stack makes: another unit, another sign, a stray sample, nothing to identify."""
+"""Records that no stack makes: another quantity, unit, sign or time, or too few readings."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -8,9 +8,275 @@ from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.start.readings import refuse_stuck
-from psa_casadi.records.record import Record
+from psa_casadi.records.drive import reversals
+from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.units import FloatArray
+
+#: Numbers whose squares would overflow.
+_LARGEST = 1e30
+
+_STUCK = (
+    "But for stuck readings, the displacement is one value: the sensor is out of its range, or"
+    " another column holds its readings (--columns displacement=...)."
+)
+_FEW = (
+    "Only {} of {} readings of the displacement count, too few for a fit, which needs {}; record"
+    " again, with the sensor in its range throughout."
+)
+_STILL = (
+    "The displacement is {:.6g} m throughout: the sensor is out of its range or was not connected,"
+    " or another column holds its readings (--columns displacement=...)."
+)
+_HARDLY = (
+    "Only {} readings of the displacement differ from {:.6g} m, too few for a fit, which needs {}:"
+    " the sensor is out of its range nearly throughout. Record again, with the sensor in its range."
+)
+_TWO = (
+    "The displacement has two values only, {:.6g} and {:.6g} m: that is a switch, or a sensor whose"
+    " step is as large as the motion, and nothing of a stack can be identified from it. Record it"
+    " with a finer sensor, or name another column (--columns displacement=...)."
+)
+
+
+def refuse_stuck(records: Sequence[Record]) -> None:
+    """Raise InputError where no displacement that counts changes."""
+    if not any(r.mask.any() and r.range_m > 0.0 for r in records):
+        raise InputError([_STUCK])
+
+
+def refuse_still(records: Sequence[Record]) -> None:
+    """Raise InputError where displacements, as they were read, have one or two values."""
+    for name, columns in (
+        ("displacement", [measured(r)[r.mask] for r in records]),
+        ("voltage", [r.voltage for r in records]),
+    ):
+        largest = max(float(np.max(np.abs(c), initial=0.0)) for c in columns)
+        if largest > _LARGEST:
+            raise InputError(
+                [f"The {name} reaches {largest:.2g}: that is no reading; correct the column."]
+            )
+    values = [np.unique(measured(r)[r.mask]) for r in records]
+    if all(v.size <= 1 for v in values):
+        raise InputError([_STILL.format(values[0][0])])
+    if all(v.size <= 2 for v in values):
+        raise InputError([_TWO.format(*max(values, key=np.ptp))])
+
+
+def _usual(records: Sequence[Record]) -> tuple[float, int]:
+    """Return the reading that is there most often in a record, and how many are others in all."""
+    usual, most, others = 0.0, 0, 0
+    for r in records:
+        values, counts = np.unique(measured(r)[r.mask], return_counts=True)
+        if counts.size:
+            others += int(counts.sum() - counts.max())
+            if counts.max() > most:
+                usual, most = float(values[np.argmax(counts)]), int(counts.max())
+    return usual, others
+
+
+def refuse_few(given: Sequence[Record], kept: Sequence[Record], said: Sequence[str]) -> None:
+    """Raise InputError where masking left hardly a reading; `said` is what it was done for."""
+    before, after = (sum(int(r.mask.sum()) for r in records) for records in (given, kept))
+    if after < min(before, FEWEST_SAMPLES):
+        raise InputError([*said, _FEW.format(after, before, FEWEST_SAMPLES)])
+    usual, others = _usual(kept)
+    if others < min(after, FEWEST_SAMPLES):
+        raise InputError([*said, _HARDLY.format(others, usual, FEWEST_SAMPLES)])
+
+
+#: The largest mean speed of a stack's end [m/s]. A bar of length L has its first resonance at
+#: c / 4L and moves by S L at most; back and forth there it covers 2 S L c / 4L = S c / 2. With the
+#: largest strain of soft PZT, S = 1.5e-3 at 2 kV/mm, and its sound, c = 1 / sqrt(7800 kg/m3 *
+#: 16e-12 m2/N) = 2800 m/s, that is 2.1 m/s; levers enlarge the stroke and lower the resonance.
+FASTEST = 2.0
+#: A mean speed [m/s] that few tests have: strokes of 10 um at 5 kHz.
+_FAST = 0.1
+#: Largest stroke that counts for that [m]: of more, the displacement's unit is wrong. Where the
+#: sensor's scale is unknown, a chip's stroke [m/V] stands for it.
+_STROKE, _CHIP = 2e-3, 1e-8
+#: Time [s] for the whole range of the voltage that counts as held: see `hold_rate`.
+SLOWEST = 1000.0
+#: Time between samples [s] that records of stacks have.
+_SAMPLE_TIMES = (1e-8, 3600.0)
+#: Ways through the range of the voltage in a second that tests have.
+_USUAL = (1e-2, 1e3)
+#: The unit that a time is probably in and the one it is taken for, by the power of ten between.
+_UNITS = {3: ("s", "ms"), 6: ("s", "us"), 9: ("s", "ns"),
+          -3: ("ms", "s"), -6: ("us", "s"), -9: ("ns", "s")}  # fmt: skip
+
+
+def refuse_other_time(records: Sequence[Record]) -> None:
+    """Raise InputError where a stack would move faster than sound lets it, or never but creep."""
+    said = _faster(records, FASTEST)
+    if said:
+        raise InputError(said)
+    fastest = max((_paces(r)[1] for r in records if np.ptp(r.voltage) > 0.0), default=1.0)
+    if fastest < 1.0 / SLOWEST:
+        raise InputError(
+            f"The voltage takes {1.0 / fastest:.2g} s for its range where it is fastest; what takes"
+            f" more than {SLOWEST:.0f} s counts as held. {_advice(fastest, (-3, -6, -9))}"
+        )
+
+
+def doubtful_time(records: Sequence[Record]) -> str:
+    """Say that samples are further apart, or closer together, than records of stacks have them.
+
+    Or that the stack moves faster than in nearly all tests.
+    """
+    low, high = _SAMPLE_TIMES
+    step = next((r.sample_time for r in records if not low <= r.sample_time <= high), None)
+    if step is None:
+        return _faster(records, _FAST)
+    unit = "ms" if step > high else "s"
+    return (
+        f"Samples are {step:.2g} s apart: the unit of time is probably another; correct it in the"
+        f" header, or say which it is (--columns time=NAME:{unit})."
+    )
+
+
+def _faster(records: Sequence[Record], limit: float) -> str:
+    """Say that a stack which follows the voltage of a record would be faster than a limit [m/s]."""
+    for record in records:
+        if np.ptp(record.voltage) == 0.0:
+            continue
+        pace, _ = _paces(record)
+        speed = pace * _stroke(record)
+        if speed > limit:
+            bound = "none can at more than" if limit == FASTEST else "few tests are above"
+            return (
+                f"Record '{record.name}': in {record.duration:.2g} s the voltage goes"
+                f" {pace * record.duration:.2g} times through its range; a stack that follows"
+                f" would move at {speed:.2g} m/s, and {bound} {limit:g} m/s."
+                f" {_advice(pace, (3, 6, 9))}"
+            )
+    return ""
+
+
+def _stroke(record: Record) -> float:
+    if record.displacement_unit == "counts":
+        return _CHIP * float(np.ptp(record.voltage))
+    y = measured(record)[record.mask]
+    return min(float(np.ptp(y)), _STROKE) if y.size else 0.0
+
+
+def _paces(record: Record) -> tuple[float, float]:
+    """Return how often in a second the voltage goes through its range: on average, at most."""
+    v, t = record.voltage, record.time
+    span = float(np.ptp(v))
+    ends = np.unique(np.r_[0, reversals(v, 0.1 * span), record.n - 1])
+    ways, times = np.abs(np.diff(v[ends])) / span, np.diff(t[ends])
+    return float(np.sum(ways) / np.sum(times)), float(np.max(ways / times))
+
+
+def _advice(pace: float, powers: Sequence[int]) -> str:
+    """Return which unit of time, so many powers of ten from the given, makes a pace usual."""
+    low, high = _USUAL
+    power = next((p for p in powers if low <= pace / 10.0**p <= high), powers[-1])
+    right, wrong = _UNITS[power]
+    return (
+        f"The time is probably in {right}, not {wrong} (or in units as far apart): correct the"
+        f" header, or give --columns time=NAME:{right}."
+    )
+
+
+#: Correlation with the voltage from which on a column holds what is correlated.
+_FOLLOWS = 0.95
+#: A step over the range, between two samples, that is a wrap, and by how much wraps may differ.
+_STEP, _ALIKE = 0.5, 0.2
+#: Shares of the readings below whose voltage the sign is turned.
+_TURNS = np.arange(0.02, 0.99, 0.02)
+#: Fewest wraps.
+_WRAPS = 2
+
+_WRAPPED = (
+    "Record '{}': the displacement jumps {} times by {:.4g} {}, up or down, and follows the voltage"
+    " without these jumps: the sensor, or its counter, begins again at the end of its range. Add"
+    " the jumps up (numpy.unwrap with period={:.4g}), or record with a larger range."
+)
+_OTHER = (
+    "Record '{}': the {} the displacement follows the voltage (correlation {:.3f}), the"
+    " displacement itself does not ({:.3f}): the column may hold {} it."
+)
+_TURNED = (
+    "Record '{}': with its sign turned below {:.4g} V the displacement follows the voltage"
+    " (correlation {:.3f}), as it is it does not ({:.3f}): it may be rectified."
+)
+
+
+def refuse_wrapped(records: Sequence[Record]) -> None:
+    """Raise InputError where a displacement begins again at the end of the sensor's range."""
+    problems = [s for r in records if (s := _wrapped(r))]
+    if problems:
+        raise InputError(problems)
+
+
+def _wrapped(record: Record) -> str:
+    """Say that all large steps of a displacement are alike, and that it is right without them."""
+    y, v = _readings(record)
+    steps = np.diff(y)
+    large = np.abs(steps) > _STEP * np.ptp(y)
+    if np.count_nonzero(large) < _WRAPS:
+        return ""
+    period = float(np.median(np.abs(steps[large])))
+    if np.any(np.abs(np.abs(steps[large]) - period) > _ALIKE * period):
+        return ""
+    turns = np.r_[0, np.cumsum(np.where(large, -np.sign(steps), 0.0))].astype(int)
+    if y.size - np.max(np.unique(turns, return_counts=True)[1]) < FEWEST_SAMPLES:  # a stray reading
+        return ""
+    added = period * turns
+    if abs(_correlation(y + added, v)) < _FOLLOWS or abs(_correlation(y, v)) > _FOLLOWS:
+        return ""
+    scale, unit = (1e6, "um") if record.displacement_unit == "m" else (1.0, "counts")
+    count = int(np.count_nonzero(large))
+    return _WRAPPED.format(record.name, count, scale * period, unit, scale * period)
+
+
+def doubtful_quantity(records: Sequence[Record]) -> str:
+    """Say that a rate, an integral, or the sign turned below a voltage follows it better; else "".
+
+    A stack behind a lag that is long beside the voltage's changes looks so too. Nothing is said of
+    a record of which less than half is read: what it shows may follow the rate by itself.
+    """
+    return next((s for r in records if (s := _rate_or_integral(r) or _rectified(r))), "")
+
+
+def _rate_or_integral(record: Record) -> str:
+    y, v = _readings(record)
+    if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
+        return ""
+    step = np.diff(record.time[record.mask])
+    rate = _correlation(np.diff(y) / step, 0.5 * (v[1:] + v[:-1]))
+    if abs(rate) > _FOLLOWS:
+        return _OTHER.format(record.name, "rate of", rate, own, "an integral of")
+    line = np.column_stack([np.ones(step.size), np.cumsum(step)])
+    both = np.column_stack([np.cumsum(0.5 * (y[1:] + y[:-1]) * step), v[1:]])
+    summed, moved = (both - line @ np.linalg.lstsq(line, both, rcond=None)[0]).T
+    integral = _correlation(summed, moved)
+    if abs(integral) > _FOLLOWS:
+        return _OTHER.format(record.name, "integral of", integral, own, "the rate of")
+    return ""
+
+
+def _rectified(record: Record) -> str:
+    """Say that a displacement follows the voltage where its sign is turned below one voltage."""
+    y, v = _readings(record)
+    if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
+        return ""
+    turned = [(abs(_correlation(np.where(v < u, -y, y), v)), u) for u in np.quantile(v, _TURNS)]
+    found, at = max(turned)
+    return _TURNED.format(record.name, at, found, own) if found > _FOLLOWS else ""
+
+
+def _readings(record: Record) -> tuple[FloatArray, FloatArray]:
+    mask: NDArray[np.bool_] = record.mask
+    return measured(record)[mask], record.voltage[mask]
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    a, b = a - np.mean(a), b - np.mean(b)
+    power = float(a @ a) * float(b @ b)
+    return float(a @ b) / power**0.5 if power > 0.0 else 0.0
+
 
 #: Displacement per volt [m/V] of stacks, from a chip of 2 um at 120 V to a lever of 1 mm at 100 V,
 #: with a margin of ten.

@@ -1,19 +1,42 @@
-"""The exact response of eqs. (13), (15) with a drive in front, to voltages linear between samples.
+"""Exact responses of linear models: the stack's, poles by vector fitting, modes of a residual.
+
+The exact response of eqs. (13), (15) with a drive in front, to voltages linear between samples.
 
     X/U = (b s + 1) / ((T s + 1) (tau s + 1) (q_P s^2 + a_P s + 1) (q_B s^2 + a_B s + 1))
 
 T = R_s C_p, a = c/k [s] and q = m/k [s^2] of wafers (P) and bonding layers (B), r = k_P/k_B and
 b = (c_P + c_B)/(k_P + k_B) = (r a_P + a_B)/(r + 1). The gain at rest is 1. The poles need not be
 apart: those closer than `_APART` are moved apart, far less than a starting value needs.
+
+Poles of a response by vector fitting in time, without starting values.
+
+With trial poles p_i and (x)_i the response of 1/(s - p_i) to x, least squares finds c, d of
+
+    y + sum_i d_i (y)_i = constant + sum_i c_i (w)_i ;
+
+the zeros of 1 + sum_i d_i/(s - p_i) are the next poles. First poles are real, spread evenly over
+the decades that the record can show. Sources: Gustavsen and Semlyen, IEEE Trans. Power Delivery 14
+(1999), 1052; Grivet-Talocia, IEEE Microwave and Wireless Components Letters 13 (2003), 472 (in
+time). The realisation algorithms of python-control (`eigensys_realization`) need an impulse
+response on uniform samples: differences of a step response, which amplify its noise.
+
+Modes that a residual shows: frequencies, dampings and residues, one by one, then all again.
+
+What drives them is known, so that the response of a candidate is an exact filter. The residues are
+linear and drop out; only the poles are sought (variable projection: Golub and Pereyra, Inverse
+Problems 19 (2003) R1).
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from math import exp, log, sqrt
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
+
 ComplexArray = npt.NDArray[np.complex128]
 
 #: Least relative distance of two poles.
@@ -172,3 +195,224 @@ def _apart(poles: ComplexArray) -> ComplexArray:
     for k in range(1, len(real)):
         real[k] = max(real[k], real[k - 1] + _APART)
     return np.array([*own, *(-exp(place) for place in real)], dtype=np.complex128)
+
+
+_ROUNDS = 10
+#: Least damping ratio of a pole, and the share of its mirror image that an unstable pole keeps.
+_LEAST_DAMPING = 1e-3
+_DECADES_BEYOND = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Samples h [s] apart: input w (n,), output y (n,), both 0 before, `valid` (n,), noise sigma.
+
+    Where `valid` is False, y holds a stand-in for the missing sample.
+    """
+
+    h: float
+    w: FloatArray
+    y: FloatArray
+    valid: npt.NDArray[np.bool_]
+    sigma: float
+
+
+def vector_fit(responses: Sequence[Response], order: int) -> ComplexArray:
+    """Return `order` poles [rad/s] in the left half plane that the responses share."""
+    fastest = 2.0 * min(r.h for r in responses)
+    slowest = max(r.h * r.y.size for r in responses) / 5.0
+    spread = (np.arange(order) + 0.5) / order
+    poles: ComplexArray = np.array(-1.0 / (fastest * (slowest / fastest) ** spread), dtype=complex)
+    for _ in range(_ROUNDS):
+        poles = _settled(_relocated(responses, poles), fastest, slowest)
+    return poles
+
+
+def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatArray:
+    """Return the largest root mean square of every pole's own part of a response, over its noise.
+
+    Shape (order,); the two poles of a pair share one figure.
+    """
+    found = np.zeros(poles.size)
+    for r in responses:
+        columns = _columns(poles, r.w, r.h)
+        matrix = np.column_stack([columns, np.ones(r.y.size)])[r.valid]
+        q, transform = orthonormal(matrix)
+        weights = transform @ (q.T @ r.y[r.valid])
+        for i, k in _places(poles):
+            width = 2 if poles[i].imag else 1
+            part = columns[:, k : k + width] @ weights[k : k + width]
+            found[i : i + width] = np.maximum(found[i : i + width], np.std(part) / r.sigma)
+    return found
+
+
+def _relocated(responses: Sequence[Response], poles: ComplexArray) -> ComplexArray:
+    """Return the zeros of the denominator that the trial poles give."""
+    rows, targets = [], []
+    for index, r in enumerate(responses):
+        one = np.zeros((r.y.size, len(responses)))
+        one[:, index] = 1.0
+        y = -_columns(poles, r.y, r.h)
+        rows.append(np.hstack([_columns(poles, r.w, r.h), one, y])[r.valid] / r.sigma)
+        targets.append(r.y[r.valid] / r.sigma)
+    q, transform = orthonormal(np.vstack(rows))
+    d = (transform @ (q.T @ np.concatenate(targets)))[-poles.size :]
+    state, drive, sense = np.zeros((poles.size, poles.size)), np.zeros(poles.size), d.copy()
+    for i, k in _places(poles):
+        p, size = poles[i], abs(poles[i])
+        if p.imag:
+            state[k : k + 2, k : k + 2] = [[p.real, p.imag], [-p.imag, p.real]]
+            drive[k], sense[k : k + 2] = 2.0, size * d[k : k + 2] / 2.0 * np.array([1.0, -1.0])
+        else:
+            state[k, k], drive[k], sense[k] = p.real, 1.0, size * d[k]
+    return np.linalg.eigvals(state - np.outer(drive, sense)).astype(np.complex128)
+
+
+def _settled(poles: ComplexArray, fastest: float, slowest: float) -> ComplexArray:
+    """Return the poles stable, damped, within reach of the records; pairs next to each other."""
+    kept: list[complex] = []
+    for p in poles[poles.imag >= 0]:
+        size = min(max(abs(p), 1.0 / (_DECADES_BEYOND * slowest)), _DECADES_BEYOND / fastest)
+        damping = max(abs(p.real) / max(abs(p), 1e-300), _LEAST_DAMPING)
+        if p.imag:
+            upper = size * complex(-damping, np.sqrt(max(1.0 - damping**2, 0.0)))
+            kept += [upper, upper.conjugate()]
+        else:
+            kept.append(complex(-size))
+    return np.array(kept, dtype=np.complex128)
+
+
+def _places(poles: ComplexArray) -> list[tuple[int, int]]:
+    """Return (index of the pole, first of its real columns) for real poles and upper ones."""
+    return [(i, i) for i, p in enumerate(poles) if p.imag >= 0]
+
+
+def _columns(poles: ComplexArray, x: FloatArray, h: float) -> FloatArray:
+    """Return the responses of |p|/(s - p) to x, shape (n, order); real and imaginary for a pair."""
+    columns: list[FloatArray] = []
+    for p in poles:
+        if p.imag >= 0:
+            residues = (0.5, -0.5j) if p.imag else (1.0,)
+            columns += [mode(complex(p), abs(p) * r, x, h) for r in residues]
+    return np.column_stack(columns)
+
+
+#: Frequencies and damping ratios among which the next mode is looked for: the highest frequency
+#: over the sampling rate, and the lowest as periods in the longest record.
+_FREQUENCIES, _DAMPINGS = 160, (0.004, 0.015, 0.06)
+_HIGHEST, _PERIODS = 0.45, 8.0
+#: What rings has a damping ratio below this one.
+MOST_DAMPED, _LEAST_DAMPED = 0.2, 1e-3
+#: Evaluations over all poles after each new mode.
+_EVALUATIONS = 6
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode: frequency [Hz], damping ratio, share of the drive in phase with it and ahead."""
+
+    frequency: float
+    damping: float
+    share: float
+    ahead: float
+
+
+@dataclass(frozen=True, eq=False)
+class Shaken:
+    """A record's drive and residual (n,) [m], the samples that count, the sample time [s]."""
+
+    drive: FloatArray
+    residual: FloatArray
+    used: npt.NDArray[np.bool_]
+    sample_time: float
+
+
+def modes_of(
+    records: Sequence[Shaken], free: FloatArray, *, most: int, better: float
+) -> list[Mode]:
+    """Return modes while each brings the rms of the residual to a share `better` at most.
+
+    `free` (samples that count, k) are directions of the residual that are free to follow.
+    """
+    search = _Search(records, free)
+    poles: FloatArray = np.zeros((0, 2))
+    left = search.target
+    while len(poles) < most:
+        trial = search.refined(np.vstack([poles, search.next(left)]))
+        rest = search.left(trial)
+        if np.linalg.norm(rest) > better * np.linalg.norm(left):
+            break
+        poles, left = trial, rest
+    return search.modes(poles)
+
+
+class _Search:
+    """The residual without what is free, and the responses of modes; poles are ln (f, zeta)."""
+
+    def __init__(self, records: Sequence[Shaken], free: FloatArray) -> None:
+        self.records = records
+        self.basis, _ = orthonormal(free)
+        self.target = self._without(np.concatenate([r.residual[r.used] for r in records]))
+        lowest = _PERIODS / max(r.sample_time * r.drive.size for r in records)
+        highest = _HIGHEST / min(r.sample_time for r in records)
+        grid = np.log(np.geomspace(min(lowest, 0.1 * highest), highest, _FREQUENCIES))
+        self.grid = [np.array([f, np.log(z)]) for f in grid for z in _DAMPINGS]
+        self.low = np.array([grid[0] - 1.0, np.log(_LEAST_DAMPED)])
+        self.high = np.array([grid[-1] + 0.1, np.log(MOST_DAMPED)])
+
+    def next(self, left: FloatArray) -> FloatArray:
+        """Return the pole of the grid whose mode takes most from what is left."""
+        return max(self.grid, key=lambda pole: self._taken(pole, left))
+
+    def left(self, poles: FloatArray) -> FloatArray:
+        """Return what the modes leave of the residual, with the best residues."""
+        q, _ = orthonormal(self._columns(poles))
+        rest: FloatArray = self.target - q @ (q.T @ self.target)
+        return rest
+
+    def refined(self, poles: FloatArray) -> FloatArray:
+        """Return all poles moved to where their modes leave less."""
+        count, size = len(poles), float(np.linalg.norm(self.target))
+        low, high = np.tile(self.low, count), np.tile(self.high, count)
+
+        def rest(p: FloatArray) -> FloatArray:
+            return self.left(p.reshape(-1, 2)) / size
+
+        found = scipy.optimize.least_squares(
+            rest,
+            np.clip(poles.ravel(), low + 1e-6, high - 1e-6),
+            bounds=(low, high),
+            x_scale=np.tile([0.01, 0.3], count),
+            max_nfev=_EVALUATIONS,
+        )
+        moved: FloatArray = found.x.reshape(-1, 2)
+        return moved
+
+    def modes(self, poles: FloatArray) -> list[Mode]:
+        """Return the modes with their residues."""
+        if not len(poles):
+            return []
+        gains = np.linalg.lstsq(self._columns(poles), self.target, rcond=None)[0].reshape(-1, 2)
+        return [Mode(*np.exp(p), *g) for p, g in zip(poles, gains, strict=True)]
+
+    def _taken(self, pole: FloatArray, left: FloatArray) -> float:
+        q, _ = orthonormal(self._columns(pole[None]))
+        return float(np.sum((q.T @ left) ** 2))
+
+    def _columns(self, poles: FloatArray) -> FloatArray:
+        return self._without(np.hstack([self._response(*np.exp(p)) for p in poles]))
+
+    def _without(self, x: FloatArray) -> FloatArray:
+        projected: FloatArray = x - self.basis @ (self.basis.T @ x)
+        return projected
+
+    def _response(self, frequency: float, damping: float) -> FloatArray:
+        """Return q and q'/w of a mode, q'' + 2 zeta w q' + w^2 q = w^2 drive, from rest (n, 2)."""
+        omega = 2.0 * np.pi * frequency
+        turn = np.sqrt(1.0 - damping**2)
+        pole = omega * complex(-damping, turn)
+        rows = []
+        for r in self.records:
+            y = one_pole(pole, r.drive - r.drive[0], r.sample_time) * omega / turn
+            rows.append(np.column_stack([y.imag, (pole * y).imag / omega])[r.used])
+        return np.vstack(rows)

@@ -1,15 +1,362 @@
-"""The points from which a search starts: shapes of loop, and dynamics that the records show."""
+"""Starting points of a search: dynamics and loops that the records show, ordinary shapes.
+
+Starting values of the linear part, from the records alone.
+
+1. Excerpts in which a static loop misses something (`excerpts`): steps, broadband, fast loops.
+2. Their poles by vector fitting, for one to five poles (`vector_fitting`).
+3. Poles on drive, lag, wafers and bonding layers in the few ways that make sense; poles that no
+   record shows lie below those that it shows.
+4. Every such start refined by least squares with the exact response (`linear_fit`), the best ones
+   to the end, and k_P/k_B as well where that explains more.
+
+Starting values of the hysteresis: the paper's formulas (26) to (35) in integrated form.
+
+The paper reads A and delta at the crossings of h and n, beta, gamma from logarithms of velocities.
+Noise spoils velocities, and h must cross zero. Integrated over time, eq. (26) needs neither:
+
+    x - x_0 = s (u - u_0) - beta I_1 - gamma I_2 + delta I_3,    s = k + A,
+    I_1 = int |h|^(n-1) h |du|,  I_2 = int |h|^n du,  I_3 = int u sgn(u') dt,
+
+with h = h_0 + (x - x_0) - k (u - u_0) from the measured x, so that s, beta, gamma and delta follow
+by linear least squares at given k, n and h_0. Those are searched (variable projection).
+"""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import log
 
 import numpy as np
+import scipy
 
+from psa_casadi.components import BASE
+from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.linear import LinearCandidate
-from psa_casadi.identification.start.loop import loop_start
+from psa_casadi.identification.start.doubts import static_slope
+from psa_casadi.identification.start.linear_fit import (
+    COORDINATES,
+    Excerpt,
+    LinearFit,
+    cost_of,
+    excerpts,
+    fit_linear,
+)
+from psa_casadi.identification.start.linear_response import (
+    ComplexArray,
+    Response,
+    contributions,
+    vector_fit,
+)
 from psa_casadi.identification.start.ordinary import has_loop, loop_starts
 from psa_casadi.model.compose import Model
+from psa_casadi.records.drive import turns
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
+from psa_casadi.units import FloatArray
+
+#: Number of candidates at most, and of poles that vector fitting looks for.
+CANDIDATES, ORDERS = 4, (1, 2, 3, 4, 5)
+#: Excerpts whose poles are sought.
+_SOURCES = 3
+#: Rounds of the search: how many of the best starts go on, for how many evaluations; the last one.
+_ROUNDS, _FULL = ((16, 3), (8, 6)), 20
+#: Largest difference, in natural logarithms, of starts that are the same.
+_ALIKE = 0.1
+#: Dynamics show when the variance that they leave is less than this of what a static loop leaves,
+#: and that is more than this of the noise.
+_GAIN, _VISIBLE = 0.5, 0.1
+#: Least residual, over the range, by which an excerpt is weighted.
+_FLOOR = 5e-4
+#: How much more a residual that is not white counts than a white one.
+_MISSED = 10.0
+
+
+@dataclass(frozen=True)
+class LinearCandidate:
+    """Starting values by parameter name, how far they miss, and what is told.
+
+    `misfit` is the root mean square of what the fast records leave over, as a share of their
+    range; `told` names the parameters that they determine within a factor of e^(1/2).
+    """
+
+    values: Mapping[str, float]
+    misfit: float
+    told: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LinearStart:
+    """Candidates, the best first; the records they come from; the misfit without any dynamics."""
+
+    candidates: tuple[LinearCandidate, ...]
+    records: tuple[str, ...]
+    static_misfit: float
+
+
+def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> LinearStart | None:
+    """Return starting values of tau, R_s, c_P, m_P, c_B, m_B, and of k_P where its share is told.
+
+    `values` gives C_p [F], k_P and k_B [N/m], which voltage and displacement do not determine.
+    None where the records show no dynamics: loops that a static loop explains.
+    """
+    parts = excerpts(records)
+    if not parts:
+        return None
+    starts = _starts(parts, log(values["k_P"] / values["k_B"]))
+    starts = sorted(starts, key=lambda theta: cost_of(parts, theta))
+    best: Sequence[LinearFit] = ()
+    for count, evaluations in _ROUNDS:
+        fits = [
+            fit_linear(parts, s, ratio_free=False, evaluations=evaluations) for s in starts[:count]
+        ]
+        best = different(sorted(fits, key=lambda f: f.cost))
+        starts = [f.theta for f in best]
+        parts = _reweighted(parts, best[0])
+    best = best[:CANDIDATES]
+    fits = [_refined(parts, f) for f in best]
+    fits = different(sorted(fits, key=lambda f: f.cost))
+    kept = [f for f in fits if _explains(parts, f)]
+    if not kept:
+        return None
+    return LinearStart(
+        candidates=tuple(_candidate(f, values, _share(parts, f.left)) for f in kept),
+        records=tuple(e.name for e in parts),
+        static_misfit=_share(parts, [e.static for e in parts]),
+    )
+
+
+def _reweighted(parts: Sequence[Excerpt], fit: LinearFit) -> list[Excerpt]:
+    """Return the excerpts with the noise that a fit leaves.
+
+    The rest of the residual, which the model misses and which is not white, counts many times.
+    """
+    found = []
+    for e, left, white in zip(parts, fit.left, fit.white, strict=True):
+        missed = _MISSED * np.sqrt(max(left**2 - white**2, 0.0))
+        found.append(replace(e, sigma=float(max(np.hypot(white, missed), _FLOOR * e.range))))
+    return found
+
+
+def _explains(parts: Sequence[Excerpt], fit: LinearFit) -> bool:
+    """Whether dynamics leave clearly less than a static loop does, white noise aside."""
+    noise = _share(parts, fit.white) ** 2
+    left = _share(parts, fit.left) ** 2 - noise
+    static = _share(parts, [e.static for e in parts]) ** 2 - noise
+    return left < _GAIN * static and static > _VISIBLE * noise
+
+
+def _share(parts: Sequence[Excerpt], left: Sequence[float]) -> float:
+    """Return the root mean square of what is left over the ranges."""
+    return float(np.sqrt(np.mean([(r / e.range) ** 2 for e, r in zip(parts, left, strict=True)])))
+
+
+def _refined(parts: Sequence[Excerpt], fit: LinearFit) -> LinearFit:
+    """Return the fit continued, with k_P/k_B free where that lowers the cost clearly."""
+    fixed = fit_linear(parts, fit.theta, ratio_free=False, evaluations=_FULL)
+    free = fit_linear(parts, fixed.theta, ratio_free=True, evaluations=_FULL)
+    samples = sum(int(e.valid.sum()) for e in parts)
+    level = max(1.0, free.cost / samples)
+    told = free.errors[-1] < 0.5 and fixed.cost - free.cost > level * log(samples)
+    return free if told else fixed
+
+
+def different(fits: Sequence[LinearFit]) -> list[LinearFit]:
+    """Return the fits, best first, without those that repeat a better one within 10 %."""
+    kept: list[LinearFit] = []
+    for f in fits:
+        if all(np.max(np.abs(f.theta - k.theta)) > _ALIKE for k in kept):
+            kept.append(f)
+    return kept
+
+
+def _candidate(fit: LinearFit, values: Mapping[str, float], misfit: float) -> LinearCandidate:
+    size = dict(zip(COORDINATES, np.exp(fit.theta).tolist(), strict=True))
+    k_B = values["k_B"]
+    k_P = values["k_P"] if np.isnan(fit.errors[-1]) else size["r"] * k_B
+    found = {
+        "tau": size["tau"],
+        "R_s": size["T"] / values["C_p"],
+        "c_P": size["a_P"] * k_P,
+        "m_P": size["q_P"] * k_P,
+        "c_B": size["a_B"] * k_B,
+        "m_B": size["q_B"] * k_B,
+        "k_P": k_P,
+    }
+    names = dict(zip(COORDINATES, ("R_s", "tau", "c_P", "m_P", "c_B", "m_B", "k_P"), strict=True))
+    if np.isnan(fit.errors[-1]):
+        del found["k_P"]
+    bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
+    return LinearCandidate(
+        values={n: float(np.clip(v, *bounds[n])) for n, v in found.items()},
+        misfit=misfit,
+        told=tuple(names[c] for c, e in zip(COORDINATES, fit.errors, strict=True) if e < 0.5),
+    )
+
+
+def _starts(parts: Sequence[Excerpt], ratio: float) -> list[FloatArray]:
+    """Return theta (7,) for every way to place the poles of every order, of every excerpt."""
+    found: list[FloatArray] = []
+    for e in parts[:_SOURCES]:
+        for source in (_scaled(e), e.loop):
+            response = [Response(e.h, source, e.y, e.valid, e.sigma)]
+            for order in ORDERS:
+                poles = vector_fit(response, order)
+                share = contributions(response, poles)
+                for least in {min(1.0, share.max()), share.max()}:
+                    for placed in arrangements(poles[share >= 0.2 * least], e.h):
+                        theta = np.append(placed, ratio)
+                        if all(np.max(np.abs(theta - f)) > _ALIKE for f in found):
+                            found.append(theta)
+    return found
+
+
+def _scaled(e: Excerpt) -> FloatArray:
+    """Return the voltage in metres: times the slope of displacement on voltage."""
+    v = e.v[e.valid] - np.mean(e.v[e.valid])
+    return e.v * float(v @ (e.y[e.valid] - np.mean(e.y[e.valid])) / (v @ v))
+
+
+def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
+    """Return ln (T, tau, a_P, q_P, a_B, q_B) for the ways to place poles [rad/s]; see module.
+
+    Oscillations belong to wafers and bonding layers, the slowest real pole to the creep lag or
+    the drive, others to the drive or an overdamped pair. What is left open lies at 0.3 of the
+    shortest time found, not below a quarter of the sampling interval.
+    """
+    times = sorted((1.0 / abs(p) for p in poles if not p.imag), reverse=True)
+    tones = sorted((p for p in poles if p.imag > 0), key=abs)
+    fast = max(0.3 * min([1.0 / abs(p) for p in poles]), 0.25 * interval)
+    pairs = [(-2.0 * p.real / abs(p) ** 2, 1.0 / abs(p) ** 2) for p in tones[:2]]
+    found = []
+    for lags in (2, 1) if len(times) > 1 else (2,):
+        own = [*times, fast, fast][:lags] + [0.5 * fast] * (2 - lags)
+        left = times[lags:]
+        both = list(pairs)
+        while len(both) < 2:
+            one, two = [*left, fast, 0.7 * fast][:2]
+            left = left[2:]
+            both.append((one + two, one * two))
+        for tau, drive in {(own[0], own[1]), (own[1], own[0])}:
+            for b, p in {(both[0], both[1]), (both[1], both[0])}:
+                found.append(np.log([drive, tau, *p, *b]))
+    return found
+
+
+#: Loops that take part, samples of each, and how much faster than the slowest they may be.
+_LOOPS, _SAMPLES, _FASTER = 4, 2000, 5.0
+#: Ranges of n, and of k over the slope of displacement on voltage.
+_N, _K = (1.0, 3.0), (0.5, 3.5)
+#: k over the slope, and n, from which the search starts.
+_STARTS = ((1.1, 1.2), (1.6, 1.2), (2.5, 1.05))
+#: How many standard deviations h_0 may be off: the noise at rest, an ordinary hysteresis elsewhere.
+_DOUBT = 4.0
+#: Least noise over the range: what formulas without lags miss.
+_FLOOR_loop = 1e-3
+#: A sample's voltage counts as held where it moves less than this share of the mean step.
+_HELD = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """Displacement x [m], voltage u [V], both (n,) from the first sample, and what is fixed."""
+
+    x: FloatArray
+    u: FloatArray
+    steps: FloatArray
+    skew: FloatArray
+    rests: bool
+
+
+def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | None:
+    """Return k_L, A, beta, gamma [N/V], delta [N/(V.s)] and n of the slowest loops, or None.
+
+    Forces follow from the model's stiffnesses by eq. (14), beta and gamma belong to its h_ref.
+    None where no record's voltage turns, or nothing moves. Only where a search begins depends on
+    these values, so they may come from all samples, held-out ones too.
+    """
+    loops = [_loop(r) for r in _slowest(records)]
+    slope = abs(static_slope(records))
+    level = max((float(np.ptp(loop.x)) for loop in loops), default=0.0)
+    if level == 0.0 or slope == 0.0:
+        return None
+    compliance = static_compliance(model.values)
+    size = compliance * model.values["h_ref"]
+    noise = max(_FLOOR_loop * level, *(high_frequency_noise(loop.x) for loop in loops))
+    doubt = np.array([noise if loop.rests else size for loop in loops])
+
+    def parts(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return _eliminated(loops, theta[0] * slope, theta[1], theta[2:] * doubt, size)
+
+    def weighted(theta: FloatArray) -> FloatArray:
+        return np.concatenate([parts(theta)[1] / noise, theta[2:]])
+
+    low = np.array([_K[0], _N[0], *[-_DOUBT] * len(loops)])
+    high = np.array([_K[1], _N[1], *[_DOUBT] * len(loops)])
+    none = [0.0] * len(loops)
+    found = [
+        scipy.optimize.least_squares(weighted, [*start, *none], bounds=(low, high), max_nfev=30)
+        for start in _STARTS
+    ]
+    best = min(found, key=lambda f: float(f.cost)).x
+    s, beta, gamma, delta = parts(best)[0]
+    k = best[0] * slope
+    values = {"k_L": k, "A": s - k, "beta": beta, "gamma": gamma, "delta": delta}
+    forces = {n: float(v) / compliance for n, v in values.items()} | {"n": float(best[1])}
+    return {n: float(np.clip(v, *model.parameter(n).bounds)) for n, v in forces.items()}
+
+
+def _eliminated(
+    loops: Sequence[_Loop], k: float, n: float, starts: FloatArray, size: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return s, beta, gamma, delta [m/V, m/(V.s)] and the residual [m] of all loops, stacked."""
+    blocks, targets = [], []
+    for loop, start in zip(loops, starts, strict=True):
+        ratio = (start + loop.x - k * loop.u) / size
+        middle = 0.5 * (ratio[1:] + ratio[:-1])
+        bend = np.abs(middle) ** n
+        turning = np.sign(middle) * bend * np.abs(loop.steps)
+        columns = [loop.u, -_integral(turning), -_integral(bend * loop.steps), _integral(loop.skew)]
+        blocks.append(np.column_stack([c - np.mean(c) for c in columns]))
+        targets.append(loop.x - np.mean(loop.x))
+    matrix, target = np.vstack(blocks), np.concatenate(targets)
+    scale = np.linalg.norm(matrix, axis=0)
+    scale[scale == 0.0] = 1.0
+    weights = np.linalg.lstsq(matrix / scale, target, rcond=1e-6)[0] / scale
+    return weights, target - matrix @ weights
+
+
+def _integral(steps: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _slowest(records: Sequence[Record]) -> list[Record]:
+    """Return the records whose voltage turns, the slowest and those that are not much faster."""
+    turning = [r for r in records if r.mask.sum() > 20 and turns(r.voltage)]
+    turning.sort(key=_rate)
+    return [r for r in turning if _rate(r) <= _FASTER * _rate(turning[0])][:_LOOPS]
+
+
+def _rate(record: Record) -> float:
+    """Mean speed of the voltage [1/s], over its range."""
+    travelled = float(np.sum(np.abs(np.diff(record.voltage))))
+    return travelled / float(np.ptp(record.voltage)) / record.duration
+
+
+def _loop(record: Record) -> _Loop:
+    """Return a record, averaged in blocks where it has many samples; at rest if it begins so."""
+    valid = record.mask
+    y = np.interp(record.time, record.time[valid], measured(record)[valid])
+    every = -(-record.n // _SAMPLES)
+    blocks = record.n // every
+    t, u, x = (
+        np.mean(values[: blocks * every].reshape(blocks, every), axis=1)
+        for values in (record.time, record.voltage, y)
+    )
+    steps = np.diff(u)
+    moving = np.abs(steps) > _HELD * float(np.mean(np.abs(steps)))
+    skew = 0.5 * (u[1:] + u[:-1]) * np.sign(steps) * moving * np.diff(t)
+    rests = abs(float(u[0])) < 1e-2 * float(np.ptp(u))
+    return _Loop(x - x[0], u - u[0], steps, skew, rests)
+
 
 #: Candidate dynamics that miss the fast records this much more than the best are not tried.
 _WORSE, _DYNAMICS = 1.2, 3

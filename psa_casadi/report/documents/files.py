@@ -19,9 +19,9 @@ from psa_casadi.diagnosis.result import (
     unnamed_causes,
 )
 from psa_casadi.export.check.check import CheckReport
-from psa_casadi.identification.certainty.profile import Profile
 from psa_casadi.identification.identify import Identification
-from psa_casadi.posterior.result import Figures, Posterior
+from psa_casadi.identification.profile import Profile
+from psa_casadi.posterior.sample import Figures, Posterior
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.fit_words import Degree, grade
 from psa_casadi.shown import Lined

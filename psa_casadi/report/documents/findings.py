@@ -18,8 +18,8 @@ from psa_casadi.population.finding import (
     Found,
     HeldOutErrors,
     NamedCause,
+    replayed,
 )
-from psa_casadi.population.replay import replayed
 from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
 from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.report.documents.files import DeviceFile, DiagnosisFile, IdentificationFile, damage

@@ -6,22 +6,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from psa_casadi.design.experiment.designs import Informative, Separated
-from psa_casadi.design.mechanism.loop import response_times
-from psa_casadi.design.mechanism.mechanism import (
-    MechanismDesign,
-    Mounting,
-    mounted_model,
-    root_locus,
-    step_response,
-)
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.inversion import InvertedInput
+from psa_casadi.design.experiment.experiment import Informative, Separated
+from psa_casadi.design.mechanism.loop import Mounting, response_times, step_response
+from psa_casadi.design.mechanism.mechanism import MechanismDesign, mounted_model, root_locus
+from psa_casadi.design.tracking.inversion import CorrectedInput, InvertedInput
 from psa_casadi.design.tracking.minimum_time import QuickMove
-from psa_casadi.design.tracking.targets import Target
+from psa_casadi.design.tracking.targets import AmplifierLimits, Response, Target, respond
 from psa_casadi.design.tracking.tracking import TrackedInput
-from psa_casadi.design.tracking.trial import CorrectedInput
-from psa_casadi.design.tracking.verification import Response, respond
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model

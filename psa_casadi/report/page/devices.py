@@ -6,9 +6,8 @@ from typing import Any
 
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
-from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import Finding
-from psa_casadi.population.population import Population
+from psa_casadi.population.population import Difference, Population, differences
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.plots.device_plots import (
     budget_plot,

@@ -15,8 +15,8 @@ from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.diagnosis.signature import Signature, signature
 from psa_casadi.files import atomic_write
-from psa_casadi.identification.certainty.profile import Profile, profile_sentences
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.profile import Profile
 from psa_casadi.model.compose import Model
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
@@ -43,6 +43,7 @@ from psa_casadi.report.plots.records import (
     time_plot,
     zoom_plot,
 )
+from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.report.words.fit_words import (
     Grade,
     determined,

@@ -5,11 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.population.difference import Difference
 from psa_casadi.population.finding import NORMAL_95, Finding, Trace
-from psa_casadi.population.mixed_regression import mixed_regression
-from psa_casadi.population.parameters import display_unit
-from psa_casadi.population.population import Population, Spread
+from psa_casadi.population.population import Difference, Population, Spread, display_unit
+from psa_casadi.population.statistics import mixed_regression
 from psa_casadi.report.plots.panel import BOUND_COLOUR, WEAK_COLOUR, Panel
 from psa_casadi.report.words.phrases import handy_scale, in_brackets, length_scale, plain
 from psa_casadi.report.words.series import (

@@ -19,8 +19,8 @@ from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
-from psa_casadi.posterior.result import HDI, Figures, Posterior
-from psa_casadi.posterior.tree import columns_of_records
+from psa_casadi.posterior.chains import columns_of_records
+from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.records.record import Record
 from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style

@@ -5,10 +5,9 @@ from typing import TypeGuard
 
 import numpy as np
 
-from psa_casadi.design.experiment.designs import ASKED, PLAYS, Informative, Separated
+from psa_casadi.design.experiment.experiment import ASKED, PLAYS, Informative, Separated
 from psa_casadi.design.mechanism.mechanism import MechanismDesign, Reached
-from psa_casadi.design.tracking.amplifier_limits import AmplifierLimits
-from psa_casadi.design.tracking.verification import Response, TrackingError, usage
+from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import (
     interval_text,

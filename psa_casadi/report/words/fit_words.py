@@ -2,13 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-from psa_casadi.identification.certainty.determinacy import DETERMINED_WIDTH
+from psa_casadi.identification.determinacy import DETERMINED_WIDTH
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import Scale, listing, number, percent
-from psa_casadi.report.words.series import ResidualFigures
+
+if TYPE_CHECKING:
+    from psa_casadi.report.words.series import ResidualFigures
 
 Degree = Literal["determined", "weak", "undetermined", "on its bound", "fixed"]
 DEGREES: tuple[Degree, ...] = get_args(Degree)
@@ -154,12 +156,12 @@ def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
     )
 
 
-def residual_sentence(f: ResidualFigures, model: str, time: Scale) -> str:
+def residual_sentence(f: "ResidualFigures", model: str, time: Scale) -> str:
     """Say whether the residual of a model is white and normal, with the figures behind it."""
     return f"{whiteness_sentence(f, model, time)} {_normality(f)}"
 
 
-def whiteness_sentence(f: ResidualFigures, model: str, time: Scale) -> str:
+def whiteness_sentence(f: "ResidualFigures", model: str, time: Scale) -> str:
     """Say whether the residual of a model is white, with the figures behind it."""
     share = f"{percent(f.outside)} of the lags lie outside the 95 % band"
     if f.outside <= _WHITE_SHARE and abs(f.neighbours) <= _WHITE_NEIGHBOURS:
@@ -171,7 +173,7 @@ def whiteness_sentence(f: ResidualFigures, model: str, time: Scale) -> str:
     )
 
 
-def _normality(f: ResidualFigures) -> str:
+def _normality(f: "ResidualFigures") -> str:
     figures = f"skewness {_signed(f.skewness)}, excess kurtosis {_signed(f.kurtosis)}"
     tail = f"{number(100.0 * f.beyond_three, 2)} % of the samples lie beyond three standard"
     tail += " deviations, 0.27 % in a normal distribution"

@@ -5,6 +5,7 @@ from string import Formatter
 from typing import Any
 
 from psa_casadi.notes import Note
+from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
 from psa_casadi.report.words.own_words import OWN_MODELS
 from psa_casadi.report.words.phrases import quantity, raised, with_unit
@@ -261,7 +262,12 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
 
 #: A code's sentence: a template with the values' names, or what makes it of the values.
 Sentence = str | Callable[..., str]
-SENTENCES: Mapping[str, Sentence] = {**DIAGNOSIS, **MISFIT, **OWN_MODELS}
+SENTENCES: Mapping[str, Sentence] = {
+    **DIAGNOSIS,
+    **IDENTIFICATION,
+    **MISFIT,
+    **OWN_MODELS,
+}
 
 
 class _Words(Formatter):

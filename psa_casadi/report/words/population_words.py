@@ -4,13 +4,18 @@ import math
 from collections.abc import Sequence
 
 from psa_casadi.diagnosis.held_out import Share
-from psa_casadi.population.difference import Difference, differences
 from psa_casadi.population.finding import NORMAL_95, BudgetShare, Finding
-from psa_casadi.population.groups import Batch
-from psa_casadi.population.mixed_regression import MixedFit
-from psa_casadi.population.outliers import FEWEST
-from psa_casadi.population.parameters import Estimates, display_unit
-from psa_casadi.population.population import Frequency, Outlier, Population, Spread
+from psa_casadi.population.population import (
+    Difference,
+    Estimates,
+    Frequency,
+    Outlier,
+    Population,
+    Spread,
+    differences,
+    display_unit,
+)
+from psa_casadi.population.statistics import FEWEST, Batch, MixedFit
 from psa_casadi.report.words.phrases import (
     Scale,
     either,

@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.identify import Identification
-from psa_casadi.identification.search.multistart import StartOutcome
+from psa_casadi.identification.search import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment

@@ -14,7 +14,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
-from psa_casadi.posterior.result import Posterior
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.notes import brief_text

@@ -1,0 +1,426 @@
+"""Rivals, and what a design maximises: their separation, or what is known of parameters.
+
+What a design maximises: its value for a voltage, and a function with the same gradient there.
+
+The value involves a re-fit or a covariance, whose derivative by the voltage would need second
+derivatives of the trajectories. At one voltage everything but the trajectories can be held: by the
+envelope theorem the derivative of a minimum is that of the function at the minimising point, and
+the derivative of a function of the information matrix is linear in that of the sensitivities.
+
+Models that a designed record shall tell apart or sharpen: values, unknowns, what is known.
+
+A rival's unknowns are coordinates delta around its values: its free parameters, and for the new
+record the initial states that no voltage tells, in nominal sizes, and the sensor's offset in um.
+What the records at hand say of the parameters is an information matrix, their own initial states
+and offsets eliminated: H = H_pp - H_pn H_nn^-1 H_np, with the weak priors of the fits.
+
+Separation of rivals: how far one rival's prediction stays from another that is fitted again.
+
+    T(a, b) = min over delta of |W (y_a(v) - y_b(v, delta))|^2 + delta^T H_b delta
+
+y_a is what rival a predicts for the voltage v, its effect a standard error weaker than fitted, y_b
+what rival b does at coordinates delta away from its fit (parameters, initial states, offset), W
+whitens the noise, and H_b is what the data at hand know of b: it may move only where they let it.
+If a is true, ln of the Bayes factor of a over b is expected to grow by T/2 with variance T. The
+value is the logarithm of the harmonic mean of all T(a, b). Sources: Atkinson and Fedorov,
+Biometrika 62 (1975), 57 (T-optimality); for Gaussian noise T/2 is the Kullback-Leibler distance
+(Lopez-Fidalgo, Tommasi and Trandafir 2007).
+
+Optimality for parameters: the covariance that a record and the data at hand would leave.
+
+    Phi = known + J^T W J,   C = (Phi^-1) of the chosen coordinates
+
+J (n, size) holds the exact derivatives of the predicted displacement by parameters, initial states
+and the offset; W whitens the noise. D minimises ln det C, A the trace, E the largest eigenvalue;
+each is told as minus the logarithm of a mean standard error, so that a difference d of two values
+means intervals narrower by the factor exp(d). Gradient: d phi(C) = -tr(Psi dPhi), with
+Psi = Phi^-1 E (d phi/d C) E^T Phi^-1 and E the choice of coordinates. Source: Fedorov and Leonov,
+Optimal Design for Nonlinear Response Models, 2013, chapters 2 and 10.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Literal, Protocol, get_args
+
+import numpy as np
+
+from psa_casadi.design.experiment.limits import Limits
+from psa_casadi.diagnosis.colour import Colour, colour_of
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.levenberg_marquardt import minimise
+from psa_casadi.identification.fitting.prediction import predict_record
+from psa_casadi.identification.fitting.unknowns import (
+    Unknowns,
+    memory_priors,
+    memory_sizes,
+    unknowns_of,
+)
+from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.start import memory_names
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A criterion at one voltage: its value, and a function of the voltage with its gradient."""
+
+    value: float
+    frozen: Callable[[Record], float]
+
+
+class Criterion(Protocol):
+    """What is maximised."""
+
+    def at(self, record: Record) -> Point:
+        """Return value and frozen function at a planned record; raises PsaError."""
+        ...
+
+
+#: Standard errors by which the cautious truth has less of its effect, and the most that it loses.
+_CAUTION, _LOSS = 1.0, 0.75
+#: How far other parameters may move with it, in natural logarithms.
+_FARTHEST = 1.0
+#: Tolerance of trajectories: far below what a step of the gradient changes.
+RTOL = 1e-6
+_OFFSET = 1e-6
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of the sensor: `rms` [m], and the `correlation` of neighbouring samples, 0 if white."""
+
+    rms: float
+    correlation: float = 0.0
+
+    def on_grid(self, limits: Limits, samples: int) -> Colour:
+        """Return the noise on a grid of fewer samples that tells as much about slow signals.
+
+        On every m-th sample the correlation is r^m, and the variance is such that the density at
+        frequency 0, s^2 (1 + r)/(1 - r), over the number of samples stays what it is.
+        """
+        r = self.correlation
+        m = limits.samples / samples
+        coarse = r**m
+        density = self.rms**2 * (1.0 + r) / (1.0 - r) / m
+        variance = density * (1.0 - coarse) / (1.0 + coarse)
+        colour = np.array([coarse] if coarse > 0.0 else [])
+        return Colour((colour,), float(np.sqrt(variance * (1.0 - coarse**2))), (samples,))
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A model with the coordinates `theta` (k,) of its free parameters and what is known of them.
+
+    `known` (k, k) is the information of the records at hand and the priors; `evidence` is ln of the
+    Bayes factor over the base that those records give. `less` (k,) is the way from `theta` to what
+    the rival is taken for where it is the truth.
+    """
+
+    name: str
+    model: Model
+    unknowns: Unknowns
+    theta: FloatArray
+    known: FloatArray
+    evidence: float = 0.0
+    less: FloatArray | None = None
+
+    @property
+    def truth(self) -> FloatArray:
+        """Return the coordinates (size,) at which it is the truth that a record shall show."""
+        own = np.zeros(len(self.theta)) if self.less is None else self.less
+        low, high = self.bounds()
+        return np.clip(np.append(own, np.zeros(self.size - len(own))), low, high)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates for a new record: parameters, initial states, offset."""
+        return len(self.theta) + len(memory_names(self.model.structure)) + 1
+
+    @property
+    def information(self) -> FloatArray:
+        """Return what is known of all coordinates, (size, size); nothing of the offset."""
+        count, states = len(self.theta), len(memory_names(self.model.structure))
+        full = np.zeros((self.size, self.size))
+        full[:count, :count] = self.known
+        where = np.arange(count, count + states)
+        full[where, where] = 1.0 / np.square(memory_priors(self.model))
+        return full
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return the lowest and highest delta (size,) that the parameters' bounds allow."""
+        count, rest = len(self.theta), np.full(self.size - len(self.theta), np.inf)
+        low, high = (edge[:count] - self.theta for edge in self.unknowns.bounds())
+        return np.append(np.minimum(low, 0.0), -rest), np.append(np.maximum(high, 0.0), rest)
+
+    def moved(self, delta: FloatArray) -> tuple[Model, dict[str, float]]:
+        """Return the model and the deviations of its initial states at delta (size,)."""
+        count = len(self.theta)
+        values = self.unknowns.values(self.theta + delta[:count])
+        sizes = memory_sizes(self.model)
+        start = dict(zip(sizes, (np.array(list(sizes.values())) * delta[count:-1]).tolist(),
+                         strict=True))  # fmt: skip
+        return self.model.with_values(values), start
+
+    def predict(self, record: Record, delta: FloatArray) -> FloatArray:
+        """Return the displacement (n,) [m] that the rival predicts at delta."""
+        model, start = self.moved(delta)
+        y, *_ = predict_record(model, record, start, (), stop=record.n, rtol=RTOL)
+        shown: FloatArray = y + _OFFSET * delta[-1]
+        return shown
+
+    def sensitivities(self, record: Record, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the displacement (n,) [m] and its exact derivative by delta (n, size) [m]."""
+        model, start = self.moved(delta)
+        y, by_parameter, by_start = predict_record(
+            model, record, start, self.unknowns.names, stop=record.n, rtol=RTOL
+        )
+        slopes = self.unknowns.slopes(self.theta + delta[: len(self.theta)])
+        sizes = np.array(list(memory_sizes(model).values()))
+        columns = [by_parameter @ slopes, by_start * sizes, np.full((record.n, 1), _OFFSET)]
+        return y + _OFFSET * delta[-1], np.hstack(columns)
+
+
+def rival_of_fit(name: str, fit: Fit, colour: Colour, evidence: float = 0.0) -> Rival:
+    """Return a fitted model as a rival; what it was fitted to is what is known of it.
+
+    `colour` is the noise of the fit's samples.
+    """
+    count = len(fit.unknowns.names)
+    white = colour.whiten(fit.jacobian) / colour.level
+    full = white.T @ white + np.diag(1.0 / fit.unknowns.prior**2)
+    inner, cross = full[count:, count:], full[:count, count:]
+    known = full[:count, :count] - cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T
+    less = _less(name, fit, known)
+    return Rival(name, fit.model, fit.unknowns, fit.theta[:count].copy(), known, evidence, less)
+
+
+def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
+    """Return the way (k,) to the likeliest values with a standard error less of an effect's gain.
+
+    Where a record hardly tells how strong an effect is, its fit may be far too strong, and what
+    would tell that from a rival may not tell the truth. theta moves by C_g / C_gg of the gain's.
+    """
+    gain = next((c.gain for c in fit.model.components if c.name == name), None)
+    names = fit.unknowns.names
+    if gain is None or gain not in names:
+        return np.zeros(len(names))
+    k = names.index(gain)
+    own = np.linalg.pinv(known, hermitian=True)[:, k]
+    size = fit.model.values[gain] / fit.unknowns.scale[k]
+    shift = min(_CAUTION * float(np.sqrt(max(own[k], 0.0))), _LOSS * abs(size))
+    less: FloatArray = -float(np.sign(size)) * shift * own / max(own[k], 1e-300)
+    farthest = float(np.max(np.abs(less[fit.unknowns.log[: len(less)]]), initial=0.0))
+    return less * min(1.0, _FARTHEST / max(farthest, 1e-300))
+
+
+def rival_of_model(name: str, model: Model, free: Sequence[str]) -> Rival:
+    """Return a model of which only the order of magnitude of its free parameters is known."""
+    unknowns = unknowns_of(model, free, [], [], _OFFSET)
+    theta = unknowns.coordinates(model.values)
+    return Rival(name, model, unknowns, theta, np.diag(1.0 / unknowns.prior[: len(theta)] ** 2))
+
+
+def noise_of_fit(fit: Fit, experiments: Sequence[Experiment]) -> tuple[SensorNoise, Colour]:
+    """Return the noise that a fit's residuals show: rms and correlation, and as their colour."""
+    colour = colour_of(fit.residuals, [int(e.used.sum()) for e in experiments])
+    first = colour.autoregression[0]
+    correlation = float(first[0]) if first.size else 0.0
+    return SensorNoise(fit.rms, correlation), colour
+
+
+#: Evaluations of a re-fit at most, while voltages are compared and in the end; when it has settled.
+#: A re-fit that is cut off too soon shows a distance that is not there, which a search would find.
+QUICK, FINAL, _SETTLED = 30, 40, 1e-4
+#: Distances below this are none.
+LEAST = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class _Refit:
+    """Rival b fitted again to a: the distance T, where b ended, and the whitened difference."""
+
+    distance: float
+    delta: FloatArray
+    difference: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """The criterion for rivals under a noise on the record's grid.
+
+    A re-fit is cut off after so many `evaluations` while voltages are compared.
+    """
+
+    rivals: tuple[Rival, ...]
+    noise: Colour
+    evaluations: int = QUICK
+
+    def __post_init__(self) -> None:
+        if len(self.rivals) < 2:
+            raise InputError("One effect cannot be separated from itself; name two or more.")
+
+    def at(self, record: Record) -> Point:
+        """Return the value and a function of the voltage with its gradient."""
+        found = self._refits(record, self.evaluations)
+        inverse = {pair: 1.0 / max(r.distance, LEAST) for pair, r in found.items()}
+        total = sum(inverse.values())
+        value = overall([r.distance for r in found.values()])
+
+        def frozen(other: Record) -> float:
+            plain = [r.predict(other, r.truth) for r in self.rivals]
+            moved = 0.0
+            for (a, b), r in found.items():
+                gap = plain[a] - self.rivals[b].predict(other, r.delta)
+                slope = 2.0 * r.difference @ self._white(gap)
+                moved += inverse[a, b] ** 2 / total * float(slope)
+            return moved
+
+        return Point(value, frozen)
+
+    def distances(self, record: Record) -> Mapping[tuple[str, str], float]:
+        """Return T of every true rival and other one, by their names, fitted to the end."""
+        names = [r.name for r in self.rivals]
+        found = self._refits(record, FINAL)
+        return {(names[a], names[b]): r.distance for (a, b), r in found.items()}
+
+    def distance(self, truth: Rival, other: Rival, record: Record) -> float:
+        """Return T of one pair, fitted to the end."""
+        target = truth.predict(record, truth.truth)
+        return self._refit(target, other, record, FINAL).distance
+
+    def _refits(self, record: Record, steps: int) -> dict[tuple[int, int], _Refit]:
+        plain = side_by_side(lambda r: r.predict(record, r.truth), self.rivals)
+        pairs = list(permutations(range(len(self.rivals)), 2))
+        found = side_by_side(
+            lambda ab: self._refit(plain[ab[0]], self.rivals[ab[1]], record, steps), pairs
+        )
+        return dict(zip(pairs, found, strict=True))
+
+    def _refit(self, target: FloatArray, rival: Rival, record: Record, evaluations: int) -> _Refit:
+        """Fit a rival again to a target (n,) [m], held by what is known of it."""
+        root = _root(rival.information)
+
+        def evaluate(delta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+            try:
+                y, jacobian = rival.sensitivities(record, delta)
+            except PsaError:
+                return None
+            residual = np.concatenate([self._white(y - target), root @ delta])
+            return residual, np.vstack([self._white(jacobian), root])
+
+        found = minimise(
+            evaluate,
+            np.zeros(rival.size),
+            rival.bounds(),
+            tolerance=_SETTLED,
+            evaluations=evaluations,
+        )
+        if found is None:
+            raise SimulationError(
+                f"The model with {rival.name} cannot follow a planned voltage; its values are far"
+                " from physical ones."
+            )
+        return _Refit(found.cost, found.theta, -found.residual[: record.n])
+
+    def _white(self, signal: FloatArray) -> FloatArray:
+        white: FloatArray = self.noise.whiten(signal) / self.noise.level
+        return white
+
+
+def overall(distances: Collection[float]) -> float:
+    """Return the logarithm of the harmonic mean of distances: the least one counts most."""
+    return float(np.log(len(distances) / sum(1.0 / max(t, LEAST) for t in distances)))
+
+
+def _root(information: FloatArray) -> FloatArray:
+    """Return R with R^T R = information."""
+    values, vectors = np.linalg.eigh(information)
+    root: FloatArray = np.sqrt(np.clip(values, 0.0, None))[:, None] * vectors.T
+    return root
+
+
+Optimality = Literal["D", "E", "A"]
+OPTIMALITIES: tuple[Optimality, ...] = get_args(Optimality)
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """The criterion for the parameters `names` of a model under a noise on the record's grid."""
+
+    rival: Rival
+    names: tuple[str, ...]
+    optimality: Optimality
+    noise: Colour
+
+    def __post_init__(self) -> None:
+        unknown = [n for n in self.names if n not in self.rival.unknowns.names]
+        if unknown or not self.names:
+            free = ", ".join(self.rival.unknowns.names)
+            raise InputError(
+                f"The parameters {', '.join(unknown) or '(none)'} are not among the model's free"
+                f" ones; choose from {free}."
+            )
+        if self.optimality not in OPTIMALITIES:
+            raise InputError(f"There is no optimality '{self.optimality}'; there are D, E and A.")
+
+    @property
+    def _chosen(self) -> list[int]:
+        return [self.rival.unknowns.names.index(n) for n in self.names]
+
+    def _white(self, record: Record) -> FloatArray:
+        _, jacobian = self.rival.sensitivities(record, np.zeros(self.rival.size))
+        white: FloatArray = self.noise.whiten(jacobian) / self.noise.level
+        return white
+
+    def covariance(self, record: Record | None) -> FloatArray:
+        """Return C of the chosen coordinates (k, k), with a record or with the data at hand."""
+        information = self.rival.information
+        if record is not None:
+            white = self._white(record)
+            information = information + white.T @ white
+        return _inverse(information)[np.ix_(self._chosen, self._chosen)]
+
+    def at(self, record: Record) -> Point:
+        """Return the value and a function of the voltage with its gradient."""
+        chosen, white = self._chosen, self._white(record)
+        inverse = _inverse(self.rival.information + white.T @ white)
+        value, slope = _value(inverse[np.ix_(chosen, chosen)], self.optimality)
+        sides = inverse[:, chosen]
+        weights = 2.0 * white @ (sides @ slope @ sides.T)
+        return Point(value, lambda other: float(np.sum(weights * self._white(other))))
+
+    def standard_errors(self, record: Record | None) -> Mapping[str, float]:
+        """Return the standard error of every chosen parameter, in its own unit."""
+        slopes = np.abs(np.diag(self.rival.unknowns.slopes(self.rival.theta)))
+        own = np.sqrt(np.diag(self.covariance(record)))
+        return {
+            n: float(e * slopes[k]) for n, e, k in zip(self.names, own, self._chosen, strict=True)
+        }
+
+
+def _value(c: FloatArray, optimality: Optimality) -> tuple[float, FloatArray]:
+    """Return minus the log of the mean standard error, and -d value / d C."""
+    count = len(c)
+    if optimality == "D":
+        return -0.5 * float(np.linalg.slogdet(c)[1]) / count, 0.5 * np.linalg.inv(c) / count
+    if optimality == "A":
+        trace = float(np.trace(c))
+        return -0.5 * float(np.log(trace / count)), 0.5 * np.eye(count) / trace
+    values, vectors = np.linalg.eigh(c)
+    worst = vectors[:, -1:]
+    slope: FloatArray = 0.5 * worst @ worst.T / values[-1]
+    return -0.5 * float(np.log(values[-1])), slope
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Invert an information matrix, scaled to a unit diagonal first; unknown offsets are wide."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-12))
+    scaled = matrix * scale[:, None] * scale[None, :] + 1e-12 * np.eye(len(matrix))
+    inverse: FloatArray = np.linalg.inv(scaled) * scale[:, None] * scale[None, :]
+    return inverse

@@ -1,1 +1,0 @@
-"""A stack followed while it works: observers and recursive least squares."""

@@ -1,1 +1,0 @@
-"""What to measure next so that more is determined."""

@@ -1,1 +1,0 @@
-"""What the records determine: intervals, combinations, profiles, information."""

@@ -1,0 +1,313 @@
+"""Profile likelihood: how the best fit worsens as one parameter is held away from its estimate."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psa_casadi.errors import InputError
+from psa_casadi.identification.determinacy import covariance_of, weighted_rows
+from psa_casadi.identification.fitting.fit import Fit, Objective
+from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
+from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
+from psa_casadi.units import FloatArray
+
+Progress = Callable[[str], None]
+
+_EVALUATIONS = 40
+#: A step out is at most this many times the distance that has been covered.
+_GROWTH = 3.0
+#: Levels, in roots of the limit, that the next point aims at before and at the crossing.
+_BEFORE, _AT = 0.7, 1.08
+#: A crossing is interpolated from points whose levels lie no further apart than this.
+_FINE = 0.6
+#: Each fit ends when a step lowers the cost by less than this share of the limit.
+_CLOSE = 3e-3
+#: Where a step raised the level by less, the cost levels off: the next step is twice as long.
+_FLAT = 0.05
+_RETRIES = 3
+_NEWTON_STEPS = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A value's coordinate with the fit of all other unknowns there."""
+
+    z: float
+    theta: FloatArray
+    cost: float
+
+
+class HeldFits:
+    """The fits of all other unknowns while one parameter is held."""
+
+    def __init__(
+        self,
+        fit: Fit,
+        experiments: Sequence[Experiment],
+        name: str,
+        limit: float,
+        progress: Progress,
+    ) -> None:
+        self.name, self.limit, self._progress = name, limit, progress
+        self.unknowns = fit.unknowns
+        self.k = self.unknowns.names.index(name)
+        self.log = fit.model.parameter(name).log
+        self.estimate = fit.model.values[name]
+        self._evaluate = Objective(fit.model, experiments, self.unknowns, fit.sigma, fit.way)
+        self._tolerance = float(np.clip(_CLOSE * limit / fit.cost, 1e-9, 1e-5))
+        self._fitted = fit.theta
+        edges = (float(edge[self.k]) for edge in (self.unknowns.low, self.unknowns.high))
+        low, high = (self.coordinate(max(e, 1e-300) if self.log else e) for e in edges)
+        self.edges = (low, high)
+
+    def coordinate(self, value: float) -> float:
+        """Return ln value, or the value itself."""
+        return float(np.log(value)) if self.log else value
+
+    def first_step(self, spread: float) -> float:
+        """Return one standard error as a step, an ordinary change at most."""
+        ordinary = 1.0 if self.log else abs(float(self.unknowns.scale[self.k]))
+        step = spread / self.estimate if self.log else spread
+        return float(np.clip(step, 1e-6 * ordinary, ordinary))
+
+    def value(self, z: float) -> float:
+        """Return the value at a coordinate."""
+        return float(np.exp(z)) if self.log else z
+
+    def minimum(self, z: float, before: Sequence[Point]) -> Point | None:
+        """Fit all other unknowns at z from the points before it; None if that cannot be simulated.
+
+        Starts on the line through the last two points, else at the last.
+        """
+        self._progress(f"profile of {self.name}, {self.value(z):.4g}")
+        starts = [p.theta for p in before[-1:]] or [self._fitted]
+        if len(before) > 1:
+            last, other = before[-1], before[-2]
+            along = (last.theta - other.theta) * (z - last.z) / (last.z - other.z)
+            starts.insert(0, last.theta + along)
+        for start in starts:
+            found = self._fit(z, start)
+            if found is not None:
+                return Point(z, self._whole(z, found.theta)[0], found.cost)
+        return None
+
+    def _whole(self, z: float, others: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return theta with the parameter held at z, and d own coordinate / d others (size - 1,).
+
+        The own coordinate solves value(theta) = z given the others, by Newton's method from what
+        `coordinates` says: where the loop has coordinates of its own, a parameter depends on
+        several of them.
+        """
+        u, value = self.unknowns, self.value(z)
+        theta: FloatArray = np.insert(others, self.k, self._fitted[self.k])
+        theta[self.k] = u.coordinates({**u.values(theta), self.name: value})[self.k]
+        slopes = u.slopes(theta)[self.k]
+        for _ in range(_NEWTON_STEPS):
+            missing = value - u.values(theta)[self.name]
+            if abs(missing) <= 1e-12 * abs(value):
+                break
+            theta[self.k] += float(np.clip(missing / slopes[self.k], -1.0, 1.0))
+            slopes = u.slopes(theta)[self.k]
+        own = np.zeros(len(theta))
+        own[: len(u.names)] = -slopes / slopes[self.k]
+        return theta, np.delete(own, self.k)
+
+    def _fit(self, z: float, start: FloatArray) -> Minimum | None:
+        def evaluate(others: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+            theta, by_others = self._whole(z, others)
+            found = self._evaluate(theta)
+            if found is None:
+                return None
+            residual, jacobian = found
+            along = np.delete(jacobian, self.k, 1) + np.outer(jacobian[:, self.k], by_others)
+            row = len(residual) - self.unknowns.size + self.k  # the parameter's own prior
+            return np.delete(residual, row), np.delete(along, row, 0)
+
+        low, high = (np.delete(edge, self.k) for edge in self.unknowns.bounds())
+        minimum = minimise(
+            evaluate,
+            np.delete(start, self.k),
+            (low, high),
+            tolerance=self._tolerance,
+            evaluations=_EVALUATIONS,
+        )
+        if minimum is not None and minimum.interrupted:
+            raise KeyboardInterrupt
+        return minimum
+
+    def side(self, centre: Point, step: float, points: int) -> list[Point]:
+        """Return points outwards from the centre until the limit is crossed or a bound is met."""
+        found, failures = [centre], 0
+        edge = self.edges[1] if step > 0 else self.edges[0]
+        while len(found) <= points and failures < _RETRIES:
+            last = found[-1]
+            outside = (last.z + step - edge) * step > 0
+            z = edge if outside else last.z + step
+            if abs(z - last.z) <= 1e-9 * max(abs(z), abs(step)):
+                break
+            point = self.minimum(z, found)
+            if point is None:
+                failures, step = failures + 1, 0.3 * step
+                continue
+            found.append(point)
+            if self._level(point, found) > 1.0:
+                return self._refined(found)[1:]
+            step = self._next_step(found, abs(step))
+        return found[1:]
+
+    def _level(self, point: Point, found: Sequence[Point]) -> float:
+        """Return sqrt(increase / limit), which grows in proportion to the distance at first."""
+        least = min(p.cost for p in found)
+        return float(np.sqrt(max(point.cost - least, 0.0) / self.limit))
+
+    def _next_step(self, found: Sequence[Point], before: float) -> float:
+        """Return the step that should reach the next level, by the last point's distance."""
+        centre, last = found[0].z, found[-1].z
+        distance, level = abs(last - centre), self._level(found[-1], found)
+        aim = _BEFORE if level < 0.5 * _BEFORE else _AT
+        wanted = distance * (aim / max(level, 1e-9) - 1.0)
+        flat = len(found) > 2 and level - self._level(found[-2], found) < _FLAT
+        least = 2.0 * before if flat else 0.1 * before
+        step = float(np.clip(wanted, min(least, _GROWTH * distance), _GROWTH * distance))
+        return step if last > centre else -step
+
+    def _refined(self, found: list[Point]) -> list[Point]:
+        """Put points where the limit should be crossed, until those around it are close."""
+        outer = found.pop()
+        beyond = [outer]
+        for _ in range(_RETRIES):
+            inner = found[-1]
+            levels = self._level(inner, found), self._level(outer, found)
+            if levels[1] - levels[0] <= _FINE:
+                break
+            # a cost that turns steep all at once would hold an interpolation back at the inside
+            share = max((1.0 - levels[0]) / (levels[1] - levels[0]), 0.25)
+            middle = self.minimum(inner.z + share * (outer.z - inner.z), found)
+            if middle is None:
+                break
+            if self._level(middle, found) > 1.0:
+                outer = middle
+                beyond.insert(0, middle)
+            else:
+                found.append(middle)
+        return [*found, *beyond]
+
+
+#: The 95 % quantile of chi-square with one degree of freedom.
+PROFILE_LIMIT = 3.841458820694124
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """The profile likelihood of one parameter, all other unknowns fitted anew at every value.
+
+    `values` (points,) ascend, in `unit`; `increase` (points,) is that of the cost over its minimum,
+    in units of the residuals' variance: `PROFILE_LIMIT` bounds the 95 % interval [`low`, `high`].
+    An end is None where the increase stays below the limit up to `bounds`, or as far as the model
+    can be simulated. `standard_error` is the one of the linearised fit, for comparison; `log` says
+    that the parameter is searched on a logarithmic scale.
+    """
+
+    name: str
+    unit: str
+    display_unit: str
+    log: bool
+    bounds: tuple[float, float]
+    estimate: float
+    standard_error: float
+    values: FloatArray
+    increase: FloatArray
+    low: float | None
+    high: float | None
+
+
+def profile(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    name: str,
+    *,
+    points: int = 10,
+    progress: Progress = lambda _: None,
+) -> Profile:
+    """Return the profile likelihood of a free parameter of a fit, with up to `points` on each side.
+
+    The parameter is held on a grid that grows outwards until the limit is crossed; every point is
+    fitted from its neighbours. The limit on the cost is 3.84 times the ratio of the parameter's
+    variance (`covariance_of`, residuals as they are) to that of white residuals at the level that
+    weighted them, so that a quadratic cost gives the linearised interval. The parameter's own
+    weak prior does not count. Raises InputError for a parameter that was not free.
+
+    Source: Murphy and van der Vaart 2000 (profile likelihood); Chandler and Bate 2007 (its vertical
+    adjustment for residuals that are not independent).
+    """
+    if name not in fit.unknowns.names:
+        raise InputError(
+            [
+                f"'{name}' was not searched in this fit, so it has no profile; choose one of"
+                f" {', '.join(fit.unknowns.names)}."
+            ]
+        )
+    spread, ratio = _spread(fit, experiments, name)
+    held = HeldFits(fit, experiments, name, ratio * PROFILE_LIMIT, progress)
+    centre = held.minimum(held.coordinate(held.estimate), [])
+    if centre is None:
+        raise InputError([f"The fit cannot be simulated where it ended; fit again before '{name}'"])
+    first = held.first_step(spread)
+    sides = [held.side(centre, sign * first, points) for sign in (-1.0, 1.0)]
+    return _profile(fit.model, held, spread, [*sides[0][::-1], centre, *sides[1]])
+
+
+def _profile(model: Model, held: HeldFits, spread: float, points: Sequence[Point]) -> Profile:
+    z = np.array([p.z for p in points])
+    cost = np.array([p.cost for p in points])
+    level: FloatArray = np.sqrt((cost - cost.min()) / held.limit)
+    least = int(np.argmin(cost))
+    ends = [
+        _crossing(z[: least + 1][::-1], level[: least + 1][::-1]),
+        _crossing(z[least:], level[least:]),
+    ]
+    low, high = (None if end is None else held.value(end) for end in ends)
+    parameter = model.parameter(held.name)
+    return Profile(
+        name=held.name,
+        unit=parameter.unit,
+        display_unit=parameter.display_unit or parameter.unit,
+        log=held.log,
+        bounds=parameter.bounds,
+        estimate=held.estimate,
+        standard_error=spread,
+        values=np.array([held.value(float(q)) for q in z]),
+        increase=PROFILE_LIMIT * level**2,
+        low=low,
+        high=high,
+    )
+
+
+def _crossing(z: FloatArray, level: FloatArray) -> float | None:
+    """Return where the level first reaches 1 outwards, linear between points; None if it never."""
+    beyond = np.flatnonzero(level >= 1.0)
+    if not len(beyond):
+        return None
+    last = int(beyond[0])
+    inner, outer = level[last - 1], level[last]
+    return float(z[last - 1] + (1.0 - inner) / (outer - inner) * (z[last] - z[last - 1]))
+
+
+def _spread(fit: Fit, experiments: Sequence[Experiment], name: str) -> tuple[float, float]:
+    """Return a parameter's standard error, and its variance over that at white residuals."""
+    unknowns = fit.unknowns
+    count = len(unknowns.names)
+    gradient = np.zeros(unknowns.size)
+    gradient[:count] = unknowns.slopes(fit.theta)[unknowns.names.index(name)]
+    curvature = np.diag(1.0 / unknowns.prior**2)
+    variance, samples = 0.0, 0
+    for scaled, residuals in weighted_rows(fit, experiments):
+        curvature += scaled.T @ scaled
+        variance += float(np.sum(residuals**2))
+        samples += len(residuals)
+    white = float(gradient @ np.linalg.pinv(curvature, hermitian=True) @ gradient)
+    found = max(float(gradient @ covariance_of(fit, experiments) @ gradient), 1e-12 * white)
+    # a parameter that the prior holds has no ratio of its own: the residuals' variance stands in
+    return float(np.sqrt(found)), max(found / white, variance / samples)

@@ -1,0 +1,391 @@
+"""A measured load as an input without its noise: the load as a curve over the displacement.
+
+The noise of an input moves the model, so that a fit prefers whatever explains the displacement
+without that input. A load that is a function of the displacement is known better by its curve over
+the displacement that a model without it predicts from the voltage: an instrument whose error has
+nothing to do with the load cell's (instrumental variables; Fuller, Measurement Error Models 1987).
+A straight line is what a stiffer stack does: it tells nothing of the stiffness that it meets.
+Where the displacement's sensor bends, that model is bent with it, and the load may be a straighter
+curve over what the same model predicts that is fitted to the load itself.
+"""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.components.stack import MEMORY_SPECTRUM
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.force_start import retuned
+from psa_casadi.identification.refitting import (
+    Progress,
+    differing,
+    equal,
+    exchanged,
+    noise_levels,
+    quick_rtol,
+    record_rms,
+    refit_or_keep,
+    residual_noise,
+    same_place,
+    with_fast,
+    without_blur,
+)
+from psa_casadi.identification.start.ordinary import FORMS
+from psa_casadi.identification.start.starting_points import (
+    LinearCandidate,
+    resolved,
+    starting_points,
+)
+from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import high_frequency_noise
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment, fitted
+from psa_casadi.simulation.timings import stage
+from psa_casadi.units import FloatArray
+
+#: Parameters that voltage and displacement determine in every record with loops.
+CORE = (
+    *("k_L", "A", "beta", "gamma", "delta", "n", *MEMORY_SPECTRUM.fitted),
+    *("tau", "R_s", "c_P", "c_B", "c"),
+)
+
+#: Where there are more starts than finalists, all get the first evaluations, those the rest.
+_QUICK, _FINALISTS, _FIRST = 12, 3, 5
+#: The second best is followed to the end where its cost is at most this much larger.
+_NEAR = 1.5
+#: A fit misses the records where its mean weighted square exceeds this; so many starts are then
+#: followed to the end.
+_MISSED, _FOLLOWED = 2.0, 4
+#: A start whose quick fit comes this close to the best one's cost is followed to the end.
+_CLOSE = 1.02
+
+
+@dataclass(frozen=True)
+class StartOutcome:
+    """One start of the search: its name, the cost and rms [m] it led to, and what became of it.
+
+    `agrees` is True where it led to the same minimum as the best, False where it led elsewhere,
+    None where the quick fit was so much worse that it was not followed to the end.
+    """
+
+    name: str
+    cost: float
+    rms: float
+    agrees: bool | None
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The best fit, what became of every start, and parameters that equally good fits differ in."""
+
+    best: Fit
+    starts: tuple[StartOutcome, ...]
+    not_unique: tuple[str, ...]
+
+
+def free_parameters(model: Model, records: Sequence[Record] = ()) -> list[str]:
+    """Return the core parameters and those of the model's effects that records can tell.
+
+    A measured load that changes tells the stiffness that it meets.
+    """
+    effects = [n for c in model.effects for n in c.fitted]
+    loaded = "load_force" in model.input_names and any(
+        r.load_force is not None and np.ptp(r.load_force) > 0.0 for r in records
+    )
+    met = [n for n in ("k_B", "k") if loaded and n in model.values]
+    return [n for n in CORE if n in model.values] + met + effects
+
+
+@stage("base fit")
+def fit_base(
+    model: Model, experiments: Sequence[Experiment], *, progress: Progress = lambda _: None
+) -> Fit:
+    """Return the best fit of `search`, without the account of its starts."""
+    return search(model, experiments, progress=progress).best
+
+
+def search(
+    model: Model,
+    experiments: Sequence[Experiment],
+    *,
+    linear: Sequence[LinearCandidate] = (),
+    thorough: bool = False,
+    progress: Progress = lambda _: None,
+) -> Search:
+    """Fit the core parameters from several starts, then whatever else the data can tell.
+
+    The starts are the records' loops and ordinary shapes with the first of the `linear` candidates
+    (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
+    best and the second best are followed to the end, if that one is close or, with `thorough`, not
+    far, to tell whether starts agree; with `thorough` more of them while all miss the records. A
+    keyboard interrupt ends the search at the best fit so far, if there is one. Raises PsaError when
+    no start can be simulated.
+    """
+    so_far: list[Fit] = []
+    off = (c for c in model.effects if c.linear and model.values[c.gain or ""] == 0.0)
+    model = model.with_values({n: v for c in off for n, v in c.at_gain(0.0, {}).items()})
+    try:
+        return _search(model, experiments, linear, thorough, progress, so_far.append)
+    except KeyboardInterrupt:
+        if not so_far:
+            raise
+        return Search(replace(so_far[-1], interrupted=True, converged=False), (), ())
+
+
+def _search(
+    model: Model,
+    experiments: Sequence[Experiment],
+    linear: Sequence[LinearCandidate],
+    thorough: bool,
+    progress: Progress,
+    keep: Callable[[Fit], None],
+) -> Search:
+    """Search as `search` says; `keep` gets every fit that is better than those before it."""
+    records = [e.record for e in fitted(experiments)]
+    core = free_parameters(model, records)
+    told = resolved(model, linear, min(r.sample_time for r in records))
+    starts = starting_points(model, linear, records)
+    found = _quick_fits(model, experiments, [*core, *told], starts, progress, keep)
+    keep(found[0][1])
+    free = found[0][1].unknowns.names
+    sigma = residual_noise(found[0][1], experiments)
+    polished: list[Fit] = []
+    for name, quick in found:
+        near = quick.data_cost < (_NEAR if thorough else _CLOSE) * found[0][1].data_cost
+        missed = thorough and len(polished) < _FOLLOWED and all(map(_misses, polished))
+        if polished and (polished[0].interrupted or not (missed or (near and len(polished) < 2))):
+            break
+        if polished and not thorough and same_place(found[0][1], quick, experiments):
+            continue
+        progress(f"base fit, {name} to the end")
+        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, free, sigma)
+        polished.append(ended)
+        keep(min(polished, key=lambda f: f.data_cost))
+    best = min(polished, key=lambda f: f.data_cost)
+    outcomes, not_unique = _outcomes(found, polished, best, experiments)
+    if not best.interrupted:
+        best = with_fast(best, experiments, progress)
+        tuned = retuned(best, experiments, progress) if told else best
+        if tuned is not best:
+            best = tuned
+            outcomes, not_unique = _outcomes(found, polished, best, experiments)
+        keep(best)
+        best = without_blur(best, experiments)
+        keep(best)
+    if thorough and not best.interrupted:
+        best, open_ones = exchanged(best, experiments, progress)
+        not_unique |= set(open_ones)
+    names = best.unknowns.names
+    return Search(best, outcomes, tuple(n for n in names if n in not_unique))
+
+
+def _misses(found: Fit) -> bool:
+    """Whether a fit leaves much more than the noise, or lost itself on the way there."""
+    return found.data_cost > _MISSED * len(found.residuals)
+
+
+def _outcomes(
+    found: Sequence[tuple[str, Fit]],
+    polished: Sequence[Fit],
+    best: Fit,
+    experiments: Sequence[Experiment],
+) -> tuple[tuple[StartOutcome, ...], set[str]]:
+    """Tell what became of every start, and which parameters equally good fits differ in."""
+    outcomes, not_unique = [], set[str]()
+    for k, (name, quick) in enumerate(found):
+        if k >= len(polished):
+            outcomes.append(StartOutcome(name, quick.data_cost, quick.rms, None))
+            continue
+        final = polished[k]
+        names = differing(best, final, experiments)
+        agrees = final is best or (names == () and equal(best, final))
+        not_unique |= set(names)
+        outcomes.append(StartOutcome(name, final.data_cost, final.rms, agrees))
+    return tuple(outcomes), not_unique
+
+
+def _quick_fits(
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    starts: Sequence[tuple[str, dict[str, float]]],
+    progress: Progress,
+    keep: Callable[[Fit], None],
+) -> list[tuple[str, Fit]]:
+    """Fit from every start with few evaluations; return those that could be simulated."""
+    sigma = noise_levels(experiments)
+    quickly: dict[str, Any] = {"sigma": sigma, "rtol": quick_rtol(sigma, experiments)}
+    found: list[tuple[str, Fit]] = []
+    rounds: tuple[int, ...] = (_QUICK,) if len(starts) <= _FINALISTS else (_FIRST, _QUICK - _FIRST)
+    for name, start in starts:
+        progress(f"base fit from {name}")
+        try:
+            quick = fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
+        except PsaError:
+            continue
+        except KeyboardInterrupt:
+            if not found:
+                raise
+            found = [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
+            break
+        found.append((name, quick))
+        keep(min((f for _, f in found), key=lambda f: f.data_cost))
+        if quick.interrupted:
+            break
+    found.sort(key=lambda pair: pair[1].data_cost)
+    widest = max(e.record.range_m for e in fitted(experiments))
+    # a loop that diverges is left there, unless all do
+    found = [pair for pair in found if pair[1].rms < widest] or found
+    for k, (name, quick) in enumerate(found[: _FINALISTS if len(rounds) > 1 else 0]):
+        if any(f.interrupted for _, f in found):
+            break
+        progress(f"base fit from {name}, continued")
+        states = quick.starts()
+        with suppress(PsaError):  # where it leads to what cannot be simulated, the first one stays
+            further = fit(
+                quick.model, experiments, free, start_states=states, evaluations=rounds[1],
+                **quickly,
+            )  # fmt: skip
+            found[k] = (name, further)
+    if not found:
+        raise PsaError(
+            "The base model could not be simulated from any start; the voltage's unit or the"
+            " displacement's sign is the likely cause: check the record."
+        )
+    return sorted(found, key=lambda pair: pair[1].data_cost)
+
+
+_LABELS = {FORMS["bouc-wen"].name: "Bouc-Wen", FORMS["spectrum"].name: "a spectrum of elements"}
+
+
+def search_forms(
+    models: Sequence[Model],
+    experiments: Sequence[Experiment],
+    *,
+    linear: Sequence[LinearCandidate] = (),
+    thorough: bool = False,
+    progress: Progress = lambda _: None,
+) -> tuple[Search, Note | None]:
+    """Search from each model, and return the search that the records prefer, and why.
+
+    That of the smaller Schwarz criterion, sum_r n_r ln S_r + k ln n: S_r the mean square of record
+    r's residual, k the parameters, n the samples (Schwarz, Annals of Statistics 6 (1978) 461). None
+    for one model. Raises PsaError where no model can be fitted.
+    """
+    found: list[Search] = []
+    failed: list[PsaError] = []
+    for model in models:
+        try:
+            one = search(model, experiments, linear=linear, thorough=thorough, progress=progress)
+        except PsaError as error:
+            failed.append(error)
+            continue
+        found.append(one)
+        if one.best.interrupted:
+            break
+    if not found:
+        raise failed[0]
+    ranked = sorted(found, key=lambda s: _criterion(s.best, experiments))
+    if len(ranked) < 2:
+        return ranked[0], None
+    (better, left), (other, other_left) = ((_form(s.best), 1e9 * s.best.rms) for s in ranked)
+    said = note("form", better=better, left=left, other=other, other_left=other_left)
+    return ranked[0], said
+
+
+def _form(found: Fit) -> str:
+    return next(_LABELS[c.name] for c in found.model.components if c.name in _LABELS)
+
+
+def _criterion(found: Fit, experiments: Sequence[Experiment]) -> float:
+    samples = [int(e.used.sum()) for e in experiments]
+    levels = record_rms(found, experiments)
+    likely = sum(n * np.log(level**2) for n, level in zip(samples, levels, strict=True))
+    return float(likely + len(found.unknowns.names) * np.log(sum(samples)))
+
+
+#: The column, and the highest order of the curve.
+LOAD, _ORDER = "load_force", 8
+#: The curve stands for the load where it misses no more than its noise, with this margin, and this
+#: share of its range.
+_NOISE, _SHARE = 1.1, 1e-3
+
+
+def is_measured(experiments: Sequence[Experiment]) -> bool:
+    """Whether the load on the stack is measured in every record."""
+    return all(e.record.load_force is not None for e in experiments)
+
+
+def without_column(experiments: Sequence[Experiment], column: str) -> tuple[Experiment, ...]:
+    """Return the experiments as if a column had not been measured."""
+    gone: dict[str, Any] = {column: None}
+    return tuple(
+        replace(
+            e,
+            record=replace(e.record, **gone),
+            further=tuple(q for q in e.further if q.column != column),
+        )
+        for e in experiments
+    )
+
+
+def loads_as_curves(
+    start: Model, experiments: Sequence[Experiment], progress: Callable[[str], None]
+) -> tuple[Experiment, ...]:
+    """Return the experiments with loads that are curves over the displacement as these curves.
+
+    Of a fit without the load, from `start`. Where all of them are straight lines they are 0: the
+    model's stiffness stands for them. Other loads stay as they were measured. Without a load that
+    changes nothing is fitted.
+    """
+    loads = [np.asarray(e.record.load_force, dtype=float) for e in experiments]
+    if not is_measured(experiments) or all(np.ptp(load) == 0.0 for load in loads):
+        return tuple(experiments)
+    progress("base fit without the measured load")
+    unloaded = without_column(experiments, LOAD)
+    ways = [
+        fit_base(start, own, progress=progress).predicted(own)
+        for own in (unloaded, tuple(map(_as_displacement, experiments)))
+    ]
+    curves = [_curve(load, own) for load, *own in zip(loads, *ways, strict=True)]
+    straight = all(c is not None and c[1] == 1 for c in curves)
+    found = []
+    for e, load, own in zip(experiments, loads, curves, strict=True):
+        curve = np.zeros(e.record.n) if straight else load if own is None else own[0]
+        found.append(replace(e, record=replace(e.record, load_force=curve)))
+    return tuple(found)
+
+
+def _as_displacement(e: Experiment) -> Experiment:
+    """Return an experiment whose displacement is its load, to the size and sign of the first."""
+    load, y = np.asarray(e.record.load_force), np.asarray(e.record.displacement)
+    span = max(float(np.ptp(load)), 1e-300)
+    seen = np.isfinite(y)
+    sign = np.sign(np.cov(load[seen], y[seen])[0, 1]) or 1.0
+    shown = np.where(seen, load * sign * e.record.range_m / span, np.nan)
+    return replace(e, record=replace(e.record, displacement=shown, load_force=None), further=())
+
+
+def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, int] | None:
+    """Return the polynomial that stands for a load (n,) [N], and its order; None if all are far.
+
+    Over one of the displacements x (n,) [m]; of the smallest n ln S + order ln n (Schwarz 1978).
+    """
+    found = []
+    for x in ways:
+        middle, half = 0.5 * (float(x.max()) + float(x.min())), 0.5 * float(np.ptp(x))
+        powers = np.polynomial.chebyshev.chebvander((x - middle) / max(half, 1e-300), _ORDER)
+        for order in range(1, _ORDER + 1):
+            columns = powers[:, : order + 1]
+            curve = columns @ np.linalg.lstsq(columns, load, rcond=None)[0]
+            left = max(float(np.sum((load - curve) ** 2)), 1e-300)
+            found.append((load.size * np.log(left) + order * np.log(load.size), order, curve))
+    _, order, curve = min(found, key=lambda f: f[0])
+    missed = float(np.std(load - curve))
+    allowed = np.hypot(_NOISE * high_frequency_noise(load), _SHARE * float(np.ptp(load)))
+    return (curve, order) if missed <= allowed else None
