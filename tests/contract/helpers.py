@@ -1,0 +1,121 @@
+"""The command in this process, and records of an independent stack, as all contract tests use."""
+
+import io
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import psa_casadi as psa
+from psa_casadi import reference
+from psa_casadi.cli import main
+
+Floats = NDArray[np.float64]
+DATA = Path(psa.__file__).parent / "data"
+SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: exit code, and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def words(self) -> str:
+        """All it said, with every white space as one."""
+        return " ".join((self.out + " " + self.err).split())
+
+
+def command(*words: str | Path) -> Ended:
+    """Run `psa` in this process."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with _own_process(["psa", *map(str, words)]), redirect_stdout(out), redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
+    return Ended(code, out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def _own_process(argv: list[str]) -> Iterator[None]:
+    """Put back what a command changes of its process."""
+    before, folder, kept = sys.argv, tempfile.tempdir, os.environ.get("TMPDIR")
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+    sys.argv = argv
+    try:
+        yield
+    finally:
+        sys.argv, tempfile.tempdir = before, folder
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        os.environ.pop("TMPDIR", None)
+        if kept is not None:
+            os.environ["TMPDIR"] = kept
+
+
+def done(*words: str | Path) -> Ended:
+    """Run a command that must work."""
+    ended = command(*words)
+    assert ended.code == 0, ended.words
+    assert "Traceback" not in ended.words
+    return ended
+
+
+def refused(*words: str | Path, code: int = 2, folder: Path | None = None) -> str:
+    """Run a command that must fail without a traceback and leave a folder as it was."""
+    before = _content(folder)
+    ended = command(*words)
+    assert ended.code == code, ended.words
+    assert ended.out == ""
+    assert "Traceback" not in ended.err
+    assert _content(folder) == before
+    return " ".join(ended.err.split())
+
+
+def _content(folder: Path | None) -> dict[Path, bytes]:
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} if folder else {}
+
+
+def table(path: Path) -> dict[str, Floats]:
+    """Read a CSV file by plain means: every column by its header."""
+    head, *rows = path.read_text("utf-8").splitlines()
+    columns = zip(*(row.split(",") for row in rows), strict=True)
+    return {
+        name: np.array([float(x) if x else np.nan for x in column])
+        for name, column in zip(head.split(","), columns, strict=True)
+    }
+
+
+def write(path: Path, columns: dict[str, Floats]) -> Path:
+    """Write a CSV file by plain means."""
+    lines = [",".join(columns)]
+    lines += [",".join(f"{x:.12g}" for x in row) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+@cache
+def reference_run(
+    stack: str = "P-885.51", stop: float = 0.06, samples: int = 301
+) -> tuple[Floats, Floats, reference.Trajectory]:
+    """Return times, a voltage of loops that shrink, and what the independent model makes of it."""
+    values = psa.stack_model(stack).values
+    time = np.linspace(0.0, stop, samples)
+    swing = np.cos(4.0 * np.pi * time / stop) * (1.0 - 0.3 * time / stop)
+    voltage = 0.4 * values["u_rated"] * (1.0 - swing)
+    found = reference.simulate(
+        values, reference.from_samples(time, voltage), time, breakpoints=list(time)
+    )
+    return time, voltage, found
