@@ -1,0 +1,255 @@
+"""The command: help, exit codes, messages, files written whole or not at all, the served page."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+
+import psa_casadi as psa
+from tests.contract.helpers import DATA, command, done, refused
+from tests.tiers import slow
+
+PSA = [sys.executable, "-m", "psa_casadi.cli"]
+COMMANDS = (
+    "demo", "identify", "sample", "simulate", "diagnose", "batch", "compare", "effects", "stacks",
+    "export fmu", "export modelica", "export c", "export ssp", "design experiment",
+    "design mechanism", "design input", "check", "web", "examples", "datasets",
+)  # fmt: skip
+posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_an_example_and_can_be_quiet(name: str) -> None:
+    for option in ("--help", "-h"):
+        said = done(*name.split(), option).words
+        assert f"Usage: psa {name}" in said
+        assert f"Example: psa {name}" in said
+        assert "--quiet" in said
+    assert name.split(maxsplit=1)[0] in done("--help").out.split()
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert done("--version").out == f"psa_casadi {psa.__version__}\n"
+
+
+def test_every_public_name_is_there_and_a_wrong_one_is_told() -> None:
+    for name in psa.__all__:
+        assert getattr(psa, name) is not None
+    assert set(dir(psa)) == set(psa.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'identfy'"):
+        psa.identfy  # noqa: B018
+
+
+def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
+    code = "import sys, psa_casadi; print([m for m in ('casadi', 'numpy') if m in sys.modules])"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("identfy",), "identfy"),
+        (("simulate", "--stack", "demo"), "--input"),
+        (("diagnose",), "records"),
+        (("identify", "{bytes}", "--method", "best"), "--method"),
+        (("identify", "{absent}", "-o", "{out}"), "there is no such file"),
+        (("compare", "{absent}", "b.json"), "absent.csv: cannot be read"),
+        (("export", "fmu", "--stack", "P-1", "-o", "{out}"), "P-1"),
+        (("export", "fmu", "--stack", "demo", "-o", "{out}", "--platforms", "vax"), "'vax'"),
+        (("export", "fmu", "--stack", "demo", "-o", "{out}", "--name", "1st"), "'1st' cannot"),
+        (("export", "fmu", "--stack", "demo", "-o", "{out}", "--fmi", "7"), "--fmi"),
+        (("export", "fmu", "--stack", "demo", "-o", "{folder}/no/x.fmu"), "create it first"),
+        (("export", "c", "--stack", "demo", "--step", "10", "-o", "{folder}/code"), "unit"),
+        (("check", "{bytes}"), "cannot be read as an FMU"),
+        (("check", "{folder}"), "is a directory"),
+        (("diagnose", "{demo}", "--expect", "adquate"), "'adequate'"),
+        (("diagnose", "{demo}", "--max-error", "much"), "0.5%"),
+        (("diagnose", "{demo}", "-o", "{out}", "--json", "{out}"), "both"),
+        (("identify", "{demo}", "--method", "paper", "--model", "{absent}"), "absent.csv"),
+        (("design", "mechanism", "--stack", "demo", "--damping", "2", "-o", "{out}"), "2"),
+        (("effects", "xyzzy"), "current_limit"),
+        (("stacks", "P-885"), "P-885.51"),
+        (("datasets", "micro"), "micromanipulator"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_told_with_exit_code_2(
+    words: tuple[str, ...], said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "bytes").write_bytes(bytes(range(256)))
+    places = {
+        "folder": tmp_path, "out": tmp_path / "out", "bytes": tmp_path / "bytes",
+        "absent": tmp_path / "absent.csv", "demo": DATA / "demo.csv",
+    }  # fmt: skip
+    assert said in refused(*(w.format(**places) for w in words), folder=tmp_path)
+
+
+def test_a_message_is_one_sentence_on_stderr_of_a_process_of_its_own(tmp_path: Path) -> None:
+    absent = tmp_path / "absent.csv"
+    ended = subprocess.run(
+        [*PSA, "identify", absent, "-o", tmp_path / "m.json"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.splitlines() == [
+        f"Error: {absent}: there is no such file; check the name and the directory it is in."
+    ]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_machines_fault_ends_with_1_and_leaves_files_as_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "x.fmu"
+    out.write_bytes(b"kept")
+    monkeypatch.setenv("CC", str(tmp_path / "no_compiler"))
+    said = refused("export", "fmu", "--stack", "demo", "-o", out, code=1, folder=tmp_path)
+    assert "Failed: The C compiler" in said
+    assert str(tmp_path / "no_compiler") in said
+    assert out.read_bytes() == b"kept"
+    with pytest.raises(psa.MachineError, match="CC"):
+        psa.export_fmu(psa.stack_model("demo"), out)
+
+
+def test_mistakes_in_python_are_input_errors_that_list_all() -> None:
+    with pytest.raises(psa.InputError) as told:
+        psa.identify(["none.csv", {"t": [0.0]}])
+    assert {p.split(":")[0] for p in told.value.problems} == {"none.csv", "record 2"}
+    assert isinstance(told.value, psa.PsaError)
+    assert not issubclass(psa.MachineError, psa.PsaError)
+    with pytest.raises(psa.InputError, match="no parameter 'kL'"):
+        psa.stack_model("demo").with_values({"kL": 1.0})
+    with pytest.raises(psa.InputError, match="outside its bounds"):
+        psa.stack_model("demo").with_values({"k_P": -1.0})
+
+
+@posix
+@slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_is_ended_says_so_and_leaves_no_half_file(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    running = subprocess.Popen(
+        [*PSA, "diagnose", DATA / "demo.csv", "--report", tmp_path / "page.html"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    )  # fmt: skip
+    assert running.stderr is not None
+    assert running.stderr.readline()  # it works by now
+    running.send_signal(number)
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 128 + number
+    assert "Traceback" not in said
+    assert number != signal.SIGINT or "Interrupted: " in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_examples_are_listed_shown_and_copied(tmp_path: Path) -> None:
+    listed = done("examples", "--quiet").out.split()
+    assert {"van_der_pol", "use_in_casadi", "own_effect", "ci", "simulink"} <= set(listed)
+    assert "ode_model" in done("examples", "van_der_pol").out
+    done("examples", "van_der_pol", "-o", tmp_path / "new", "--copy-only")
+    (copied,) = (tmp_path / "new").glob("*.py")
+    compile(copied.read_text("utf-8"), str(copied), "exec")
+    assert "sensor_pickup" in done("examples", "own_effect").out
+
+
+def test_an_effect_is_drawn_as_a_picture(tmp_path: Path) -> None:
+    done("effects", "sensor_delay", "--figure", tmp_path / "f.png", "--quiet")
+    head = (tmp_path / "f.png").read_bytes()[:24]
+    assert head.startswith(b"\x89PNG")
+    width, height = (int.from_bytes(head[k : k + 4], "big") for k in (16, 20))
+    assert width >= 800
+    assert height >= 400
+
+
+# --- psa web ---
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[tuple[str, str]]:
+    """Serve the page that diagnoses; yield where it is and the token in its address."""
+    running = subprocess.Popen(
+        [*PSA, "web", "--diagnose", "--no-browser"], cwd=folder, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    assert running.stdout is not None
+    try:
+        for line in running.stdout:
+            found = re.search(r"http://(127\.0\.0\.1:\d+)/\?token=(\S+)", line)
+            if found:
+                break
+        assert found, "no address was told"
+        yield found[1], found[2]
+    finally:
+        running.send_signal(signal.SIGINT)
+        running.wait(timeout=30)
+
+
+def asked(
+    place: str, method: str, path: str, body: bytes | None = None, **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    line = http.client.HTTPConnection(place, timeout=30)
+    try:
+        line.request(method, path, body, {n.replace("_", "-"): v for n, v in headers.items()})
+        answer = line.getresponse()
+        return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    finally:
+        line.close()
+
+
+@posix
+def test_the_page_that_diagnoses_answers_to_who_has_its_address_alone(tmp_path: Path) -> None:
+    with served(tmp_path) as (place, token):
+        for path in ("/", "/state", "/?token=guess"):
+            assert asked(place, "GET", path)[0] == 403
+        assert asked(place, "GET", f"/?token={token}", Host="psa.example")[0] in (400, 403, 421)
+        status, headers, page = asked(place, "GET", f"/?token={token}")
+        assert status == 200
+        assert "default-src 'none'" in headers["content-security-policy"]
+        assert "httponly" in headers["set-cookie"].lower()
+        assert token.encode() not in page
+        cookie, origin = headers["set-cookie"].split(";")[0], f"http://{place}"
+        record = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k) for k in range(99))
+        given = {"Cookie": cookie, "X_Name": quote("mine & <b>.csv")}
+        assert asked(place, "POST", "/files", record, Origin="http://x.example", **given)[0] == 403
+        assert asked(place, "POST", "/files", record, Origin=origin, **given)[0] < 300
+        begun, state = time.monotonic(), {}
+        while time.monotonic() < begun + 30.0:
+            state = json.loads(asked(place, "GET", "/state", Cookie=cookie)[2])
+            if "voltage" in json.dumps(state):
+                break
+            time.sleep(0.1)
+        told = json.dumps(state)
+        assert "mine & <b>.csv" in told
+        assert '"ms"' in told
+    assert list(tmp_path.iterdir()) == []
+
+
+@slow
+def test_a_playground_holds_every_stack_and_loads_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("ziglang")
+    done("web", "-o", tmp_path / "page.html", "--quiet")
+    text = (tmp_path / "page.html").read_text("utf-8")
+    for name in ("P-885.51", "PTBS200", "slow_creep"):
+        assert name in text
+    assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
+    assert "default-src 'none'" in text
+    assert 1e5 < len(text) < 3e6
+
+
+@slow
+def test_a_command_of_another_process_keeps_its_exit_code_and_streams(tmp_path: Path) -> None:
+    ended = command("export", "c", "--stack", "P-885.51", "--step", "10us", "-o", tmp_path / "code")
+    assert ended.code == 0
+    assert sorted(p.suffix for p in (tmp_path / "code").iterdir()) == [".c", ".h"]
