@@ -113,12 +113,13 @@ def test_the_machines_fault_ends_with_1_and_leaves_files_as_they_were(
     out = tmp_path / "x.fmu"
     out.write_bytes(b"kept")
     monkeypatch.setenv("CC", str(tmp_path / "no_compiler"))
-    said = refused("export", "fmu", "--stack", "demo", "-o", out, code=1, folder=tmp_path)
+    export = ("export", "fmu", "--stack", "demo", "--name", "compiled_by_no_other_test", "-o", out)
+    said = refused(*export, code=1, folder=tmp_path)
     assert "Failed: The C compiler" in said
     assert str(tmp_path / "no_compiler") in said
     assert out.read_bytes() == b"kept"
     with pytest.raises(psa.MachineError, match="CC"):
-        psa.export_fmu(psa.stack_model("demo"), out)
+        psa.export_fmu(psa.stack_model("demo"), out, name="compiled_by_no_other_test")
 
 
 def test_mistakes_in_python_are_input_errors_that_list_all() -> None:
