@@ -131,7 +131,8 @@ def totals(before: Mapping[str, Row], now: Mapping[str, Row]) -> list[tuple[str,
 
 
 def _right(rows: Iterable[Row]) -> str:
-    return str(sum(row["mark"].startswith("right") for row in rows))
+    marks = [row["mark"] for row in rows]
+    return str(sum(m.startswith("right") and "wrong" not in m for m in marks))
 
 
 def _error_ratio(rows: Iterable[Row]) -> float:

@@ -1,0 +1,352 @@
+"""Exports: FMUs in fmpy beside the independent reference, Modelica, C, SSP, FMUs that are read."""
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+import zipfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+import rumoca
+from fmpy.fmi2 import FMU2Slave
+from fmpy.ssp.simulation import simulate_ssp
+from fmpy.ssp.ssd import read_ssd
+from fmpy.validation import validate_fmu
+
+import psa_casadi as psa
+from psa_casadi import reference
+from tests.contract.helpers import Floats, command, done, reference_run, refused
+from tests.contract.test_models import off, van_der_pol
+from tests.tiers import slow
+
+STACK = "P-885.51"
+
+
+@cache
+def fmu_of(fmi: int) -> Path:
+    """Return the FMU of a stack, written by the command once for all tests."""
+    path = Path(mkdtemp()) / f"stack{fmi}.fmu"
+    done("export", "fmu", "--stack", STACK, "--fmi", str(fmi), "-o", path, "--quiet")
+    return path
+
+
+def played(
+    path: Path, time: Floats, inputs: Mapping[str, Floats], kind: str = "CoSimulation", **more: Any
+) -> Any:
+    """Return what fmpy makes of an FMU whose inputs are lines between samples."""
+    given = np.zeros(time.size, dtype=[("time", float), *((n, float) for n in inputs)])
+    given["time"] = time
+    for name, values in inputs.items():
+        given[name] = values
+    return fmpy.simulate_fmu(
+        str(path), fmi_type=kind, input=given, stop_time=float(time[-1]), relative_tolerance=1e-8,
+        output_interval=float(time[1]), **more,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_is_valid_and_describes_its_ports(fmi: int) -> None:
+    assert validate_fmu(str(fmu_of(fmi))) == []
+    told = fmpy.read_model_description(str(fmu_of(fmi)))
+    assert told.fmiVersion == ("2.0" if fmi == 2 else "3.0")
+    assert told.coSimulation.modelIdentifier == told.modelExchange.modelIdentifier == "P_885_51"
+    variables = {v.name: v for v in told.modelVariables}
+    inputs = [v.name for v in told.modelVariables if v.causality == "input"]
+    outputs = {v.name: v.unit for v in told.modelVariables if v.causality == "output"}
+    assert inputs == ["voltage", "load_force"]
+    assert outputs == {
+        "current": "A", "charge": "C", "displacement": "m", "velocity": "m/s", "blocked_force": "N",
+    }  # fmt: skip
+    for name, value in psa.stack_model(STACK).plant().values.items():
+        assert float(variables[name].start) == value
+        assert variables[name].causality == "parameter"
+    assert "measured_displacement" not in variables
+
+
+def test_an_fmu_with_input_derivatives_agrees_with_the_independent_reference(
+    tmp_path: Path,
+) -> None:
+    time, voltage, expected = reference_run()
+    told = fmpy.read_model_description(str(fmu_of(2)))
+    numbers = {v.name: v.valueReference for v in told.modelVariables}
+    unpacked = fmpy.extract(str(fmu_of(2)), str(tmp_path))
+    slave = FMU2Slave(
+        guid=told.guid, unzipDirectory=unpacked, instanceName="one",
+        modelIdentifier=told.coSimulation.modelIdentifier,
+    )  # fmt: skip
+    slave.instantiate()
+    slave.setupExperiment(startTime=0.0, tolerance=1e-9)
+    slave.enterInitializationMode()
+    slave.exitInitializationMode()
+    found, steps = [], np.diff(time)
+    for k, step in enumerate(steps):
+        slave.setReal([numbers["voltage"]], [voltage[k]])
+        slope = (voltage[k + 1] - voltage[k]) / step
+        slave.setRealInputDerivatives([numbers["voltage"]], [1], [slope])
+        slave.doStep(currentCommunicationPoint=time[k], communicationStepSize=step)
+        found.append(slave.getReal([numbers["displacement"], numbers["blocked_force"]]))
+    slave.terminate()
+    slave.freeInstance()
+    x, force = np.array(found).T
+    assert off(x, expected.displacement[1:]) < 1e-6
+    assert off(force, expected.blocked_force[1:]) < 1e-6
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_whose_inputs_are_held_comes_to_the_reference(fmi: int) -> None:
+    time, voltage, expected = reference_run()
+    errors = []
+    for parts in (4, 16):
+        fine = np.linspace(0.0, time[-1], parts * (time.size - 1) + 1)
+        found = played(fmu_of(fmi), fine, {"voltage": np.interp(fine, time, voltage)})
+        x = np.interp(time, found["time"], found["displacement"])
+        errors.append(off(x, expected.displacement))
+    assert errors[1] == pytest.approx(errors[0] / 4.0, rel=0.1)
+    assert errors[1] < 1e-3
+
+
+def test_model_exchange_agrees_with_the_independent_reference() -> None:
+    time, voltage, expected = reference_run()
+    found = played(fmu_of(2), time, {"voltage": voltage}, "ModelExchange")
+    assert off(np.interp(time, found["time"], found["displacement"]), expected.displacement) < 1e-3
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_parameters_and_loads_of_an_fmu_act_as_in_the_model(fmi: int) -> None:
+    time = np.linspace(0.0, 5e-3, 501)
+    held = np.full(501, -32.0)
+    found = played(
+        fmu_of(fmi), time, {"voltage": 0.0 * time + 60.0, "load_force": held},
+        start_values={"k_L": 6.0, "m_B": 0.2},
+    )  # fmt: skip
+    model = psa.stack_model(STACK).with_values({"k_L": 6.0, "m_B": 0.2}).plant()
+    expected = psa.run(
+        model, time, np.column_stack([0.0 * time + 60.0, held]), np.zeros(len(model.state_names)),
+        rtol=1e-8,
+    )  # fmt: skip
+    x = np.interp(time, found["time"], found["displacement"])
+    assert off(x, expected.y[:, model.output_names.index("displacement")]) < 1e-5
+
+
+def test_an_fmu_starts_settled_where_it_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "x.fmu"
+    done(
+        "export", "fmu", "--stack", STACK, "--start-voltage", "60", "--history", "120,0", "-o", path
+    )
+    time = np.linspace(0.0, 0.02, 201)
+    found = played(path, time, {"voltage": np.full(201, 60.0)})["displacement"]
+    settled = psa.settled_at(psa.stack_model(STACK), 60.0, (120.0, 0.0))
+    there = psa.simulate(settled, time, np.full(201, 60.0), as_exported=True).displacement
+    assert found[0] == pytest.approx(there[0], rel=1e-9)
+    assert np.ptp(found) < 1e-9
+    relaxed = psa.settled_at(psa.stack_model(STACK), 60.0)
+    other = psa.simulate(relaxed, time, np.full(201, 60.0), as_exported=True).displacement
+    assert abs(found[0] - other[0]) > 1e-7
+
+
+def test_options_name_an_fmu_and_keep_the_sensor(tmp_path: Path) -> None:
+    model = psa.stack_model(STACK).with_effect(psa.EFFECTS["sensor_nonlinearity"])
+    psa.save_model(model, tmp_path / "m.json")
+    base = ("export", "fmu", "--model", tmp_path / "m.json", "-o", tmp_path / "x.fmu")
+    assert "sensor_nonlinearity" in done(*base, "--name", "my_stack").out
+    told = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    assert told.coSimulation.modelIdentifier == "my_stack"
+    assert not [v.name for v in told.modelVariables if v.name.startswith("nonlinearity")]
+    done(*base, "--include-sensor", "--author", "A. N. Other", "--version", "4.2")
+    told = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    names = [v.name for v in told.modelVariables]
+    assert "measured_displacement" in names
+    assert "nonlinearity_angle" in names
+    assert (told.author, told.version) == ("A. N. Other", "4.2")
+
+
+def test_the_same_model_gives_the_same_bytes_and_carries_itself(tmp_path: Path) -> None:
+    one, two = (psa.export_fmu(van_der_pol(), tmp_path / f"{k}.fmu") for k in (1, 2))
+    assert one.read_bytes() == two.read_bytes()
+    with zipfile.ZipFile(fmu_of(2)) as archive:
+        inside = json.loads(archive.read("resources/model.json"))
+        names = archive.namelist()
+    assert inside["format"] == "psa_casadi.model/1"
+    assert inside["parameters"]["k_L"]["value"] == psa.stack_model(STACK).values["k_L"]
+    for part in ("modelDescription.xml", "model.png", "documentation/index.html"):
+        assert part in names
+    assert any(n.startswith("sources/") and n.endswith(".c") for n in names)
+
+
+@slow
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_check_passes_what_is_right_and_names_what_is_not(fmi: int, tmp_path: Path) -> None:
+    passed = done("check", fmu_of(fmi), "--stack", STACK, "--json", tmp_path / "c.json",
+                  "--junit", tmp_path / "c.xml")  # fmt: skip
+    assert "FAIL" not in passed.out
+    content = json.loads((tmp_path / "c.json").read_text("utf-8"))
+    assert content["format"] == "psa_casadi.check/1"
+    xml = (tmp_path / "c.xml").read_text("utf-8")
+    assert re.search(r'failures="0"', xml)
+
+
+@slow
+def test_a_check_beside_another_model_fails() -> None:
+    other = command("check", fmu_of(2), "--stack", "PTBS200")
+    assert other.code == 1
+    assert "FAIL" in other.out
+    report = psa.check_fmu(fmu_of(2), psa.stack_model(STACK))
+    assert report.passed
+    assert report.compared
+    assert len(report.rows) > 10
+
+
+@slow
+def test_a_check_finds_a_description_that_was_spoiled(tmp_path: Path) -> None:
+    with zipfile.ZipFile(fmu_of(2)) as archive:
+        entries = {n: archive.read(n) for n in archive.namelist()}
+    description = entries["modelDescription.xml"].decode()
+    spoiled = {
+        "start value": description.replace('start="7.3"', 'start="7.4"', 1),
+        "guid": re.sub(r'guid="\{?.', 'guid="{0', description, count=1),
+        "xml": description.replace("</fmiModelDescription>", ""),
+    }
+    for name, text in spoiled.items():
+        assert text != description, name
+        path = tmp_path / "spoiled.fmu"
+        with zipfile.ZipFile(path, "w") as archive:
+            for entry, data in entries.items():
+                archive.writestr(entry, text if entry == "modelDescription.xml" else data)
+        assert command("check", path).code in (1, 2), name
+
+
+def test_a_step_of_fixed_length_is_exported_for_co_simulation(tmp_path: Path) -> None:
+    path = tmp_path / "fixed.fmu"
+    done("export", "fmu", "--stack", STACK, "--solver", "fixed", "--step", "100us", "-o", path)
+    told = fmpy.read_model_description(str(path))
+    assert told.modelExchange is None
+    assert float(told.defaultExperiment.stepSize) == 1e-4
+    time, voltage, expected = reference_run()
+    found = played(path, time, {"voltage": voltage}, step_size=2e-4)
+    x = np.interp(time, found["time"], found["displacement"])
+    assert off(x, expected.displacement) < 0.02
+    said = refused("export", "fmu", "--stack", STACK, "--solver", "fixed", "-o", path)
+    assert "--step" in said
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_c_for_a_controller_errs_as_little_as_it_says(precision: str, tmp_path: Path) -> None:
+    compiler = shutil.which("cc") or pytest.skip("no C compiler")
+    said = done("export", "c", "--stack", STACK, "--step", "200us", "--name", "stack",
+                "--precision", precision, "-o", tmp_path / "code").out  # fmt: skip
+    assert "substeps" in said or "%" in said
+    time, voltage, expected = reference_run()
+    (tmp_path / "code" / "play.c").write_text(
+        '#include "stack.h"\n'
+        "void play(int n, const double *v, double *x) {\n"
+        "    stack_state state; stack_input input = {0}; stack_output output;\n"
+        "    stack_init(&state);\n"
+        "    for (int k = 0; k < n; ++k) {\n"
+        "        input.voltage = v[k];\n"
+        "        stack_step(&state, &input, &output);\n"
+        "        x[k] = output.displacement;\n"
+        "    }\n"
+        "}\n"
+    )
+    library = tmp_path / "play.so"
+    subprocess.run(
+        [compiler, "-std=c99", "-Wall", "-Werror", "-O1", "-shared", "-fPIC", "-o", library,
+         "play.c", "stack.c", "-lm"],
+        cwd=tmp_path / "code", check=True,
+    )  # fmt: skip
+    found = np.zeros(time.size - 1)
+    given = np.ascontiguousarray(voltage[1:])
+    double = ctypes.POINTER(ctypes.c_double)
+    ctypes.CDLL(str(library)).play(
+        len(given), given.ctypes.data_as(double), found.ctypes.data_as(double)
+    )
+    assert off(found, expected.displacement[1:]) < 1e-3
+
+
+def test_modelica_has_the_equations_for_another_compiler(tmp_path: Path) -> None:
+    """Rumoca, an independent compiler, runs it to the reference's displacement."""
+    model = psa.stack_model(STACK)
+    path = psa.export_modelica(model, tmp_path / "PiezoStack.mo")
+    text = path.read_text("utf-8")
+    assert text.startswith("package PiezoStack") or "\npackage PiezoStack" in text
+    for part in ("model Signal", "Acausal", "Examples"):
+        assert part in text
+    assert re.search(r'Real k_L\(unit="N/V".*\) = 7\.3 "', text)
+    stop = 0.02
+    harness = (
+        f"{text}\nmodel Harness PiezoStack.Signal psa(voltage=2500.0*time, load_force=0.0);"
+        " end Harness;"
+    )
+    config = rumoca.SimConfig(solver="bdf", rtol=1e-10, atol=1e-16, dt=stop / 100)
+    run = rumoca.Session().loads(harness, model="Harness").simulate(t=(0.0, stop), config=config)
+    time = np.asarray(run.time)
+    expected = reference.simulate(model.values, lambda t: 2500.0 * t, time)
+    assert off(np.asarray(run["psa.displacement"]), expected.displacement) < 1e-5
+
+
+@slow
+def test_a_closed_loop_runs_as_ssp_as_it_does_as_one_model(tmp_path: Path) -> None:
+    archive, picture = tmp_path / "stage.ssp", tmp_path / "wiring.svg"
+    said = done("export", "ssp", "-o", archive, "--picture", picture).out
+    parts = [c.name for c in read_ssd(str(archive)).system.elements]
+    assert parts == ["controller", "compensator", "amplifier", "stack", "flexure"]
+    assert "reference" in said
+    assert "controller" in picture.read_text("utf-8")
+    found = simulate_ssp(
+        str(archive), stop_time=2e-3, step_size=2.5e-6,
+        input={"reference": lambda t: 4e-6 * (1 - np.cos(500 * np.pi * t))},
+    )  # fmt: skip
+    model = psa.nanopositioner(STACK).model()
+    time = np.linspace(0.0, 2e-3, 801)
+    wanted = 4e-6 * (1 - np.cos(500 * np.pi * time))
+    inputs = np.array([[w if n == "reference" else 0.0 for n in model.input_names] for w in wanted])
+    starts = np.array([s.start for s in model.structure.states])
+    whole = psa.run(model, time, inputs, starts, hold="linear")
+    expected = whole.y[:, model.output_names.index("stage_position")]
+    position = np.interp(time, found["time"], found["stage_position"])
+    assert off(position, expected) < 0.005
+
+
+def test_an_fmu_of_an_own_model_is_read_back_and_runs_alike(tmp_path: Path) -> None:
+    path = psa.export_fmu(van_der_pol(), tmp_path / "v.fmu", fmi=3)
+    read = psa.fmu_model(path, free={"mu": (0.1, 10.0)}, values={"mu": 2.3})
+    time = np.linspace(0.0, 10.0, 501)
+    nothing, start = np.empty((501, 0)), np.array([2.0, 0.0])
+    own = psa.run(van_der_pol().with_values({"mu": 2.3}), time, nothing, start, rtol=1e-8)
+    found = psa.run(read, time, nothing, start, rtol=1e-8)
+    np.testing.assert_allclose(found.y, own.y, atol=1e-5)
+    assert read.output_names == ("position",)
+    with pytest.raises(psa.InputError, match="FMU"):
+        psa.export_fmu(read, tmp_path / "again.fmu")
+
+
+@pytest.mark.parametrize("part", ["flexure_stage", "position_controller", "charge_amplifier"])
+def test_parts_are_exported(part: str, tmp_path: Path) -> None:
+    done("export", "fmu", "--part", part, "-o", tmp_path / "x.fmu")
+    assert validate_fmu(str(tmp_path / "x.fmu")) == []
+    done("export", "modelica", "--part", part, "-o", tmp_path / "x.mo", "--name", "Part")
+    values = psa.part_model(part).values
+    told = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    starts = {v.name: v.start for v in told.modelVariables if v.causality == "parameter"}
+    assert {n: float(starts[n]) for n in values} == dict(values)
+
+
+@slow
+def test_an_fmu_holds_binaries_of_other_platforms(tmp_path: Path) -> None:
+    pytest.importorskip("ziglang")
+    path = tmp_path / "x.fmu"
+    done("export", "fmu", "--stack", STACK, "--platforms", "x86_64-linux,x86_64-windows",
+         "-o", path)  # fmt: skip
+    with zipfile.ZipFile(path) as archive:
+        binaries = {n: archive.read(n)[:4] for n in archive.namelist() if "binaries/" in n}
+    assert binaries["binaries/linux64/P_885_51.so"] == b"\x7fELF"
+    assert binaries["binaries/win64/P_885_51.dll"][:2] == b"MZ"
+    done("check", path, "--portable")
