@@ -163,7 +163,6 @@ _HOMES = {
         "load_model",
         "save_model",
     ),
-    "psa_casadi.simulation.history": ("memory_after", "settled_at"),
     "psa_casadi.simulation.many": ("simulate_many",),
     "psa_casadi.simulation.stepper": ("run",),
     "psa_casadi.simulation.timings": (
@@ -172,6 +171,8 @@ _HOMES = {
     ),
     "psa_casadi.simulation.simulate": (
         "Trajectory",
+        "memory_after",
+        "settled_at",
         "simulate",
         "simulate_record",
     ),
