@@ -314,7 +314,7 @@ def test_a_fault_of_the_package_ends_with_1_and_a_short_message(
         (("compare", "absent.json", "b.json"), "absent.json: cannot be read (there is no such"),
         (
             ("simulate", "--model", "bytes", "--input", "x"),
-            "bytes cannot be read (it is no text in",
+            "bytes: cannot be read (it is no text in",
         ),
         (("export", "c", "--step", "10us", "--stack", "demo", "-o", "bytes"), "there is a file of"),
         (("examples", "ci", "-o", "bytes"), "bytes: cannot be created, there is a file of that"),

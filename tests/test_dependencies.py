@@ -28,6 +28,8 @@ pytestmark = pytest.mark.xdist_group("dependencies")
 _PARTS = ("body", "orelse", "finalbody", "handlers", "cases")
 #: The extras that a file format needs.
 FORMATS = ("parquet", "tdms", "uff")
+#: And those of other optional packages.
+OTHERS = ("check",)
 CLASSIFIED = [
     c.removeprefix("Programming Language :: Python :: ")
     for c in PROJECT["classifiers"]
@@ -78,7 +80,7 @@ def test_every_requirement_has_a_lower_bound(extra: str) -> None:
 
 
 def test_what_is_imported_is_what_is_required() -> None:
-    optional = {r.name.lower() for extra in FORMATS for r in EXTRAS[extra]}
+    optional = {r.name.lower() for extra in (*FORMATS, *OTHERS) for r in EXTRAS[extra]}
     imported = {name for _, name, _ in _third_party()}
     assert imported - optional == {r.name.replace("-", "_") for r in CORE}
     assert optional <= imported

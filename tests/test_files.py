@@ -222,7 +222,7 @@ def test_a_child_that_is_not_waited_for_dies_with_its_children(tmp_path: Path) -
 #: Reads an HDF5 file by an interpreter that notes its number and never ends.
 READS = """
 import sys
-from psa_casadi.cli.surroundings import prepare
+from psa_casadi.cli.failures import prepare
 from psa_casadi.records import read_record
 prepare()
 sys.executable = sys.argv[1]

@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextvars import copy_context
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -42,7 +43,7 @@ def command(*words: str | Path) -> Ended:
     out, err, code = io.StringIO(), io.StringIO(), 0
     with _own_process(["psa", *map(str, words)]), redirect_stdout(out), redirect_stderr(err):
         try:
-            main()
+            copy_context().run(main)  # which keeps what was typed
         except SystemExit as ended:
             code = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
     return Ended(code, out.getvalue(), err.getvalue())
