@@ -12,8 +12,9 @@ from psa_casadi.errors import InputError
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from tests.benchmarks.__main__ import app
+from tests.benchmarks.floor_features import play
 from tests.benchmarks.floor_fit import HISTORIES, Part, floor_of, ridge
-from tests.benchmarks.floors import floor_on, play, run_on
+from tests.benchmarks.floors import floor_on, run_on
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 
-from tests.benchmarks.floors import (
+from tests.benchmarks.floor_features import (
     Columns,
     Mode,
     apart,
