@@ -167,7 +167,9 @@ def test_each_mistake_in_a_file_is_named() -> None:
         "NaN is no number": lambda c: c[parameters]["n"].update(value=float("nan")),
         "unknown parameters ['warp']": lambda c: c[parameters].update(warp={"value": 1}),
         "'parameters.n.interval' is [1]": lambda c: c[parameters]["n"].update(interval=[1]),
-        "'identified_from[0].sha256' is missing": lambda c: c.update(identified_from=[{"record": "a"}]),
+        "'identified_from[0].sha256' is missing": lambda c: c.update(
+            identified_from=[{"record": "a"}]
+        ),
         "'notes' is 'one'": lambda c: c.update(notes="one"),
         "'name' is 3": lambda c: c.update(name=3),
         "'u'": lambda c: c["components"].remove("drive") or [
