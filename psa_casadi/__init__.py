@@ -316,9 +316,17 @@ def __getattr__(name: str) -> Any:
     return value
 
 
+#: Where texts are made, which need no pictures; all else that a result shows is in `report.shown`.
+_TEXTS = {
+    "note_text": "psa_casadi.report.words.notes",
+    "sentence_of": "psa_casadi.report.words.advice_words",
+}
+
+
 def _show(what: str, *given: Any, **options: Any) -> Any:
     """Make what a result shows of itself."""
-    return getattr(import_module("psa_casadi.report.shown"), what)(*given, **options)
+    module = import_module(_TEXTS.get(what, "psa_casadi.report.shown"))
+    return getattr(module, what)(*given, **options)
 
 
 psa_casadi.shown.register(_show)

@@ -2,11 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any
 
-#: Where sentences are made. Imports point down, so it is looked up when a text is asked for.
-_WORDS = "psa_casadi.report.words.notes"
+from psa_casadi.shown import made
 
 
 @dataclass(frozen=True)
@@ -21,7 +19,7 @@ class Note:
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        return str(import_module(_WORDS).note_text(self))
+        return str(made("note_text", self))
 
 
 def note(code: str, **values: Any) -> Note:

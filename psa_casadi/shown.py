@@ -9,7 +9,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_WORDS = "psa_casadi.report.words.advice_words"
+_make: Callable[..., Any]
+
+
+def register(make: Callable[..., Any]) -> None:
+    """Register what makes a text, a picture or a page of a result, by the name of its function."""
+    global _make  # noqa: PLW0603 - one function for all results
+    _make = make
+
+
+def made(what: str, *given: Any, **options: Any) -> Any:
+    """Return what the registered function makes: "line", "plot", "note_text", ..."""
+    return _make(what, *given, **options)
 
 
 class Worded:
@@ -18,16 +29,7 @@ class Worded:
     @property
     def sentence(self) -> str:
         """The result in words."""
-        return str(import_module(_WORDS).sentence_of(self))
-
-
-_made: Callable[..., Any]
-
-
-def register(make: Callable[..., Any]) -> None:
-    """Register what makes the "line", "cell", "plot" or "report" of a result."""
-    global _made  # noqa: PLW0603 - one function for all results
-    _made = make
+        return str(made("sentence_of", self))
 
 
 class Celled:
@@ -35,7 +37,7 @@ class Celled:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: words, and a table or a picture."""
-        return str(_made("cell", self))
+        return str(made("cell", self))
 
 
 class Plotted(Celled):
@@ -50,7 +52,7 @@ class Plotted(Celled):
         Raises:
             InputError: there is no such output.
         """
-        return cast("Figure", _made("plot", self, ax, output))
+        return cast("Figure", made("plot", self, ax, output))
 
 
 class Lined(Celled):
@@ -58,7 +60,7 @@ class Lined(Celled):
 
     def __repr__(self) -> str:
         """Return the result in one line."""
-        return str(_made("line", self))
+        return str(made("line", self))
 
 
 class Shown(Plotted, Lined):
@@ -76,7 +78,7 @@ class Reported(Shown):
         Raises:
             InputError: `path` cannot be written to.
         """
-        _made("report", self, path, still=still)
+        made("report", self, path, still=still)
 
 
 def with_units(columns: Mapping[str, Any], units: Mapping[str, str]) -> dict[str, Any]:

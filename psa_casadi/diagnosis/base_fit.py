@@ -272,7 +272,7 @@ _MUCH = 0.985
 #: n ln(ratio of rms) by which a fit with resonances must be better to count.
 _CLEAR = 15.0
 #: Multiple of the sampling rate about which the images of a mode's tone are tried at most.
-_IMAGES_variants = 3
+_NEAR_IMAGES = 3
 _QUICK, _FIRST, _BEST = 8, 4, 2
 #: How far above what is of use the cost after the first evaluations may be.
 _HOPEFUL = 2.0
@@ -342,7 +342,7 @@ def instead_of_mode(
     values = found.model.values
     tone, damping = values[mode.tone or ""], values["mode_damping"]
     rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
-    near = images(tone, rate, _IMAGES_variants)
+    near = images(tone, rate, _NEAR_IMAGES)
     starts = [m for f in near for m in _masses(before.model.values, [f], damping * tone / f)]
     return _with_masses(before, starts, experiments, _as_good(found, _AS_GOOD))
 

@@ -390,7 +390,7 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     said = [(v.share, _followed(v, unit)) for v in views if v.significant]
     if held is not None and held.significant:
         said.append((held.share, _held(held, slope, count, unit)))
-    said.append((spectrum.share, _lines_misfit(spectrum)))
+    said.append((spectrum.share, _lines_note(spectrum)))
     worth = sorted((row for row in said if row[0] > WORTH_SAYING), key=lambda row: -row[0])
     findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in worth)]
     if split is not None and split.repeats > WORTH_SAYING * ground.excess:
@@ -462,7 +462,7 @@ def _held(v: View, slope: Slope | None, count: int, unit: str) -> Note:
     return note("holds", count=count, moves=moves, share=v.share)
 
 
-def _lines_misfit(s: Spectrum) -> Note:
+def _lines_note(s: Spectrum) -> Note:
     lines = tuple((line.frequency, line.name, (line.amplitude, s.unit)) for line in s.others[:3])
     return note("lines", lines=lines, count=len(s.others), share=s.share)
 

@@ -20,8 +20,6 @@ FloatArray = npt.NDArray[np.float64]
 Hold = Literal["linear", "zero"]
 #: So many jumps, and such a share of all moves, make a staircase.
 _JUMPS, _NEARLY_ALL = 2, 0.8
-#: What stands for the samples of one experiment: `Signals`, a table with a column `time`, a CSV.
-OneSignals = "Signals | Mapping[str, Any] | str | os.PathLike[str] | Any"
 
 _WITH_UNIT = re.compile(r"[^\[]+\[[^\]]*\]\s*")
 

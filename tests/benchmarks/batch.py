@@ -54,11 +54,11 @@ def on_dask(
     """Return a batch on a new cluster of so many workers, and what became of them."""
     devices = len(list(records.glob("*.csv"))) - 1  # jobs.csv
     with dask_client(LOCAL, workers) as client:
-        before = _processes_batch_dask(client)
+        before = _worker_processes(client)
         killer = Killer(before, devices)
         say: Callable[[str], None] = (lambda t: killer(t, progress)) if kill else progress
         found = batch(records, output, executor=client, progress=say)
-        after = set(_processes_batch_dask(client).values())
+        after = set(_worker_processes(client).values())
     gone = sorted(set(before.values()) - after)
     if kill and gone != killer.killed:
         raise RuntimeError(f"Workers {killer.killed} were killed, and {gone} are gone.")
@@ -66,7 +66,7 @@ def on_dask(
     return found, f"{len(gone)} worker killed, {new} new in its place" if kill else ""
 
 
-def _processes_batch_dask(client: Any) -> dict[str, int]:
+def _worker_processes(client: Any) -> dict[str, int]:
     """Return the process of each worker by its address."""
     found: dict[str, int] = client.run(os.getpid)
     return found

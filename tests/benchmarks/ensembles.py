@@ -35,11 +35,11 @@ from tests.benchmarks.table import Outcome, Progress, TitledTable
 
 #: Sets on the GPU for each one on the cores, and those whose ranges are compared.
 MORE, _COMPARED = 100, 64
-_HEAD_ensembles_gpu = (
+_GPU_HEAD = (
     "voltage", "sets", "samples", "tolerance", "largest difference of a range from the cores'",
     "wall [s]", "ns per sample and set",
 )  # fmt: skip
-_NOTE_ensembles_gpu = (
+_GPU_NOTE = (
     "One set a thread of {}; of each set the range is kept, on the device. The starts of the sets"
     " are in the times, compiling is not."
 )
@@ -73,8 +73,8 @@ def on_gpu(
             number(wall), number(1e9 * wall / count / record.n),
         ))  # fmt: skip
     name = cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode()
-    table = Table(_HEAD_ensembles_gpu, tuple(rows))
-    return (TitledTable("Many sets on a GPU", table, _NOTE_ensembles_gpu.format(name)),), ""
+    table = Table(_GPU_HEAD, tuple(rows))
+    return (TitledTable("Many sets on a GPU", table, _GPU_NOTE.format(name)),), ""
 
 
 FloatArray = npt.NDArray[np.float64]

@@ -45,7 +45,7 @@ def picture(found: Sequence[Found], known: Sequence[str], foreign: Sequence[str]
     figure = Figure(figsize=(11.0, 15.0), layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=(3.2, 1.0))
     _confusion(above, [f for f in found if f.reached], known, foreign)
-    _reliability_hidden_figure(below, found)
+    _draw_reliability(below, found)
     return figure
 
 
@@ -97,7 +97,7 @@ def _confusion(
     axes.set_title("What was hidden and what was named, percent of each row's cases")
 
 
-def _reliability_hidden_figure(axes: Axes, found: Sequence[Found]) -> None:
+def _draw_reliability(axes: Axes, found: Sequence[Found]) -> None:
     """Draw how often effects are the cause against their probability.
 
     The 95 % intervals take them for independent, which those of one case are not.

@@ -250,7 +250,7 @@ _STARTS = ((1.1, 1.2), (1.6, 1.2), (2.5, 1.05))
 #: How many standard deviations h_0 may be off: the noise at rest, an ordinary hysteresis elsewhere.
 _DOUBT = 4.0
 #: Least noise over the range: what formulas without lags miss.
-_FLOOR_loop = 1e-3
+_LOOP_FLOOR = 1e-3
 #: A sample's voltage counts as held where it moves less than this share of the mean step.
 _HELD = 1e-2
 
@@ -280,7 +280,7 @@ def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | No
         return None
     compliance = static_compliance(model.values)
     size = compliance * model.values["h_ref"]
-    noise = max(_FLOOR_loop * level, *(high_frequency_noise(loop.x) for loop in loops))
+    noise = max(_LOOP_FLOOR * level, *(high_frequency_noise(loop.x) for loop in loops))
     doubt = np.array([noise if loop.rests else size for loop in loops])
 
     def parts(theta: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -27,9 +27,6 @@ _LEAST = 0.1
 _PREFIXED = frozenset(("m", "s", "V", "A", "N", "Pa", "Hz", "C", "W", "J", "rad"))
 _PREFIXES = (("M", 1e6), ("k", 1e3), ("", 1.0), ("m", 1e-3), ("µ", 1e-6), ("n", 1e-9))
 
-#: What a record may be: measured on a device, or computed.
-ORIGINS = ("measured", "synthetic")
-
 
 @dataclass(frozen=True)
 class Scale:
