@@ -1,7 +1,7 @@
 """The check of an FMU without a process for its code: starting that costs more than the checks do.
 
-For FMUs of this package whose code does no harm, faulty as it may be. `tests/test_fmu.py` and
-`tests/test_fmu_hostile.py` have the process.
+For FMUs of this package whose code does no harm, faulty as it may be.
+`tests/export/test_fmu.py` and `tests/export/test_fmu_hostile.py` have the process.
 """
 
 import pickle

@@ -30,7 +30,7 @@ from psa_casadi.records import read_record
 from psa_casadi.report.page.document import render
 from psa_casadi.report.words.tables import Table
 from psa_casadi.variables import Parameter
-from tests.record_files import HEADER, ROWS, write
+from tests.records.record_files import HEADER, ROWS, write
 
 BARRED = ("\0", "\x0b", "\x1b", "\ud800", "\ufffe", "\uffff")
 CARRIED = "\t\n\r <&>\"' ]]> \x7f\x85 µ \ud7ff\ue000\ufffd \U0001f600"

@@ -24,7 +24,7 @@ from psa_casadi.files import (
     temporary_file,
     temporary_folder,
 )
-from tests.record_files import HEADER, write
+from tests.records.record_files import HEADER, write
 
 
 def test_text_and_bytes_are_written_as_given(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.model.stacks import STACKS
-from tests.own_models import oscillator
-from tests.report_cases import diagnosis, identification
+from tests.any_model.own_models import oscillator
+from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]

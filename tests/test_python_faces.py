@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 import psa_casadi as psa
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.records import records_given
-from tests.report_cases import diagnosis, identification
+from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
 
 T = np.arange(64) * 1e-3

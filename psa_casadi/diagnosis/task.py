@@ -1,7 +1,7 @@
 """What a search for causes works on, by which method, and every constant that decides.
 
 What a search does with its time (how many fits, from how many starts) stands where it is done;
-these here decide what is said. `python -m tests.benchmarks ablation` doubles and halves each.
+these here decide what is said. `python -m tests.studies ablation` doubles and halves each.
 """
 
 from collections.abc import Callable, Iterator, Sequence

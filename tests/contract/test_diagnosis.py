@@ -25,8 +25,8 @@ from tests.contract.helpers import (
     table,
     write,
 )
-from tests.html_page import Page, figures
-from tests.plants.make import make_demo
+from tests.report.html_page import Page, figures
+from tests.studies.plants.make import make_demo
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("contract")]
 VERDICTS = (

@@ -10,11 +10,11 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi import reference
-from tests import own_plants
+from tests.any_model import own_plants
+from tests.any_model.own_models import motor
 from tests.contract.helpers import DATA, done, reference_run, refused, table, write
 from tests.contract.test_models import off
-from tests.html_page import Page
-from tests.own_models import motor
+from tests.report.html_page import Page
 
 pytestmark = pytest.mark.slow
 STACK = "P-885.51"

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import psa_casadi as psa
-from tests import own_models as models
-from tests import own_plants as plants
-from tests.exam.marks import Answer, Named, mark
-from tests.exam.play import write
-from tests.exam.record import Record, Stack, Test
-from tests.exam.records import RECORDS
-from tests.plants.make import make_record
-from tests.plants.table import called
+from tests.any_model import own_models as models
+from tests.any_model import own_plants as plants
+from tests.studies.exam.marks import Answer, Named, mark
+from tests.studies.exam.play import write
+from tests.studies.exam.record import Record, Stack, Test
+from tests.studies.exam.records import RECORDS
 from tests.studies.golden.exports import EXPORTS
+from tests.studies.plants.make import make_record
+from tests.studies.plants.table import called
 
 Row = dict[str, str]
 
@@ -40,7 +40,7 @@ class Case:
 
 
 def diagnosed(asked: Record | None, *given: Any, **words: Any) -> Row:
-    """Return a diagnosis as text, with its mark where the truth is known (`tests.exam.marks`)."""
+    """Return a diagnosis as text, with its mark where the truth is known (`exam.marks`)."""
     begin = time.process_time()
     told = psa.diagnose(*given, **words).to_dict()
     seconds = time.process_time() - begin

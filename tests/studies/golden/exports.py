@@ -12,7 +12,7 @@ import fmpy
 import numpy as np
 
 import psa_casadi as psa
-from tests.own_models import motor
+from tests.any_model.own_models import motor
 
 #: What differs between two exports of one model, or between versions, and says nothing of it.
 _UNSTABLE = (

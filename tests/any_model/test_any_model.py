@@ -1,0 +1,323 @@
+"""Diagnosis of models that are no stacks: causes that independent plants hide, and clean ones."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from fmpy import simulate_fmu
+
+import psa_casadi as psa
+from build_scripts.measured_data import ROOT
+from build_scripts.page_commands import block_in_tests
+from psa_casadi.any_model.effects.attached import extended
+from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.any_model.predict import Sizes, sizes_of
+from psa_casadi.any_model.runs import runs_of
+from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.model.ports import with_ports
+from psa_casadi.records.signals import Signals
+from psa_casadi.report.words.own_words import own_verdict_sentence
+from tests.any_model import own_plants as plants
+from tests.any_model.own_models import motor, oscillator, pair, tanks
+from tests.export.modelica_runs import load
+from tests.report.browser import DARK, find_browser
+from tests.report.html_page import Page, figures, numbers
+from tests.report.test_schemas import valid
+
+
+@cache
+def _hysteresis() -> psa.OdeDiagnosis:
+    return psa.diagnose(oscillator(), plants.bouc_wen(1))
+
+
+def _only(d: psa.OdeDiagnosis, effect: str) -> bool:
+    return d.verdict == "cause_named" and [c.effect for c in d.causes] == [effect]
+
+
+def test_a_clean_model_of_two_outputs_is_identified_with_its_errors(tmp_path: Path) -> None:
+    found = psa.identify(motor(), plants.motor(2, friction=0.0), starts=3)
+    true = {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}
+    for name, value in true.items():
+        assert abs(found.model.values[name] - value) < 4.0 * found.errors[name]
+        assert found.errors[name] < 0.05 * value
+    assert found.rms["w"] == pytest.approx(0.3, rel=0.05)
+    assert found.rms["i"] == pytest.approx(0.005, rel=0.05)
+    assert not found.warnings
+    assert found.model.provenance.identified_from[0][0] == "drive"
+    found.report(tmp_path / "fit.html")
+    page = Page((tmp_path / "fit.html").read_text("utf-8"))
+    assert "w by 0.301 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
+    assert "R 1.200 1.199 to 1.200 Ohm fit" in page.text
+    assert page.loaded == []
+
+
+#: Tests that share a diagnosis run in one process.
+shares_hysteresis = pytest.mark.xdist_group("own hysteresis")
+_HOSTILE = "</script><img src=x onerror=alert(1)> $x_"
+
+
+@pytest.mark.slow
+@shares_hysteresis
+def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> None:
+    d = _hysteresis()
+    assert _only(d, "hysteresis_of_x_in_v")
+    assert d.causes[0].port == "the rate of v"
+    assert d.causes[0].confidence > 0.95
+    assert d.errors[0].base > 15.0 * d.errors[0].extended
+    assert d.errors[0].extended == pytest.approx(8e-6, rel=0.06)  # the noise
+    # the plant's own numbers, through an effect of other coordinates
+    assert d.model.values["m"] == pytest.approx(2.0, rel=0.01)
+    assert d.model.values["k"] == pytest.approx(5e4, rel=0.01)
+    per_m = d.model.values["hysteresis_of_x_in_v_size"]
+    per_m /= d.model.values["hysteresis_of_x_in_v_range"]
+    assert per_m * d.model.values["m"] == pytest.approx(5e4, rel=0.02)  # alpha
+    assert d.model.values["hysteresis_of_x_in_v_n"] == pytest.approx(1.0, abs=0.02)  # nu
+
+
+@pytest.mark.slow
+@shares_hysteresis
+def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
+    d, path = _hysteresis(), tmp_path / "page.html"
+    psa.write_report(d, path)
+    text = path.read_text("utf-8")
+    page = Page(text)
+    (run,) = d.runs
+    held = (run.outputs[:, 0] - d.extended[0][:, 0])[run.held_out]
+    rms = 1e6 * np.sqrt(np.mean(held**2))
+    assert page.text.startswith("Diagnosis of oscillator: cause named")
+    assert (
+        "The cause is hysteresis of x in v (the rate of v, confidence 99 %: virtually certain):"
+        f" it removes {d.budget.together.percents[0]} % of the base" in page.text
+    )
+    assert "position: error on held-out samples, rms base model 160 µm" in page.text
+    assert f"extended model {rms:.2f} µm" in page.text
+    rival = replace(d.causes[0], confidence=0.6, cannot_be_told_from=("stop_of_x",))
+    said = "(the rate of v, confidence 60 %: more likely than not; or stop of x)"
+    assert said in own_verdict_sentence(replace(d, causes=(rival,)))
+    assert re.search(r"hysteresis_of_x_in_v_n 0\.99\d+ 0\.99\d+ to 1\.0\d+ 1 fit", page.text)
+    assert page.loaded == []
+    assert page.targets <= page.names
+    assert "default-src 'none'" in text
+    above, below, *_ = (t for t in figures(text)[0]["data"] if t["name"] == "base model")
+    miss = 1e3 * (run.outputs - d.base[0])[:, 0]  # in mm
+    assert np.max(np.abs(numbers(below["y"]))) == pytest.approx(np.max(np.abs(miss)), rel=1e-5)
+    assert len(numbers(above["y"])) == len(numbers(below["y"])) > 1000
+    assert path.stat().st_size < 3_000_000
+    told = psa.story(d, width=300).splitlines()
+    assert told[0].startswith("verdict    cause named. The cause is hysteresis of x in v")
+    assert f"error      position: held-out rms 160 µm of the base, {rms:.2f} µm of the e" in told[3]
+    linear = psa.run(
+        d.model.with_values({"hysteresis_of_x_in_v_size": 0.0}), run.time, run.inputs,
+        np.zeros(len(d.model.state_names)), hold="linear",
+    ).y[:, 0]  # fmt: skip
+    size = f"it moves the position by up to {1e3 * np.ptp(d.extended[0][:, 0] - linear):.3g} mm"
+    assert size in told[1]
+    assert size in page.text
+    assert "Against it: approach from the same side" in page.text
+    document = valid("own_model", d.to_json())
+    assert document["causes"][0]["port"] == "the rate of v"
+    low, high = document["budget"]["causes"][0]["interval"]
+    assert 0.9 < low < d.explained_share < high
+    own = [f"{100 * x:.2f}" for x in (d.explained_share, low, 1.0)]
+    shown = f"hysteresis of x in v {own[0]} % {own[1]} to {own[2]} %"
+    assert shown in page.text  # cut, as no share is above 100 %
+    assert find_browser(tmp_path).serious_faults(path, DARK) == []
+
+
+@pytest.mark.slow
+@shares_hysteresis
+def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
+    d, path = _hysteresis(), tmp_path / "page.html"
+    (run,), (cause,) = d.runs, d.causes
+    hostile = replace(
+        d,
+        runs=(replace(run, signals=replace(run.signals, name=_HOSTILE)),),
+        causes=(replace(cause, description=_HOSTILE),),
+        missed=replace(d.missed, seen=_HOSTILE),
+        remarks=(_HOSTILE,),
+    )
+    hostile.report(path)
+    text = path.read_text("utf-8")
+    assert "<img src=x" not in text
+    page = Page(text)
+    assert page.loaded == []
+    assert page.text.count(_HOSTILE) >= 6  # the record thrice and more, cause, misfit, note
+
+
+@pytest.mark.slow
+@shares_hysteresis
+def test_the_extended_model_is_exported_like_any_other(tmp_path: Path) -> None:
+    d, record = _hysteresis(), plants.bouc_wen(1)
+    fmu = psa.export_fmu(d.model, tmp_path / "extended.fmu")
+    inputs = np.zeros(record.n, dtype=[("time", float), ("force", float)])
+    inputs["time"], inputs["force"] = record.time, record.columns["force"]
+    found = simulate_fmu(
+        str(fmu), fmi_type="CoSimulation", stop_time=record.duration,
+        output_interval=1.0 / 15000.0, input=inputs,  # fmpy holds an input over a step
+        relative_tolerance=1e-8, output=["position"],
+    )  # fmt: skip
+    shown = np.interp(record.time, found["time"], found["position"])
+    rest = record.columns["position"] - shown  # from the declared start; the plant begins there too
+    assert np.std(rest[300:]) < 1.1e-5
+    text = modelica_text(d.model, name="Oscillator")
+    assert "rate_v" in text
+    assert load(text, "Oscillator.Signal") is not None
+
+
+@pytest.mark.slow
+def test_dry_friction_of_a_motor_is_found_at_its_shaft(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program of the page, whose plant has its own equations."""
+    monkeypatch.chdir(tmp_path)
+    (program,) = block_in_tests("docs/howto/own_model.md").commands
+    names: dict[str, Any] = {}
+    exec("\n".join(program.split("\n")[1:-1]), names)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["motor.html", "motor_with_friction.fmu"]
+    d = names["result"]
+    assert isinstance(d, psa.OdeDiagnosis)
+    assert _only(d, "friction_in_speed")
+    assert d.model.values["friction_in_speed_size"] == pytest.approx(0.012 / 3e-5, rel=0.02)
+    for error, noise in zip(d.errors, (0.3, 0.005), strict=True):
+        assert error.base > 5.0 * noise
+        assert error.extended == pytest.approx(noise, rel=0.06)
+    (share,) = d.budget.causes
+    base, left = (
+        sum((getattr(e, of) / e.noise) ** 2 for e in d.errors) for of in ("base", "extended")
+    )
+    assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
+    assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
+    assert f"it removes {share.text} of the held-out error" in repr(d)
+    _is_adequate_without_friction(names["model"])
+
+
+def _is_adequate_without_friction(model: psa.Model) -> None:
+    """The same motor, whose effects are compiled by now."""
+    clean = plants.motor(2, friction=0.0)
+    columns = {"voltage": clean.columns["voltage"], "w": clean.columns["w"]}
+    d = psa.diagnose(model, {"time": clean.time, **columns, "amps": clean.columns["i"]})
+    assert d.verdict == "adequate"
+    assert not d.causes
+    assert d.base_fit is d.extended_fit
+
+
+@pytest.mark.slow
+@shares_hysteresis
+def test_a_cause_that_no_effect_has_is_unexplained() -> None:
+    d = psa.diagnose(oscillator(), plants.breathing(4))
+    assert d.verdict == "unexplained"
+    assert not d.causes
+    assert d.extended_fit is d.base_fit
+    free = d.correction
+    assert free is not None
+    assert f"{free.share:.0%}" in d.unnamed
+    told = d.budget.unnamed
+    assert told is not None
+    assert told.interval[0] < told.share == free.share < told.interval[1]
+    x = d.runs[0].outputs[:, 0]  # the state that it follows is what was measured
+    assert free.variable == "x"
+    assert len(free.along) == len(free.added) == len(x)
+    assert np.std(x - free.along) < np.std(x - d.base[0][:, 0])  # with it, the model is nearer
+    assert free.unit == "m/s2"
+    valid("own_model", d.to_json())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [oscillator, tanks, pair])
+def test_ports_and_effects_of_gain_0_leave_a_model_as_it_is(make: Callable[[], psa.Model]) -> None:
+    model = make()
+    runs = runs_of(model, [_quiet(model)], judged=False)
+    table = effects_of(model, sizes_of(model, runs))
+    assert len({e.name for e in table}) == len(table)
+    opened, every = with_ports(model), extended(model, table)
+    t, u = runs[0].time, runs[0].inputs
+    x0 = np.array([s.start for s in model.structure.states])
+    plain = psa.run(model, t, u, x0, rtol=1e-8)
+    beside = np.array([s.start for s in every.structure.states])
+    assert psa.run(opened, t, u, x0, rtol=1e-8).y == pytest.approx(plain.y, abs=1e-12)
+    shown = psa.run(every, t, u, beside, rtol=1e-8).y
+    size = np.ptp(plain.y) + np.max(np.abs(plain.y))
+    assert np.max(np.abs(shown - plain.y)) < 1e-4 * size  # steps of other lengths
+
+
+def _quiet(model: psa.Model) -> Signals:
+    t = np.linspace(0.0, 4.0, 200)
+    columns = {n: 1.0 + 0.5 * np.sin(2.0 * t + k) for k, n in enumerate(model.input_names)}
+    return Signals(
+        name="quiet", time=t, columns={**columns, **dict.fromkeys(model.output_names, t)}
+    )
+
+
+def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
+    x, v, u, k = (ca.SX.sym(n) for n in ("x", "v", "u", "k"))
+    model = psa.ode_model(
+        {"x": [x, v], "u": u, "p": k, "y": x, "ode": [v, u - k * x]},
+        name="any", outputs=["y"], values={"k": 1.0},
+    )  # fmt: skip
+    ones = dict.fromkeys(("x", "v", "u", "y"), 1.0)
+    text = (ROOT / "docs/howto/own_model.md").read_text("utf-8")
+    shown = []
+    for effect in effects_of(model, Sizes(ones, ones, ones, ones, sample=1.0, duration=1.0)):
+        kind, c = re.split("_of_|_in_", effect.name)[0], effect.component
+        if kind not in shown:
+            shown.append(kind)
+            fitted = [p for p in c.parameters if p.fitted]
+            said = "; ".join(
+                f"`{p.name.removeprefix(f'{c.name}_')}` {p.description}" for p in fitted
+            )
+            law = re.sub(r"\|(\w+)\|", r"abs(\1)", c.equation_text)
+            what = c.description.removeprefix(f"{effect.port.words}: ")
+            assert f"\n| `{c.name}` | {what} | `{law}` | {said} |\n" in text
+    assert len(shown) == text.count("\n| `") == 14
+
+
+def test_the_help_of_both_faces_tells_of_own_models() -> None:
+    for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
+        assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
+        assert str(face.__doc__).count(word) >= 2  # in the signature and in words
+
+
+def test_records_that_do_not_fit_are_refused_in_sentences(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 1.0, 50)
+    with pytest.raises(psa.InputError, match=r"lack the input 'force'.*Name the column so"):
+        psa.identify(oscillator(), {"time": t, "position": t})
+    with pytest.raises(psa.InputError, match=r"no output of the model 'oscillator'"):
+        psa.diagnose(oscillator(), {"time": t, "force": t})
+    with pytest.raises(psa.InputError, match=r"none named 'time'; name the times \[s\] so\.$"):
+        psa.identify(oscillator(), {"t": t, "force": t, "position": t})
+    for wrong in ({"time [s]": t, "force": t}, {"time": t, "force [N]": t, "position": t}):
+        with pytest.raises(psa.InputError, match=r"Write the names without units \('(time|force)'"):
+            psa.identify(oscillator(), wrong)
+    with pytest.raises(psa.InputError, match=r"model comes first.*psa.diagnose\(model, records\)"):
+        psa.diagnose({"time": t, "force": t, "position": t}, oscillator())  # type: ignore[call-overload]
+    with pytest.raises(psa.InputError, match=r"tells a diagnosis, and this is of type Signals"):
+        psa.story(_quiet(oscillator()))  # type: ignore[arg-type]
+    with pytest.raises(psa.InputError, match=r"does not strictly increase"):
+        psa.identify(oscillator(), {"time": t[::-1], "force": t, "position": t})
+    path = tmp_path / "run.csv"
+    path.write_text("time,force,position\n" + "0,1,x\n" * 9)
+    with pytest.raises(psa.InputError, match=r"'x' is no number"):
+        psa.identify(oscillator(), path)
+    with pytest.raises(psa.InputError, match=r"'zero_off', which begins the name of no effect"):
+        psa.diagnose(
+            oscillator(),
+            {"time": t, "force": t, "position": t**2},
+            leave_out=["zero_off"],
+            starts=1,
+        )
+
+
+def test_a_csv_file_and_a_table_are_the_same_record(tmp_path: Path) -> None:
+    record = plants.motor(2, friction=0.0)
+    table = {"time": record.time[:400], **{n: v[:400] for n, v in record.columns.items()}}
+    path = tmp_path / "drive.csv"
+    rows = np.column_stack(list(table.values()))
+    np.savetxt(path, rows, delimiter=",", header=",".join(table), comments="", fmt="%.17g")
+    one, other = (psa.identify(motor(), given, starts=1).model.values for given in (table, path))
+    assert one == other

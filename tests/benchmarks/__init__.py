@@ -1,1 +1,0 @@
-"""The tables behind every figure the project states: `python -m tests.benchmarks`."""

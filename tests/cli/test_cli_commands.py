@@ -1,0 +1,341 @@
+"""Single commands: stacks, models, what CI asks, the mechanism, and what is said of mistakes."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import fmpy
+import pytest
+from typer.testing import CliRunner, Result
+
+from psa_casadi.cli.app import app
+from psa_casadi.cli.screen import show_table
+from psa_casadi.design.mechanism.mechanism import design_mechanism
+from psa_casadi.diagnosis import diagnose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.check.check import CheckReport, CheckRow
+from psa_casadi.identification import identify
+from psa_casadi.model.model_file import load_model, save_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.records import sine, time_grid, write_record
+from psa_casadi.report.documents.junit import check_cases, junit_text
+from psa_casadi.report.page import playground
+from psa_casadi.report.words.tables import Table, effects_table
+from tests.records.record_files import HEADER, ROWS, write
+from tests.report.report_cases import diagnosis, identification
+from tests.report.test_schemas import valid
+from tests.tiers import slow
+
+
+def psa(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+@pytest.fixture
+def planned(tmp_path: Path) -> Path:
+    path, time = tmp_path / "planned.csv", time_grid(0.1, 1e-3)
+    write_record(path, {"time [s]": time, "voltage [V]": sine(time, 0.0, 80.0, 20.0)})
+    return path
+
+
+@slow
+def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> None:
+    fmu = tmp_path / "p.fmu"
+    done = psa("export", "fmu", "--stack", "P-885.51", "-o", fmu)
+    assert done.exit_code == 0, done.output
+    description = fmpy.read_model_description(str(fmu))
+    assert description.modelName == "P_885_51"
+    start = {v.name: v.start for v in description.modelVariables}
+    assert float(start["k_B"]) == STACKS["P-885.51"].values["k_B"].value
+    assert psa("check", fmu, "--json", tmp_path / "check.json").exit_code == 0
+    content = valid("check", (tmp_path / "check.json").read_text())
+    assert (content["passed"], content["compared"]) == (True, True)
+    assert "equations" in {row["name"] for row in content["rows"]}
+
+
+def test_a_wrong_choice_of_model_is_one_sentence(planned: Path, tmp_path: Path) -> None:
+    fmu = tmp_path / "x.fmu"
+    commands = (
+        ("simulate", "--input", planned, "-o", tmp_path / "y.csv"),
+        ("export", "fmu", "-o", fmu),
+    )
+    for command in commands:
+        for choice, expected in (
+            ((), "No model is given; add --model MODEL.json, or --stack NAME"),
+            (("--stack", "p885"), "did you mean P-885.51?"),
+            (("--stack", "xyzzy"), "there are PTBS200, WYDS0808020"),
+            (("--stack", "demo", "--model", tmp_path / "m.json"), "are both given"),
+        ):
+            result = psa(*command, *choice)
+            assert result.exit_code == 2
+            assert expected in result.stderr
+            assert len(result.stderr.splitlines()) == 1
+    assert psa("stacks", "xyzzy").exit_code == 2
+    assert list(tmp_path.iterdir()) == [planned]
+    with pytest.raises(InputError, match="no stack named"):
+        stack_model("PTBS2")
+
+
+@pytest.mark.parametrize("way", [["--model"], []], ids=["option", "file alone"])
+def test_the_playground_and_a_posterior_take_a_model(
+    way: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, played = tmp_path / "model.json", []
+    save_model(stack_model("demo"), file)
+    monkeypatch.setattr(playground, "write_playground", lambda *given: played.append(given))
+    assert psa("web", *way, file, "-o", tmp_path / "p.html").exit_code == 0
+    ((path, model),) = played
+    assert path == tmp_path / "p.html"
+    assert model.values == stack_model("demo").values
+    twice = psa("web", *way, file, file)
+    assert twice.exit_code == 2
+    assert "is one file too many" in twice.output
+    words: list[str | Path] = [*way, file, tmp_path / "absent.csv"]
+    assert psa("sample", *words).stderr.startswith(f"Error: {tmp_path / 'absent.csv'}: there is no")
+    without = psa("sample", tmp_path / "absent.csv")
+    assert "No model is given; add --model MODEL.json" in without.stderr
+
+
+def test_an_identification_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(identify, "identify", lambda *_, **__: identification())
+    monkeypatch.chdir(tmp_path)
+    record = write(tmp_path / "a.csv", HEADER, *ROWS)
+    shown = psa("identify", record, "--stack", "P-885.51")
+    assert shown.exit_code == 0, shown.output
+    assert "95 % interval" in shown.stdout
+    assert "written" not in shown.stdout
+    assert max(map(len, shown.stdout.splitlines())) <= 80
+    assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
+
+
+@pytest.mark.parametrize("width", [1, 8, 20, 26, 30, 80])
+def test_a_table_has_the_width_that_there_is(width: int) -> None:
+    table = Table(("name", "what it is"), (("a_long_name", "it goes on and on and on"), ("b", "")))
+    lines = table.fitted(width).splitlines()
+    # a column has one character at least, and two spaces part it from the next
+    assert max(map(len, lines)) <= max(width, 4)
+    if width >= 20:  # the longest words are whole
+        words = (w for line in lines for w in line.split() if "--" not in w)
+        whole = " ".join((*table.head, *(cell for row in table.rows for cell in row)))
+        assert sorted(words) == sorted(whole.split())
+    if width == 80:
+        assert str(table).splitlines() == lines
+        assert lines[2] == "a_long_name  it goes on and on and on"
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_table_on_a_terminal_is_neither_cut_nor_too_wide(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
+    monkeypatch.setenv("COLUMNS", "80")
+    show_table(effects_table(EFFECTS.values()))
+    lines = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    words = {word for line in lines for word in line.split()}
+    assert set(EFFECTS) <= words
+    assert {w for e in EFFECTS.values() for w in e.looks_like.split()} <= words
+
+
+#: Elements of Jenkins' schema of JUnit files that we write: attributes (* must be), what is inside.
+JUNIT: dict[str, tuple[set[str], set[str]]] = {
+    "testsuites": ({"name", "time", "tests", "failures", "disabled", "errors"}, {"testsuite"}),
+    "testsuite": (
+        {"name*", "tests*", "failures", "errors", "time", "disabled", "skipped", "timestamp",
+         "hostname", "id", "package"},
+        {"properties", "testcase", "system-out", "system-err"},
+    ),
+    "testcase": (
+        {"name*", "assertions", "time", "classname", "status"},
+        {"skipped", "error", "failure", "system-out", "system-err"},
+    ),
+    "failure": ({"type", "message"}, set()),
+    "system-out": (set(), set()),
+}  # fmt: skip
+
+
+def cases_of(text: str) -> dict[str, str | None]:
+    """Check a file against the schema and its own counts; return each case with its failure."""
+    root = ElementTree.fromstring(text)
+    assert root.tag == "testsuites"
+    for element in root.iter():
+        attributes, inside = JUNIT[element.tag]
+        assert set(element.attrib) <= {a.strip("*") for a in attributes}
+        assert {a[:-1] for a in attributes if a.endswith("*")} <= set(element.attrib)
+        assert {inner.tag for inner in element} <= inside
+        for count in ("tests", "failures", "errors", "skipped"):
+            assert re.fullmatch(r"\d+", element.get(count, "0"))
+        if element.tag.startswith("testsuite"):
+            assert int(element.attrib["tests"]) == len(list(element.iter("testcase")))
+            assert int(element.attrib["failures"]) == len(list(element.iter("failure")))
+            assert float(element.attrib["time"]) >= 0.0
+    failures = ((c.attrib["name"], c.find("failure")) for c in root.iter("testcase"))
+    return {name: None if f is None else f.attrib["message"] for name, f in failures}
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str | Path]:
+    """The command on a record whose diagnosis is known: its cause is named, 0.5 % is left."""
+    known = diagnosis("cause_named")
+    known = replace(
+        known, extended_errors=replace(known.extended_errors, holdout_nrmse_percent=0.5)
+    )
+    monkeypatch.setattr(diagnose, "diagnose", lambda *_, **__: known)
+    return ["diagnose", write(tmp_path / "a.csv", HEADER, *ROWS), "--quiet"]
+
+
+def run(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(w) for w in words])
+
+
+@pytest.mark.parametrize(
+    ("options", "wrong"),
+    [
+        ((), ""),
+        (("--expect", "adequate,cause_named", "--max-error", "0.5%"), ""),
+        (("--expect", "Cause named", "--max-error", "1 %"), ""),
+        (
+            ("--expect", "adequate,unexplained"),
+            "The verdict is cause_named; expected adequate or unexplained.",
+        ),
+        (
+            ("--max-error", ".4%"),
+            "The extended model's held-out error is 0.500 % of the range; expected 0.4 % at most.",
+        ),
+    ],
+)
+def test_a_result_that_is_not_as_expected_ends_with_1(
+    asked: list[str | Path], options: tuple[str, ...], wrong: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "tests.xml"
+    result = run(*asked, *options, "--junit", file)
+    assert result.exit_code == bool(wrong), result.output
+    assert result.output == (f"Not as expected: {wrong}\n" if wrong else "")
+    cases = cases_of(file.read_text(encoding="utf-8"))
+    assert list(cases) == ["verdict", "held-out error"]
+    assert [f for f in cases.values() if f] == [wrong] * bool(wrong)
+
+
+def test_the_checks_of_an_fmu_are_tests() -> None:
+    rows = (
+        CheckRow("calls", 0.0, 0.0, True, ""),
+        CheckRow("agreement", 3e-3, 1e-4, False, 'at "0.1 s" & <\x1b>'),
+        CheckRow("states", float("nan"), 0.0, False, "the check stopped"),
+    )
+    report = CheckReport(Path("a.fmu"), rows, compared=True)
+    text = junit_text("check", "a.fmu", check_cases(report), 1.0)
+    assert cases_of(text) == {
+        "calls": None,
+        "agreement": 'found 0.00300, allowed 1.00e-4: at "0.1 s" & <\ufffd>',
+        "states": "found not finite, allowed 0: the check stopped",
+    }
+
+
+STACK = "PTBS200"
+
+
+@slow
+def test_command_writes_model_port_and_page(tmp_path: Path) -> None:
+    files = [tmp_path / name for name in ("mount.json", "stack.json", "page.html")]
+    arguments = ["design", "mechanism", "--stack", STACK, "--damping", "0.7", "--starts", "1"]
+    arguments += ["-o", str(files[0]), "--port", str(files[1]), "--report", str(files[2])]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "no mechanism moves it" in result.output
+    expected = design_mechanism(stack_model(STACK), damping=0.7, starts=1)
+    mount, port = load_model(files[0]), load_model(files[1])
+    assert mount.values["m_m"] == pytest.approx(expected.mounting.mass, rel=1e-3)
+    assert "prestress_force" in port.input_names
+    page = files[2].read_text(encoding="utf-8")
+    assert "Root locus" in page
+    assert "lag, cannot be moved" in page
+    assert "Change the model and see" in page
+    assert '"kind": "report"' in page
+    assert page.count("data:image/png") == 1
+    assert len(page) < 3e6
+    assert json.loads(files[0].read_text())["components"] == ["prestress_mechanism"]
+
+
+def test_command_tells_every_mistake(tmp_path: Path) -> None:
+    arguments = ["design", "mechanism", "--stack", STACK, "--poles", "fast"]
+    arguments += ["--max-stroke-loss", "much", "-o", str(tmp_path / "no" / "mount.json")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    for part in ("'fast' is no pole", "'much' is no share", "does not exist"):
+        assert part in " ".join(result.output.split())
+
+
+def refused(*arguments: str | Path, outputs: Path, code: int = 2) -> str:
+    """Run a command that must fail in the given way, and return what it says on stderr."""
+    before = sorted(outputs.rglob("*"))
+    result = psa(*arguments)
+    assert result.exit_code == code, result.output
+    assert isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+    assert sorted(outputs.rglob("*")) == before
+    return result.stderr
+
+
+def test_outputs_that_collide(tmp_path: Path) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+    same = tmp_path / "same"
+    said = refused("diagnose", good, "-o", same, "--json", same, outputs=tmp_path)
+    assert "both -o and --json name it" in said.replace("--output", "-o")
+    said = refused("identify", good, "-o", good, outputs=tmp_path)
+    assert "would overwrite an input" in said
+    assert good.read_text(encoding="utf-8").startswith(HEADER)
+
+
+def test_a_fault_of_the_package_ends_with_1_and_a_short_message(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = write(tmp_path / "good.csv", HEADER, *ROWS)
+
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("one over none")
+
+    monkeypatch.setattr("psa_casadi.identification.identify.identify", broken)
+    monkeypatch.delenv("PSA_CASADI_DEBUG", raising=False)
+    out = tmp_path / "m.json"
+    said = refused("identify", good, "-o", out, "--quiet", outputs=tmp_path, code=1)
+    assert "unexpected ZeroDivisionError (one over none)" in said
+    assert len(said.splitlines()) == 1
+    monkeypatch.setenv("PSA_CASADI_DEBUG", "1")
+    assert isinstance(psa("identify", good, "-o", out).exception, ZeroDivisionError)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("compare", "absent.json", "b.json"), "absent.json: cannot be read (there is no such"),
+        (
+            ("simulate", "--model", "bytes", "--input", "x"),
+            "bytes: cannot be read (it is no text in",
+        ),
+        (("export", "c", "--step", "10us", "--stack", "demo", "-o", "bytes"), "there is a file of"),
+        (("examples", "ci", "-o", "bytes"), "bytes: cannot be created, there is a file of that"),
+        (("datasets", "micromanipulator", "-o", "bytes"), "bytes: cannot be created"),
+        (("check", "bytes", "--timeout", "inf"), "'--timeout'"),
+        (
+            ("design", "experiment", "--stack", "demo", "--duration", "1", "--samples", "0"),
+            "0 samples hold no experiment",
+        ),
+        (
+            ("design", "mechanism", "--stack", "demo", "--damping", "0.5", "--max-force", "inf"),
+            "The largest force is inf N; give a positive one",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_told_in_words(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bytes").write_bytes(bytes(range(256)))
+    output = () if "-o" in words or words[0] == "check" else ("-o", "out")
+    told = refused(*words, *output, outputs=tmp_path)
+    assert said in " ".join(told.split())
+    assert "Errno" not in told

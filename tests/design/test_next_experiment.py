@@ -1,0 +1,156 @@
+"""From ambiguous to named: a designed record, played on the hidden plant, tells the cause."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.cli import diagnose as command
+from psa_casadi.cli import diagnosis_files as files
+from psa_casadi.design.experiment import experiment
+from psa_casadi.design.experiment.criteria import noise_of_fit, rival_of_fit
+from psa_casadi.design.experiment.experiment import Separated, resolving_experiment
+from psa_casadi.design.experiment.limits import excess
+from psa_casadi.design.experiment.search import Effort
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.records import Record, read_record
+from psa_casadi.report.words.text import story
+from tests.studies.plants.again import play_again
+from tests.studies.plants.base import simulate_base
+from tests.studies.plants.hide import effect_called
+from tests.studies.plants.make import make_record
+from tests.studies.plants.same_device import in_terms_of
+from tests.tiers import slow
+
+#: The loop from record to name is run once: with pytest-xdist by one process.
+pytestmark = pytest.mark.xdist_group("next-experiment")
+
+#: A gain that bends with the field, hidden in a triangle, where a bent sensor looks the same.
+HIDDEN, RIVAL, SEED = "field_dependent_gain", "sensor_nonlinearity", 7003
+SAMPLES = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    first: Record
+    ambiguous: Diagnosis
+    design: Separated
+    named: Diagnosis
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
+    folder = tmp_path_factory.mktemp("loop")
+    effects = [EFFECTS[HIDDEN], EFFECTS[RIVAL]]
+    path = folder / "first.csv"
+    truth = make_record(HIDDEN, SEED, path, excitation="triangle", visible=(0.3, 2.0))
+    first = read_record(path).slice(0, SAMPLES)
+    ambiguous = diagnose([first], effects=effects)
+    design = resolving_experiment(ambiguous, effort=Effort(draws=3, starts=1, steps=3))
+    played = folder / "next.csv"
+    play_again(truth, SEED, played, (design.record.time, design.record.voltage))
+    named = diagnose([first, read_record(played)], effects=effects)
+    return Loop(first, ambiguous, design, named)
+
+
+@slow
+def test_the_first_record_leaves_two_causes_open(loop: Loop) -> None:
+    d = loop.ambiguous
+    assert d.verdict == "ambiguous"
+    assert {c.effect for c in d.contenders} == {HIDDEN, RIVAL}
+    assert set(d.next_experiment.separates) == {HIDDEN, RIVAL}
+    known = {c.effect: c.evidence for c in d.candidates}
+    for contender in d.contenders:
+        assert contender.evidence == pytest.approx(known[contender.effect])
+        assert contender.effect in {c.name for c in contender.fit.model.effects}
+
+
+@slow
+def test_a_rival_that_is_the_truth_has_a_standard_error_less_of_its_effect(loop: Loop) -> None:
+    d = loop.ambiguous
+    best = min(d.contenders, key=lambda c: c.fit.rms).fit
+    _, colour = noise_of_fit(best, d.experiments)
+    for contender in d.contenders:
+        rival = rival_of_fit(contender.effect, contender.fit, colour)
+        gain = EFFECTS[contender.effect].gain or ""
+        model, start = rival.moved(rival.truth)
+        fitted = rival.model.values[gain]
+        assert 0.2 < model.values[gain] / fitted < 1.0
+        assert not any(start.values())
+        assert rival.less is not None
+        # as likely as the data at hand make one standard error
+        assert 0.0 < rival.less @ rival.known @ rival.less < 1.001
+    base = rival_of_fit("base", d.base_fit, colour)
+    assert not np.any(base.truth)
+
+
+@slow
+def test_the_designed_record_is_like_the_first_and_tells_more_than_a_sine(loop: Loop) -> None:
+    design, first = loop.design, loop.first
+    assert design.record.n == first.n
+    assert design.record.sample_time == pytest.approx(first.sample_time)
+    assert excess(design.record, design.limits, None) == ()
+    assert design.record.voltage.min() >= first.voltage.min() - 1e-9
+    assert design.record.voltage.max() <= first.voltage.max() + 1e-9
+    assert design.factor("sine") > 2.0
+    assert design.factor("triangle") > 2.0
+    assert min(design.chance.values()) > 0.9
+
+
+@slow
+def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
+    d = loop.named
+    assert d.verdict in ("cause_named", "partly_explained")
+    assert d.causes[0].effect == HIDDEN
+    assert d.causes[0].cannot_be_told_from == ()
+    with pytest.raises(InputError, match="nothing to tell apart"):
+        resolving_experiment(d)
+
+
+@slow
+def test_the_command_writes_the_record_and_says_so(
+    loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The design itself is the one above: here only what becomes of it."""
+    monkeypatch.setattr(experiment, "resolving_experiment", lambda d, **_: loop.design)
+    path = command._beside(tmp_path / "diagnosis.json")
+    assert path == tmp_path / "diagnosis_next.csv"
+    d = files.with_next(loop.ambiguous, path, lambda _: None)
+    said = json.loads(d.to_json())["next_experiment"]
+    assert said["voltage_csv"] == str(path)
+    assert set(said["separates"]) == set(said["chance"]) == {HIDDEN, RIVAL}
+    assert str(path) in " ".join(story(d, width=400).split())
+    record = read_record(path, need_displacement=False)
+    np.testing.assert_array_equal(record.voltage, loop.design.record.voltage)
+    assert files.with_next(loop.named, path, lambda _: None) is loop.named
+    assert files.with_next(loop.ambiguous, None, lambda _: None) is loop.ambiguous
+
+
+@pytest.mark.parametrize("name", ["offset_drift", "self_heating"])
+def test_a_device_stays_the_same_on_a_shorter_record(name: str, tmp_path: Path) -> None:
+    """What it adds depends on the voltage until then, not on how long the record will last."""
+    truth = make_record(name, 5, tmp_path / "record.csv", excitation="triangle")
+    times, command = truth.times[:1500], truth.voltage[:1500]
+    run = simulate_base(truth.stack, times, command)
+    added = (truth.displacement - truth.base_displacement)[:1500]
+    seen = []
+    for told in (in_terms_of(truth, times, command), truth):
+        found = effect_called(name).contribution(run, told.parameters, told.gain)
+        seen.append(float(np.max(np.abs(found - added)) / np.ptp(added)))
+    assert seen[0] < 1e-3
+    assert seen[1] > 0.01
+
+
+def test_a_source_that_clips_does_so_at_the_same_voltage(tmp_path: Path) -> None:
+    drawn = make_record("offset_drift", 5, tmp_path / "record.csv", excitation="triangle")
+    truth = replace(drawn, effect="voltage_saturation", gain=0.1)
+    ends = (1.0 - truth.gain) * truth.voltage.max()
+    for share in (0.99 * ends, 1.01 * ends):
+        command = truth.voltage * share / truth.voltage.max()
+        again = in_terms_of(truth, truth.times, command)
+        assert (1.0 - again.gain) * command.max() == pytest.approx(min(ends, share))

@@ -1,0 +1,421 @@
+"""Many devices: real work on two, jobs from tables, what is kept, what a failure does."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from datetime import date
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from psa_casadi import children
+from psa_casadi.cli.app import app
+from psa_casadi.devices import device, executors
+from psa_casadi.devices.batch import batch
+from psa_casadi.devices.executors import Processes, outcomes
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options, jobs_given, key_of
+from psa_casadi.errors import InputError, MachineError
+from psa_casadi.interruption import raise_if_stopped
+from psa_casadi.model.model_file import load_model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import write_record
+from psa_casadi.report.documents.files import identification_file
+from psa_casadi.report.documents.findings import read_findings
+from psa_casadi.simulation.side_by_side import threads
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.strict_json import json_text
+from tests.report.report_cases import identification
+from tests.report.test_schemas import shipped
+from tests.tiers import slow
+
+TIME = np.arange(240) * 1e-2
+VOLTAGE = (50.0 - 50.0 * np.cos(4 * np.pi * TIME)) * np.exp(-0.2 * TIME)
+
+
+def write_device(path: Path, force: float = 1.0, seed: int = 1) -> None:
+    """Write the record of a stack whose force per volt has a factor."""
+    model = stack_model("P-885.51")
+    y = simulate(model.with_values({"k_L": force * model.values["k_L"]}), TIME, VOLTAGE)
+    noise = 3e-9 * np.random.default_rng(seed).standard_normal(TIME.size)
+    write_record(
+        path,
+        {"time [s]": TIME, "voltage [V]": VOLTAGE, "displacement [m]": y.displacement + noise},
+    )
+
+
+@pytest.fixture
+def records(tmp_path: Path) -> Path:
+    """Return a folder with two devices and a third that cannot be read."""
+    folder = tmp_path / "records"
+    (folder / "first").mkdir(parents=True)
+    write_device(folder / "first" / "loops.csv")
+    write_device(folder / "second.csv", 1.05, seed=2)
+    (folder / "third.csv").write_text("time [s],voltage [V],displacement [um]\n0,a,1\n")
+    return folder
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {str(p): p.stat().st_mtime_ns for p in folder.rglob("*/*.json")}
+
+
+@pytest.mark.xdist_group("identification")
+def test_two_devices_are_identified_and_the_third_does_not_stop_them(
+    records: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "results"
+    ended = CliRunner().invoke(app, ["batch", str(records), "-o", str(out)])
+    assert ended.exit_code == 0, ended.stderr
+    assert "3 devices: 2 done, 1 refused." in ended.stdout
+    assert "third: refused:" in ended.stdout
+    for name in ("first", "second"):
+        for kind in ("identification", "device", "model"):
+            content = json.loads((out / name / f"{kind}.json").read_text("utf-8"))
+            jsonschema.Draft202012Validator(shipped(kind)).validate(content)
+    with (out / "summary.csv").open(encoding="utf-8") as stream:
+        rows = {row["device"]: row for row in csv.DictReader(stream)}
+    ratio = float(rows["second"]["k_L [N/V]"]) / float(rows["first"]["k_L [N/V]"])
+    assert 1.03 < ratio < 1.07
+    assert rows["third"]["k_L [N/V]"] == ""
+    assert "line 2" in rows["third"]["problems"]
+    before = stamps(out)
+    write_device(records / "second.csv", 1.06, seed=3)
+    again = batch(records, out, workers=1)
+    assert again.kept == 2
+    assert again.counts == {"done": 2, "refused": 1}
+    changed = {p for p, when in stamps(out).items() if before[p] != when}
+    assert changed == {str(p) for p in (out / "second").iterdir()}
+    assert [f.device for f in again.findings] == ["first", "second"]
+
+
+def stand_in(
+    monkeypatch: pytest.MonkeyPatch,
+    work: Callable[[DeviceTask], DeviceOutcome | None] = lambda task: None,
+) -> list[str]:
+    """Let the work on a device be something short in this process; return who was worked on."""
+    seen: list[str] = []
+
+    def worked(task: DeviceTask, began: float) -> DeviceOutcome:
+        seen.append(task.job.device)
+        return work(task) or DeviceOutcome(task.job.device, "done", 0.0)
+
+    monkeypatch.setattr(device, "_worked", worked)
+    return seen
+
+
+def tasks(folder: Path, count: int) -> list[DeviceTask]:
+    path = folder / "r.csv"
+    path.touch()
+    return [DeviceTask(Job(f"d{k}", (str(path),)), Options(), "run") for k in range(count)]
+
+
+def test_few_are_submitted_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(monkeypatch)
+    held: list[int] = []
+    pending: set[Future[Any]] = set()
+
+    class Counting(ThreadPoolExecutor):
+        def submit(self, *given: Any, **more: Any) -> Future[Any]:
+            future = super().submit(*given, **more)
+            pending.add(future)
+            held.append(len(pending))
+            return future
+
+    with Counting(4) as pool:
+        ended = []
+        for task, _ in outcomes(tasks(tmp_path, 30), pool, at_once=3):
+            ended.append(task.job.device)
+            pending.pop()  # one of those that ended is no longer held
+    assert sorted(ended) == sorted(f"d{k}" for k in range(30))
+    assert max(held) <= 3
+
+
+def test_every_device_has_one_thread_and_its_failure_is_its_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts: set[int] = set()
+
+    def work(task: DeviceTask) -> None:
+        counts.add(threads())
+        if task.job.device == "d1":
+            raise ZeroDivisionError("by hand")
+        if task.job.device == "d2":
+            raise InputError(["one", "two"])
+
+    stand_in(monkeypatch, work)
+    with ThreadPoolExecutor(2) as pool:
+        ended = {t.job.device: o for t, o in outcomes(tasks(tmp_path, 4), pool, 4)}
+    assert counts == {1}
+    assert {n: o.status for n, o in ended.items()} == {
+        "d0": "done", "d1": "failed", "d2": "refused", "d3": "done",
+    }  # fmt: skip
+    assert ended["d1"].problems == ("ZeroDivisionError: by hand",)
+    assert ended["d2"].problems == ("one", "two")
+
+
+def test_an_interrupt_ends_the_threads_and_says_what_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = threading.Event()
+
+    def work(task: DeviceTask) -> None:
+        if task.job.device == "d0":
+            return
+        try:
+            while True:  # as a simulation in C does, until the flag is set
+                raise_if_stopped()
+                time.sleep(0.01)
+        finally:
+            ended.set()
+
+    seen = stand_in(monkeypatch, work)
+    jobs = [t.job for t in tasks(tmp_path, 8)]
+
+    def progress(told: str) -> None:
+        if "d0: done" in told:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt, match="1 of 8 devices"):
+        batch(jobs, out, executor=pool, at_once=3, progress=progress)
+    assert ended.wait(2.0)
+    assert len(seen) < 8
+    stand_in(monkeypatch)
+    with ThreadPoolExecutor(2) as pool:
+        assert batch(jobs, out, executor=pool).kept == 1
+
+
+def test_what_failed_is_tried_again_and_what_was_refused_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(task: DeviceTask) -> None:
+        if task.job.device == "d0":
+            raise InputError("no record")
+        if task.job.device == "d1":
+            raise MemoryError
+
+    jobs = [t.job for t in tasks(tmp_path, 3)]
+    stand_in(monkeypatch, work)
+    with ThreadPoolExecutor(1) as pool:
+        batch(jobs, tmp_path / "out", executor=pool)
+        seen = stand_in(monkeypatch)
+        batch(jobs, tmp_path / "out", executor=pool)
+        assert seen == ["d1"]
+        batch(jobs, tmp_path / "out", executor=pool, options=Options(stiffness=5e7))
+    assert sorted(seen) == ["d0", "d1", "d1", "d2"]
+
+
+def found(task: DeviceTask) -> DeviceOutcome:
+    text = json_text(identification_file(identification()))
+    return DeviceOutcome(task.job.device, "done", 0.0, files=(("identification.json", text),))
+
+
+@pytest.mark.parametrize("name", ["device.json", "identification.json"])
+@pytest.mark.parametrize("length", [0, 300, None])
+def test_a_damaged_result_is_named_and_made_again(
+    name: str, length: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, seen = tmp_path / "out", stand_in(monkeypatch, found)
+    jobs = [t.job for t in tasks(tmp_path, 5)]
+    with ThreadPoolExecutor(1) as pool:
+        assert len(batch(jobs, out, executor=pool).findings) == 5
+        whole = (out / "d1" / name).read_bytes()
+        # cut, or a digit is another one: still a file that can be read
+        other = whole.replace(b"1", b"2", 1) if name != "device.json" else b"{}"
+        (out / "d1" / name).write_bytes(other if length is None else whole[:length])
+        told = CliRunner().invoke(app, ["compare", str(out), "-o", str(tmp_path / "p.html")])
+        assert f"d1: failed: {out / 'd1' / name}: is damaged" in told.stdout
+        assert "d1" in (tmp_path / "p.html").read_text("utf-8")
+        again = batch(jobs, out, executor=pool)
+    assert (again.kept, again.counts, len(again.findings)) == (4, {"done": 5}, 5)
+    assert seen[5:] == ["d1"]
+    assert (out / "d1" / "identification.json").stat().st_size > 300
+
+
+def test_the_key_is_of_files_and_options(tmp_path: Path) -> None:
+    (task,) = tasks(tmp_path, 1)
+    key = key_of(task.job, task.options)
+    assert key == key_of(task.job, Options())
+    assert key != key_of(task.job, Options(work="diagnose"))
+    Path(task.job.files[0]).write_text("other")
+    assert key != key_of(task.job, task.options)
+
+
+def test_a_table_of_jobs_is_read(records: Path) -> None:
+    (records / "jobs.csv").write_text(
+        "device,batch,date,files\n"
+        "first,B1,2026-03-14,\nA2,B2,2026-04-01T12:00,second.csv;first/loops.csv\nA2,B2,2026-04-01,"
+        "third.csv\n"
+    )
+    first, second = jobs_given(records)
+    assert (first.batch, first.day) == ("B1", date(2026, 3, 14))
+    assert [Path(f).name for f in first.files] == ["loops.csv"]
+    assert [Path(f).name for f in second.files] == ["second.csv", "loops.csv", "third.csv"]
+
+
+@pytest.mark.parametrize(
+    ("table", "told"),
+    [
+        ("name,files\na,b\n", "has the columns device, batch, date, files"),
+        ("device\n../up\n", "no folder can have this name"),
+        ("device\nnul\n", "no folder can have this name"),
+        ("device,date\nfirst,14.3.26\n", "line 2: the date is '14.3.26'; write it as 2026-03-14"),
+        ("device,files\na,nowhere.csv\n", "there is no file"),
+        ("device,batch\nfirst,1\nfirst,2\n", "another batch or date"),
+        ("device,files\nSecond,second.csv\nsecond,second.csv\n", "is there twice"),
+        ("device,batch\nfirst,1,2\n", "3 cells for 2 columns"),
+        ("device\n", "there is no device"),
+        ("device\nfourth\n", "has no records"),
+    ],
+)
+def test_mistakes_in_a_table_are_told(table: str, told: str, records: Path) -> None:
+    (records / "jobs.csv").write_text(table)
+    with pytest.raises(InputError) as error:
+        jobs_given(records / "jobs.csv")
+    assert told in str(error.value)
+
+
+def test_an_executor_that_takes_no_more_is_told(tmp_path: Path) -> None:
+    pool = ThreadPoolExecutor(1)
+    pool.shutdown()
+    with pytest.raises(MachineError, match="takes no more work"):
+        list(outcomes(tasks(tmp_path, 1), pool, 1))
+
+
+def test_an_executor_that_is_lost_is_no_result_of_a_device(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(monkeypatch)
+    jobs = [t.job for t in tasks(tmp_path, 3)]
+
+    class Lost(ThreadPoolExecutor):
+        def submit(self, *given: Any, **more: Any) -> Future[Any]:
+            if given[1].job.device == "d0":
+                return super().submit(*given, **more)
+            future: Future[Any] = Future()
+            future.cancel()  # as a client of Dask does when its scheduler is gone
+            future.set_running_or_notify_cancel()
+            return future
+
+    out = tmp_path / "out"
+    with Lost(1) as pool, pytest.raises(MachineError, match="executor was lost"):
+        batch(jobs, out, executor=pool, at_once=1)
+    assert [p.name for p in out.iterdir()] == ["d0"]
+    with ThreadPoolExecutor(1) as other:
+        assert batch(jobs, out, executor=other).kept == 1
+
+
+@slow
+@pytest.mark.parametrize("address", ["junk", "tls://127.0.0.1:1"])
+def test_an_address_of_no_scheduler_is_told_in_a_sentence(
+    address: str, records: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed")
+    process = command(records, tmp_path / "out", "--dask", address)
+    _, told = process.communicate(timeout=35)
+    assert process.returncode == 1
+    assert told.splitlines()[1:] == [told.splitlines()[-1]]
+    assert f"The scheduler at {address} cannot be reached" in told
+
+
+def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> Any:
+        raise ImportError(name)
+
+    monkeypatch.setattr(executors, "import_module", missing)
+    with pytest.raises(InputError, match=r"pip install 'psa-casadi\[dask\]'"):
+        executors.dask_client("local").__enter__()
+
+
+@slow
+def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
+    job = next(j for j in jobs_given(records) if j.device == "first")
+    given = [DeviceTask(Job(f"d{k}", job.files), Options(), "run") for k in range(3)]
+    own = Processes(1)
+    try:
+        found = {}
+        for task, outcome in outcomes(given, own, 1):
+            found[task.job.device] = outcome
+            if task.job.device == "d0":  # the next begins with a process that is dying
+                (child,) = children._CHILDREN
+                os.kill(child.pid, signal.SIGKILL)
+    finally:
+        own.end()
+    assert [found[f"d{k}"].status for k in range(3)] == ["done", "failed", "done"]
+    assert "ended (signal 9)" in found["d1"].problems[0]
+
+
+@slow
+def test_processes_of_the_standard_library_do_it_too(records: Path, tmp_path: Path) -> None:
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        found = batch(records, tmp_path / "out", executor=pool)
+    assert found.counts == {"done": 2, "refused": 1}
+
+
+@slow
+def test_a_cluster_of_dask_does_it_too(records: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    with executors.dask_client("local", 2) as client:
+        found = batch(records, tmp_path / "out", executor=client)
+    assert found.counts == {"done": 2, "refused": 1}
+    assert load_model(tmp_path / "out" / "first" / "model.json").provenance.free
+
+
+@slow
+def test_devices_are_diagnosed(records: Path, tmp_path: Path) -> None:
+    (records / "third.csv").unlink()
+    found = batch(records, tmp_path / "out", options=Options(work="diagnose"), workers=2)
+    assert found.counts == {"done": 2}
+    first, second = read_findings([tmp_path / "out" / n for n in ("first", "second")])
+    assert first.verdict == second.verdict == "adequate"
+    assert first.trace is not None
+    error = np.array(first.trace.measured) - np.array(first.trace.model)
+    assert 2e-9 < np.nanstd(error) < 5e-9  # 3 nm were put in
+
+
+def command(folder: Path, out: Path, *more: str) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-m", "psa_casadi.cli", "batch", str(folder), "-o", str(out),
+         "--workers", "1", *more],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+
+
+@slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals cannot be sent to one process")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) -> None:
+    folder, out = tmp_path / "records", tmp_path / "out"
+    folder.mkdir()
+    for k in range(3):
+        write_device(folder / f"d{k}.csv", 1.0 + 0.01 * k, seed=k)
+    process = command(folder, out)
+    assert process.stderr is not None
+    for line in process.stderr:
+        if "done)" in line:
+            break
+    process.send_signal(number)
+    _, told = process.communicate(timeout=20)
+    assert process.returncode == (130 if number is signal.SIGINT else -9)
+    if number is signal.SIGINT:
+        assert "of 3 devices are done. Kept: " in told
+    before = stamps(out)
+    again = command(folder, out)
+    said, _ = again.communicate(timeout=120)
+    assert again.returncode == 0
+    assert "of them were there before" in said
+    assert before.items() <= stamps(out).items()
+    assert len(list(out.glob("*/device.json"))) == 3
+    assert not list(out.rglob(".psa_casadi-*"))

@@ -1,0 +1,72 @@
+"""Effects that records cannot tell apart but by a form nobody knows stay together in a set."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psa_casadi.cli import diagnosis_files as files
+from psa_casadi.components import BASE
+from psa_casadi.design.experiment.experiment import resolving_experiment
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.model.compose import compose
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import split
+from psa_casadi.simulation.simulate import simulate
+from tests.studies.plants.make import make_record
+from tests.tiers import slow
+
+TABLE = tuple(EFFECTS.values())
+BENDS = ("load_stiffness", "sensor_nonlinearity")
+
+
+@pytest.mark.parametrize(
+    ("rate", "free", "alike"),
+    [(1e3, ["k_L", "m_B"], (BENDS,)), (2e4, ["k_L"], (BENDS,)), (2e4, ["k_L", "m_B"], ())],
+)
+def test_bends_are_alike_where_no_resonance_shows(
+    rate: float, free: list[str], alike: tuple[tuple[str, ...], ...]
+) -> None:
+    time = np.arange(200) / rate
+    model, voltage = compose(BASE), 10.0 + 10.0 * np.sin(0.02 * rate * time)
+    shown = simulate(model, time, voltage).displacement
+    experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=shown)),)
+    found = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
+    groups = Task(experiments, TABLE).alike(found)
+    assert tuple(tuple(sorted(group)) for group in groups) == alike
+
+
+@slow
+@pytest.mark.parametrize(
+    ("hidden", "seed", "rho"),
+    [
+        # its own entry is left out
+        pytest.param("preload_loss", 61007, (0.3, 3.0), marks=slow),
+        # a foreign one
+        pytest.param("guide_stiffness", 93278, (0.3, 3.0), marks=slow),
+        ("sensor_nonlinearity", 1, (2.0, 2.5)),  # an arc tangent is no polynomial
+    ],
+)
+def test_a_bend_is_not_blamed_on_the_sensor_alone(
+    hidden: str, seed: int, rho: tuple[float, float], tmp_path: Path
+) -> None:
+    path = tmp_path / "a.csv"
+    make_record(hidden, seed, path, visible=rho)
+    record = read_record(path).slice(0, 3000)
+    found = diagnose([record], effects=[EFFECTS[n] for n in BENDS])
+    assert found.verdict == "ambiguous"
+    (cause,) = found.causes
+    assert {cause.effect, *cause.cannot_be_told_from} == set(BENDS)
+    assert cause.confidence == pytest.approx(0.5, abs=0.01)
+    assert "no voltage below the resonances tells" in found.next_experiment.why
+    told, _ = one_of_each(found.contenders, found.experiments)
+    assert len(told) == 1
+    with pytest.raises(InputError, match="bend the same curve"):
+        resolving_experiment(found)
+    assert files.with_next(found, tmp_path / "next.csv", lambda _: None) is found

@@ -1,0 +1,185 @@
+"""Records whose displacement does not follow the voltage, with another sign or unit."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from psa_casadi.cli.diagnosis_files import write_patch
+from psa_casadi.diagnosis.diagnose import diagnose, filtered
+from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.model_file import load_model
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.records import write_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import split
+from psa_casadi.report.words.text import story
+from psa_casadi.report.words.verdict_words import verdict_sentence
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+from tests.cli.test_cli import done
+from tests.report.report_cases import diagnosis
+from tests.tiers import slow, slow_but
+
+TIME: FloatArray = np.arange(2000, dtype=float) * 1e-3
+VOLTAGE = 50.0 - 50.0 * np.cos(2 * np.pi * TIME)
+TABLE = [EFFECTS["slow_creep"], EFFECTS["offset_drift"]]
+
+
+@pytest.fixture(scope="module")
+def shown() -> FloatArray:
+    """What a stack does, with a little noise."""
+    found = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
+    return found + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
+
+
+@pytest.mark.parametrize("kind", slow_but(["noise"], ["noise", "drift", "another device"]))
+def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    y: FloatArray = {
+        "noise": 1e-7 * rng.standard_normal(TIME.size),
+        "drift": 1e-6 * TIME + 1e-8 * rng.standard_normal(TIME.size),
+        "another device": 1e-6 * np.sin(2 * np.pi * 3.7 * TIME),
+    }[kind]
+    found = diagnose([Record(name=kind, time=TIME, voltage=VOLTAGE, displacement=y)], effects=TABLE)
+    assert found.verdict == "not_driven"
+    assert not found.causes
+    assert "same device" in found.notes[-1]
+    assert "does not follow the voltage" in story(found)
+
+
+def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
+    found = diagnose(
+        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=-shown)], effects=TABLE
+    )
+    assert found.verdict == "not_driven"
+    assert (
+        "the sign of the displacement flipped the base model explains 100.00 %" in found.notes[-1]
+    )
+    assert "falls while the voltage rises" in verdict_sentence(found)
+
+
+@pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
+def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray) -> None:
+    found = diagnose(
+        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=factor * shown)], effects=TABLE
+    )
+    assert found.verdict == "adequate"
+    assert "its unit, or that of the voltage, is probably another" in found.notes[-1]
+
+
+def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
+    with pytest.raises(InputError, match="m, more than a stack with any sensor: its unit"):
+        diagnose(
+            [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=1e6 * shown)], effects=TABLE
+        )
+
+
+def _modes() -> Record:
+    """Five light modes of either sign behind a delay, sampled too slowly for a stack's own."""
+    time: FloatArray = np.arange(2000) / 500.0
+    voltage = 50.0 + 20.0 * np.sin(2 * np.pi * (2.0 * time + 18.5 * time**2))
+    y = np.zeros(time.size)
+    for frequency, size in ((9.0, 1.0), (24.0, -1.0), (43.0, 1.0), (70.0, -1.0), (110.0, 1.0)):
+        pole = np.exp(2 * np.pi * frequency / 500.0 * (-0.03 + 1j))
+        late = np.concatenate([np.zeros(5), voltage[:-5] - 50.0])
+        y += lfilter([size * (1.0 - abs(pole))], [1.0, -2 * pole.real, abs(pole) ** 2], late)
+    y *= 1e-5 / np.std(y)
+    y += 1e-7 * np.random.default_rng(3).standard_normal(time.size)
+    return Record(name="r", time=time, voltage=voltage, displacement=y)
+
+
+def test_a_linear_filter_of_the_voltage_is_told_from_what_has_nothing_to_do_with_it() -> None:
+    modes = _modes()
+    noise = np.random.default_rng(4).standard_normal(modes.n)
+    shares = [filtered([split(r)]) for r in (modes, replace(modes, displacement=noise))]
+    assert shares[0] > thresholds().follows
+    assert abs(shares[1]) < 0.1
+
+
+@slow
+def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
+    found = diagnose([_modes()], effects=TABLE)
+    assert found.verdict == "unexplained"
+    assert any("A linear filter of the voltage explains" in n for n in found.notes)
+    assert not any("of the same device" in n for n in found.notes)
+
+
+def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: FloatArray) -> None:
+    rest = np.full(TIME.size, 1e-6)
+    with pytest.raises(InputError, match="The voltage is 40 V throughout"):
+        diagnose(
+            [Record(name="r", time=TIME, voltage=np.full(TIME.size, 40.0), displacement=shown)],
+            effects=TABLE,
+        )
+    with pytest.raises(InputError, match="The displacement is 1e-06 m throughout: the sensor"):
+        diagnose([Record(name="r", time=TIME, voltage=VOLTAGE, displacement=rest)], effects=TABLE)
+    bit: FloatArray = np.where(shown > np.mean(shown), 1e-5, 0.0)
+    with pytest.raises(InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
+        diagnose([Record(name="r", time=TIME, voltage=VOLTAGE, displacement=bit)], effects=TABLE)
+
+
+@slow
+def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArray) -> None:
+    hold = Record(
+        name="hold",
+        time=TIME,
+        voltage=np.full(TIME.size, VOLTAGE[0]),
+        displacement=np.full(TIME.size, shown[0]),
+    )
+    found = diagnose(
+        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=shown), hold], effects=TABLE
+    )
+    assert np.isfinite(found.base_errors.holdout_nrmse_percent)
+
+
+#: The effects that come nearest to the curve, and one that does not.
+NEAR = ("sensor_nonlinearity", "load_stiffness", "preload_loss", "hysteresis_memory", "slow_creep")
+
+
+def _curved(shown: FloatArray) -> FloatArray:
+    """A reading with a ripple that narrows over the travel, which no effect of the table forms."""
+    return shown + 1e-7 * np.sin(0.25 * (shown / 1e-6) ** 2)
+
+
+@slow
+def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) -> None:
+    time = np.arange(2500) * 1e-3
+    voltage = 50.0 + 30.0 * np.sin(2 * np.pi * time) + 15.0 * np.sin(2 * np.pi * 0.31 * time)
+    clean = simulate(stack_model("P-885.51"), time, voltage).displacement
+    noise = 5e-9 * np.random.default_rng(2).standard_normal(time.size)
+    write_record(
+        tmp_path / "r.csv",
+        {"time [s]": time, "voltage [V]": voltage, "displacement [m]": _curved(clean) + noise},
+    )
+    paths = {n: tmp_path / n for n in ("ext.json", "patched.json", "d.json", "r.html")}
+    left_out = (word for n in EFFECTS if n not in NEAR for word in ("--leave-out", n))
+    said = done(
+        "diagnose", tmp_path / "r.csv", "-o", paths["ext.json"], "--patch", paths["patched.json"],
+        "--json", paths["d.json"], "--report", paths["r.html"], "--still", *left_out,
+    ).stdout  # fmt: skip
+    told = json.loads(paths["d.json"].read_text(encoding="utf-8"))
+    assert told["verdict"] == "unexplained"
+    assert (told["patch"]["kind"], told["patch"]["port"]) == ("curve", "reading")
+    assert told["budget"]["unnamed"]["share"] > 0.9
+    assert "unnamed correction would remove" in " ".join(said.split())
+    page = paths["r.html"].read_text(encoding="utf-8")
+    assert "Where the error goes" in page
+    assert "Unnamed correction: curve at the reading" in page
+    patched = load_model(paths["patched.json"])
+    assert [c.name for c in patched.effects] == ["patch_curve_reading"]
+    assert [c.name for c in load_model(paths["ext.json"]).effects] == []
+    moved = simulate(patched, time, voltage)
+    error = moved.outputs["measured_displacement"] - _curved(clean)
+    assert np.std(error) < 0.3 * np.std(_curved(clean) - clean)
+
+
+def test_without_a_correction_nothing_is_written_and_it_says_so(tmp_path: Path) -> None:
+    said = write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
+    assert "No unnamed correction" in said
+    assert not (tmp_path / "p.json").exists()

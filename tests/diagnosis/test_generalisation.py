@@ -1,0 +1,146 @@
+"""A model that holds only where it was fitted, and what a diagnosis says of it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from psa_casadi.components import BASE
+from psa_casadi.diagnosis.colour import colour_of
+from psa_casadi.diagnosis.confirmation import held_out_excess
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.noise import noise_floor
+from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.model.compose import compose
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import divided, split
+from psa_casadi.simulation.simulate import simulate
+from tests.studies.plants.again import play_again
+from tests.studies.plants.make import make_record
+from tests.tiers import slow, slow_but
+
+FloatArray = NDArray[np.float64]
+SAMPLES, LEVEL = 2000, 2e-8
+TIME = np.linspace(0.0, 1e-3 * (SAMPLES - 1), SAMPLES)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Fit, FloatArray, FloatArray]:
+    """A fit, the voltage it saw [V], and the displacement it says [m]."""
+    voltage: FloatArray = 40.0 * (1.0 - np.cos(2 * np.pi * 4.0 * TIME))
+    model = compose(BASE)
+    clean = simulate(model, TIME, voltage).displacement
+    record = Record(name="r", time=TIME, voltage=voltage, displacement=clean)
+    return fit(model, (split(record),), ["k_L"], sigma=[LEVEL]), voltage, clean
+
+
+def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> float:
+    """What is said of an error (n,) [m] of that model."""
+    found, voltage, clean = fitted
+    experiments = (split(Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),)
+    used = error[experiments[0].used]
+    seen = replace(found, residuals=used)
+    colour = colour_of(used, [len(used)])
+    noise = noise_floor([experiments[0].record], [error])
+    return held_out_excess(seen, experiments, (clean,), colour, noise).factor
+
+
+@slow
+@pytest.mark.parametrize("correlation", slow_but([0.0], [0.0, 0.7]))
+def test_noise_is_no_reason_to_doubt(
+    fitted: tuple[Fit, FloatArray, FloatArray], correlation: float
+) -> None:
+    rng = np.random.default_rng(20261122)
+    draws = LEVEL * rng.standard_normal((200, SAMPLES))
+    noises = lfilter([1.0], [1.0, -correlation], draws, axis=1)
+    assert [_excess(fitted, noise) for noise in noises] == [1.0] * 200
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
+    fitted: tuple[Fit, FloatArray, FloatArray], seed: int
+) -> None:
+    _, voltage, clean = fitted
+    held = split(Record(name="r", time=TIME, voltage=voltage, displacement=clean)).held_out
+    noise = LEVEL * np.random.default_rng(seed).standard_normal(SAMPLES)
+    assert _excess(fitted, np.where(held, 1.3 * noise, noise)) == pytest.approx(1.3, rel=0.12)
+    stray = noise.copy()
+    stray[np.flatnonzero(held)[[40, 300]]] = 60.0 * LEVEL
+    assert _excess(fitted, stray) == 1.0
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+@pytest.mark.parametrize("samples", [200, 1000, SAMPLES])
+def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
+    fitted: tuple[Fit, FloatArray, FloatArray], samples: int, correlation: float
+) -> None:
+    """Its offset is found in a tenth of it; its noise is three times that of the fitted one."""
+    found, voltage, clean = fitted
+    rng = np.random.default_rng(3)
+    told = []
+    for _ in range(25):
+        draws = LEVEL * rng.standard_normal((2, SAMPLES)) * np.array([[1.0], [3.0]])
+        errors = lfilter([1.0], [1.0, -correlation], draws, axis=1)
+        records = [
+            Record(name=f"r{k}", time=TIME, voltage=voltage, displacement=clean + e)
+            for k, e in enumerate(errors)
+        ]
+        experiments = divided(records[:1], [records[1].slice(0, samples)])
+        lead = experiments[1].known
+        offset = float(np.mean(errors[1][:samples][lead]))
+        sigma = tuple(float(np.std(e)) for e in errors)
+        seen = replace(found, residuals=errors[0], sigma=sigma)
+        predicted = (clean, clean[:samples] + offset)
+        left = [errors[0], errors[1][:samples] - offset]
+        noise = noise_floor([e.record for e in experiments], left)
+        colour = colour_of(seen.residuals, [SAMPLES, 0])
+        told.append(held_out_excess(seen, experiments, predicted, colour, noise).factor)
+    assert told == [1.0] * 25
+
+
+@slow
+def test_a_model_that_fails_on_the_held_out_record_is_not_adequate(tmp_path: Path) -> None:
+    """Slow loops do not show a current limit; the steps that are held out do."""
+    path = tmp_path / "slow.csv"
+    truth = make_record("current_limit", 7, path, visible=(2.0, 3.0))
+    time = np.linspace(0.0, 2.999, 3000)
+    slow: FloatArray = 0.45 * truth.stack.u_rated * (1.0 - np.cos(2 * np.pi * time))
+    steps = np.where((time // 0.1) % 2 == 1, 0.9, 0.1) * truth.stack.u_rated
+    steps[:400] = 0.0  # the first tenth of a held-out record finds its offset
+    play_again(truth, 1, path, (time, slow))
+    play_again(truth, 2, tmp_path / "steps.csv", (time, steps))
+    play_again(truth, 3, tmp_path / "again.csv", (time, slow))
+    loops, jumps, again = (read_record(tmp_path / f"{n}.csv") for n in ("slow", "steps", "again"))
+    effects = [EFFECTS["current_limit"]]
+    doubted = diagnose([loops], holdout=[jumps], effects=effects)
+    assert doubted.verdict == "unexplained"
+    assert not doubted.remaining.white
+    assert "held-out samples' error is" in doubted.remaining.where
+    assert diagnose([loops], holdout=[again], effects=effects).verdict == "adequate"
+    named = diagnose([loops, jumps], effects=effects)
+    assert [c.effect for c in named.causes] == ["current_limit"]
+
+
+@slow
+def test_a_named_cause_does_not_hide_that_the_held_out_record_is_another(tmp_path: Path) -> None:
+    """After its first tenth the sensor shows 0.5 % more: the creep is named, and more is left."""
+    path, shown_again = tmp_path / "creeping.csv", tmp_path / "again.csv"
+    truth = make_record("slow_creep", 11, path, visible=(1.0, 2.0))
+    play_again(truth, 1, shown_again)
+    record, again = read_record(path), read_record(shown_again)
+    effects = [EFFECTS["slow_creep"]]
+    same = diagnose([record], holdout=[again], effects=effects)
+    assert same.verdict == "cause_named"
+    assert same.remaining.white
+    later = again.time > again.time[0] + 0.15 * again.duration
+    gain = np.where(later, 1.005, 1.0)
+    scaled = replace(again, displacement=np.asarray(gain * again.displacement, dtype=np.float64))
+    unlike = diagnose([record], holdout=[scaled], effects=effects)
+    assert unlike.verdict == "partly_explained"
+    assert [c.effect for c in unlike.causes] == ["slow_creep"]
+    assert "held-out samples' error is" in unlike.remaining.where

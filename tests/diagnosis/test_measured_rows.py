@@ -1,0 +1,73 @@
+"""Rows of docs/measured.md on the measured micromanipulator are what a diagnosis says of it.
+
+Those of the sine, which is the README's picture, and of the minor loops, which the README
+diagnoses; `python -m tests.studies measured` has the others, which take a minute each.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from build_scripts.page_commands import block_in_tests, run_block
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.records import read_record
+
+PAGE = Path(__file__).parents[2] / "docs" / "measured.md"
+
+
+def rows() -> dict[str, list[str]]:
+    """Cells of the table under `psa diagnose` on, by their first one."""
+    table = PAGE.read_text(encoding="utf-8").split("| `psa diagnose` on |")[1].split("\n\n")[0]
+    cells = [[c.strip() for c in line.strip("|").split("|")] for line in table.split("\n")[2:]]
+    return {row[0]: row[1:] for row in cells}
+
+
+def percents(cell: str) -> tuple[float, float]:
+    """Smallest and largest figure of a cell."""
+    found = re.match(r"([0-9.]+)(?: to ([0-9.]+))? %", cell)
+    assert found is not None, cell
+    return float(found[1]), float(found[2] or found[1])
+
+
+def within(value: float, cell: str) -> bool:
+    low, high = percents(cell)
+    return low - 0.01 <= value <= high + 0.01
+
+
+def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
+    """Hold a diagnosis, as its JSON has it, against a row of the page."""
+    base, extended, said = rows()[given]
+    assert said.startswith(f"`{d['verdict']}`")
+    named = {n for c in d["causes"] for n in (c["effect"], *c["cannot_be_told_from"])}
+    written = set(re.findall(r"`([a-z_]+)`", said)) & set(EFFECTS)
+    assert written <= named
+    if "third effect" not in said:
+        assert {c["effect"] for c in d["causes"]} <= written
+    assert not named & {b["effect"] for b in d["blind_to"]}
+    withdrawn = [n for n in d["notes"] if "not named, because" in n]
+    assert bool(withdrawn) == (d["verdict"] == "unexplained")
+    errors = [d["errors"][model]["holdout_nrmse_percent"] for model in ("base", "extended")]
+    assert within(errors[0], base)
+    assert within(errors[1], base if extended == "the same" else extended)
+
+
+@pytest.mark.slow
+def test_the_record_of_the_readme_s_picture_gives_its_row(measured_data: Path) -> None:
+    record = read_record(measured_data / "micromanipulator" / "sine_1hz.csv")
+    told = json.loads(diagnose([record]).to_json())
+    is_what_the_row_says(told, "`sine_1hz.csv`")
+    assert told["budget"]["together"]["share"] > 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("measured_data")
+def test_the_commands_of_the_readme_give_the_row_of_their_record(tmp_path: Path) -> None:
+    block = block_in_tests("README.md")
+    assert any("records/minor_loops.csv" in command for command in block.commands)
+    assert run_block(block, tmp_path) is None
+    told = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
+    is_what_the_row_says(told, "`minor_loops.csv`")

@@ -1,0 +1,177 @@
+"""What is seen in a residual: what was put in, and nothing in noise."""
+
+import time
+
+import numpy as np
+import pytest
+
+from psa_casadi.diagnosis.misfit import misfit
+from psa_casadi.diagnosis.noise import noise_floor
+from psa_casadi.errors import InputError
+from psa_casadi.records import Record, excitation
+from tests.diagnosis.misfit_cases import (
+    LEVELS,
+    MULTISINE,
+    NOISE,
+    SINE,
+    STEP,
+    STEPS,
+    TIME,
+    FloatArray,
+    grid,
+    noise,
+    seen,
+    shares,
+)
+from tests.tiers import slow
+
+
+def test_a_function_of_the_voltage() -> None:
+    error = 3e-8 * np.sin(2 * np.pi * SINE / 100.0)
+    m = seen(SINE, error)
+    found = shares(m)
+    assert found["voltage"] > 0.97
+    assert max(found[name] for name in ("time", "rate", "amplitude", "frequency")) == 0.0
+    assert m.sentences[1].startswith("The residual follows the voltage: ")
+    view = next(v for v in m.views if v.name == "voltage")
+    truth = 3e-8 * np.sin(2 * np.pi * view.x / 100.0)
+    assert np.max(np.abs(view.mean - truth)) < 4e-9
+    assert m.rms == pytest.approx(np.hypot(np.std(error), NOISE), rel=0.02)
+    assert m.excess == pytest.approx(1.0 - (NOISE / m.rms) ** 2, abs=0.02)
+    assert m.sentences[0].startswith("The residual of r is 21 nm rms, 2.1 times the noise of")
+
+
+def test_creep_after_every_step() -> None:
+    slope = 1e-8
+    error = np.zeros(TIME.size)
+    for k in range(1, 8):
+        since = np.arange(TIME.size - 2_500 * k)
+        error[2_500 * k :] += np.sign(LEVELS[k] - LEVELS[k - 1]) * np.log10(1.0 + since / 10.0)
+    m = seen(STEPS, slope * error)
+    assert m.holds is not None
+    assert m.slope is not None
+    assert m.holds.share > 0.4
+    assert m.slope.value == pytest.approx(slope, rel=0.2)
+    assert m.slope.value > 10.0 * m.slope.error
+    assert any(s.startswith("In 7 holds the residual moves by +") for s in m.sentences)
+    assert seen(SINE, 0.0 * SINE).holds is None
+
+
+def test_the_error_after_a_reversal() -> None:
+    triangle = excitation.triangle(TIME, 0.0, 100.0, 1.0)
+    since = np.mod(TIME, 0.5)
+    m = seen(triangle, 5e-8 * np.exp(-since / 0.02))
+    found = shares(m)
+    assert found["since_reversal"] > 0.9
+    assert found["since_reversal"] == max(found.values())
+
+
+def test_amplitude_and_frequency_of_the_drive() -> None:
+    parts = [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
+    v = np.concatenate(parts)
+    amplitude = np.repeat([30.0, 30.0, 30.0, 60.0, 60.0, 60.0, 100.0, 100.0, 100.0], 4_000)
+    frequency = np.tile(np.repeat([1.0, 2.0, 5.0], 4_000), 3)
+    by_amplitude = shares(seen(v, 5e-10 * amplitude))
+    by_frequency = shares(seen(v, 1e-8 * frequency))
+    assert by_amplitude["amplitude"] > 0.9
+    assert by_amplitude["frequency"] < 0.1
+    assert by_frequency["frequency"] > 0.9
+    assert by_frequency["amplitude"] < 0.1
+
+
+def test_delay_grows_with_frequency_and_gain_with_amplitude() -> None:
+    parts = [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
+    v = np.concatenate(parts)
+    rate = np.gradient(v, STEP)
+    delayed = seen(v, -4e-11 * rate)
+    found = shares(delayed)
+    assert found["frequency_lag"] > 0.3
+    assert found["frequency_gain"] == found["frequency"] == 0.0
+    view = next(w for w in delayed.views if w.name == "frequency_lag")
+    assert np.all(np.diff(view.mean[[0, -1]]) < -5e-9)
+    amplitude = np.repeat([30.0, 30.0, 30.0, 60.0, 60.0, 60.0, 100.0, 100.0, 100.0], 4_000)
+    stronger = shares(seen(v, 1e-5 * (v - 0.5 * amplitude) * 1e-4 * (amplitude - 60.0)))
+    assert stronger["amplitude_gain"] > 0.3
+    assert stronger["amplitude_lag"] == stronger["amplitude"] == 0.0
+
+
+def test_a_drift_does_not_hide_a_smaller_error() -> None:
+    drift = 2e-7 * (TIME / TIME[-1]) ** 2
+    m = seen(SINE, drift + 1e-8 * np.sin(2 * np.pi * SINE / 100.0))
+    view = next(w for w in m.views if w.name == "voltage")
+    assert shares(m)["time"] > 0.9
+    assert view.significant
+    assert np.ptp(view.mean) == pytest.approx(2e-8, rel=0.25)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("voltage", [SINE, MULTISINE, STEPS], ids=["sine", "multisine", "steps"])
+def test_white_noise_shows_nothing(voltage: FloatArray, seed: int) -> None:
+    m = seen(voltage, 0.0 * voltage, seed=seed)
+    assert len(m.sentences) == 1
+    assert max(shares(m).values()) < 0.02
+    assert m.spectrum.share < 0.02
+
+
+def test_coloured_noise_says_something_false_in_one_of_forty_records_at_most() -> None:
+    told = 0
+    for seed in range(40):
+        voltage = (SINE, MULTISINE, STEPS)[seed % 3][:8_000]
+        told += len(seen(voltage, 0.0 * voltage, correlation=0.7, seed=seed).sentences) > 1
+    assert told <= 1
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_standard_errors_know_of_correlation(correlation: float) -> None:
+    squares = []
+    for seed in range(6):
+        m = seen(MULTISINE, 0.0 * TIME, correlation=correlation, seed=seed)
+        view = next(v for v in m.views if v.name == "time")
+        squares.append(np.mean((view.mean / view.spread) ** 2))
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.35)
+
+
+def test_missing_samples_and_rejected_ones() -> None:
+    error = 3e-8 * np.sin(2 * np.pi * SINE / 100.0)
+    residual = error + noise(TIME.size, 0.0, 0)
+    record = Record(name="r", time=TIME, voltage=SINE, displacement=1e-7 * SINE + residual)
+    gone = residual.copy()
+    gone[np.random.default_rng(0).random(TIME.size) < 0.3] = np.nan
+    gone[3_000:6_000] = np.nan
+    floor = noise_floor([record], [gone])[0]
+    m = misfit(record, gone, floor)
+    assert shares(m)["voltage"] > 0.95
+    assert m.split is not None
+    assert m.split.odd > 10.0 * m.split.even
+    for wrong in (residual[:-1], np.full(TIME.size, np.nan)):
+        with pytest.raises(InputError, match=r"valid samples of .* instants; give one value"):
+            misfit(record, wrong, floor)
+
+
+def test_counts_stay_counts() -> None:
+    residual: FloatArray = 3.0 * np.sin(2 * np.pi * SINE / 100.0)
+    residual = residual + noise(TIME.size, 0.0, 0) / NOISE
+    record = Record(
+        name="r",
+        time=TIME,
+        voltage=SINE,
+        displacement=100.0 * SINE + residual,
+        displacement_unit="counts",
+    )
+    m = misfit(record, residual, noise_floor([record], [residual])[0])
+    assert "2.1 counts rms" in m.sentences[0]
+    assert "+3 counts at" in m.sentences[1] or "-3 counts at" in m.sentences[1]
+
+
+@slow
+def test_a_million_samples() -> None:
+    n = 1_000_000
+    v = 50.0 * (1.0 - np.cos(2 * np.pi * np.arange(n) / 800.0))
+    residual = 1e-8 * np.sin(v / 30.0) + noise(n, 0.0, 0)
+    record = Record(name="r", time=grid(n), voltage=v, displacement=1e-7 * v + residual)
+    (floor,) = noise_floor([record], [residual])
+    before = time.process_time()
+    m = misfit(record, residual, floor)
+    # 1 s where nothing else runs; the limit leaves room for a busy machine
+    assert time.process_time() - before < 6.0
+    assert shares(m)["voltage"] > 0.95

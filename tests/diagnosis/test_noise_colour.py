@@ -1,0 +1,118 @@
+"""Noise with a colour: its level from a residual's fast part, and a cause named beside it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.diagnosis.colour import (
+    Colour,
+    colour_of,
+    excess_power,
+    left_correlation,
+    noise_rms,
+    omnibus,
+    uncertain,
+)
+from psa_casadi.effects import EFFECTS
+from psa_casadi.records.noise import first_order_noise, high_frequency_noise
+from psa_casadi.units import FloatArray
+from tests.studies.plants.make import make_record
+from tests.studies.plants.noise import coloured
+from tests.tiers import slow_but
+
+N = 6000
+TIME = np.linspace(0.0, 6.0, N, endpoint=False)
+VOLTAGE = 50.0 * (1.0 - np.cos(2.0 * np.pi * TIME))
+
+
+def noise(correlation: float, seed: int = 4) -> FloatArray:
+    return coloured(np.random.default_rng(seed).standard_normal(N), correlation)
+
+
+@pytest.mark.parametrize(("correlation", "within"), [(0.3, 0.06), (0.6, 0.12)])
+def test_the_level_of_coloured_noise_shows_in_its_fast_part(
+    correlation: float, within: float
+) -> None:
+    for seed in range(8):
+        rms, found = first_order_noise(noise(correlation, seed))
+        assert rms == pytest.approx(1.0, rel=within)
+        assert found == pytest.approx(correlation, abs=within)
+    assert high_frequency_noise(noise(0.6)) < 0.6
+
+
+def test_white_noise_stays_white_whatever_is_slow_beside_it() -> None:
+    triangle = 2.0 * np.abs((TIME / 0.15) % 2.0 - 1.0)
+    steps = np.sign(np.sin(2.0 * np.pi * 1.4 * TIME))
+    tone = np.sin(2.0 * np.pi * 157.0 * TIME)
+    for misfit in (0.0 * TIME, triangle, steps, tone):
+        for seed in range(4):
+            rms, found = first_order_noise(noise(0.0, seed) + misfit)
+            assert found == 0.0
+            assert rms == pytest.approx(1.0, rel=0.06)
+
+
+def test_what_is_above_coloured_noise_is_its_excess() -> None:
+    e = noise(0.7)
+    colour = colour_of(e, [N])
+    assert colour.rms == pytest.approx(np.std(e), rel=0.03)
+    assert abs(excess_power(e, colour)) < 0.25
+    more = e + np.sqrt(2.0) * np.sin(2.0 * np.pi * TIME)
+    assert excess_power(more, colour) == pytest.approx(1.0, abs=0.25)
+    assert noise_rms(more, colour) <= colour.rms
+
+
+@pytest.mark.parametrize("correlation", slow_but([0.0, 0.6], [0.0, 0.3, 0.6, 0.85]))
+def test_a_colour_survives_the_projection_of_slow_directions(correlation: float) -> None:
+    """A hundred slow waves taken out of 3,000 samples leave 0.54 of a correlation of 0.6."""
+    n, rng = 3000, np.random.default_rng(6)
+    waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, n), np.arange(100)))
+    basis = np.linalg.qr(waves)[0]
+    found, plain = [], []
+    for _ in range(10):
+        e = coloured(rng.standard_normal(n + 200), correlation)[200:]
+        left = e - basis @ (basis.T @ e)
+        plain.append(float(left[1:] @ left[:-1] / (left @ left)))
+        found.append(float(np.sum(colour_of(left, [n // 2] * 2, None, basis).autoregression[0])))
+    assert np.mean(found) == pytest.approx(correlation, abs=0.015)
+    assert np.mean(plain) < correlation - 0.03
+    halves = list(np.split(basis, 2))
+    assert left_correlation(correlation, halves) == pytest.approx(np.mean(plain), abs=0.015)
+
+
+@pytest.mark.parametrize(("correlation", "n"), [(0.0, 4000), (0.6, 5000), (0.75, 3000)])
+def test_the_power_of_noise_is_as_uncertain_as_draws_of_it_show(correlation: float, n: int) -> None:
+    rng = np.random.default_rng(8)
+    drawn = [coloured(rng.standard_normal(n + 200), correlation)[200:] for _ in range(60)]
+    powers = [first_order_noise(e)[0] ** 2 for e in drawn]  # capped by what the draw really has
+    said = float(np.median([uncertain(e) for e in drawn]))
+    assert 0.5 * said < float(np.std(powers)) < 1.5 * said
+
+
+def _size_test(
+    residual: FloatArray, *, even: bool = True, lengths: tuple[int, ...] = (N,)
+) -> float:
+    colour = Colour(tuple(np.zeros(0) for _ in lengths), 1.0, lengths)
+    return omnibus(residual, VOLTAGE, TIME, colour, 1.0, knowable=0.0, even=even).p_value
+
+
+def test_noise_of_one_size_is_no_misfit_and_noise_after_reversals_only_is() -> None:
+    """What a colour swallows of a misfit is larger where the misfit is."""
+    quiet = [_size_test(noise(0.0, seed)) for seed in range(20)]
+    assert min(quiet) > 1e-3
+    after = 1.0 + np.exp(-((TIME % 0.5) / 0.05))
+    assert _size_test(after * noise(0.0)) < 1e-6
+    assert _size_test(after * noise(0.0), even=False) > 1e-3
+
+
+@pytest.mark.slow
+def test_a_cause_is_named_beside_a_sensor_that_sticks(tmp_path: Path) -> None:
+    """Repeated readings far from the model are masked and said; without that nothing is named."""
+    path = tmp_path / "record.csv"
+    make_record("charge_leakage", 93096, path, noise="drop-outs", visible=(0.3, 3.0))
+    table = [EFFECTS[n] for n in ("charge_leakage", "slow_creep", "offset_drift")]
+    found = psa.diagnose([psa.read_record(path)], effects=table)
+    assert found.verdict == "cause_named"
+    assert [c.effect for c in found.causes] == ["charge_leakage"]
+    assert any("stuck sensor" in note for note in found.notes)

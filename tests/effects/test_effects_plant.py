@@ -1,0 +1,377 @@
+"""The signatures of the plant's effects: each shows the figures that its equation promises.
+
+And what holds for all: finite slopes, ordinary costs, no run-away, rest at a hold.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import psa_casadi as psa
+from psa_casadi.component import Component
+from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
+from psa_casadi.effects import EFFECTS
+from psa_casadi.effects.hysteresis import HYSTERESIS_MEMORY, RATE_DEPENDENT_HYSTERESIS
+from psa_casadi.effects.mechanics import BACKLASH, LOAD_STIFFNESS, PRELOAD_LOSS
+from psa_casadi.effects.strain import (
+    AGEING,
+    FIELD_DEPENDENT_GAIN,
+    SATURATION_OF_STRAIN,
+    SELF_HEATING,
+)
+from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.start.ordinary import forms_of
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.scales import stiffness_scale, stroke_scale
+from psa_casadi.simulation.compiler import functions_of
+from psa_casadi.simulation.simulate import simulate
+from tests.effects.effect_runs import (
+    HYSTERESIS,
+    QUICK,
+    driven,
+    linear,
+    ordinary,
+    sine_and_steps,
+    third_harmonic,
+    triangle,
+)
+from tests.export.modelica_runs import right_side_error
+from tests.model.random_models import random_model, random_point
+from tests.model.stack_models import stack
+from tests.studies.plants.hysteresis_memory import play
+from tests.studies.plants.make import make_record
+from tests.tiers import slow
+
+every_base = pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
+
+
+@pytest.mark.parametrize("peak", [120.0, 24.0])
+def test_loop_width_follows_the_logarithm_of_rate(peak: float) -> None:
+    """By rate_gain per decade to 10 %, at small and large loops; the stroke moves against it."""
+    rates = np.array([0.05, 0.5, 5.0])
+
+    def width_and_stroke(gain: float, frequency: float) -> tuple[float, float]:
+        model = stack("P-885.51", **QUICK).with_effect(
+            RATE_DEPENDENT_HYSTERESIS, {"rate_gain": gain, "rate_onset": 1e-3}
+        )
+        t, voltage = triangle(frequency, peak)
+        found = driven(model, t, voltage)
+        u, x = found.x[-401:, 0], found.y[-401:, -1]
+        up = np.interp(peak / 2, u[:200], x[:200])
+        down = np.interp(peak / 2, u[200:][::-1], x[200:][::-1])
+        return float(down - up), float(np.ptp(x))
+
+    shown = {g: np.log([width_and_stroke(g, f) for f in rates]) for g in (0.0, 0.05, -0.05)}
+    for gain in (0.05, -0.05):
+        width, reach = np.polyfit(np.log10(rates), shown[gain] - shown[0.0], 1)[0]
+        assert width == pytest.approx(gain, rel=0.1)
+        assert -0.5 < reach / gain < -0.05
+
+
+def test_rayleigh_gain_grows_with_amplitude() -> None:
+    """Gain in proportion to the peak; third harmonic -8/(15 pi) of it, as its square."""
+    peaks = np.array([30.0, 60.0, 120.0])
+    gains = []
+    for peak in peaks:
+        t, voltage = triangle(1.0, peak, cycles=1)
+        gains.append(np.ptp(driven(linear(FIELD_DEPENDENT_GAIN, 0.1), t, voltage).y[:, -1]) / peak)
+    slope, start = np.polyfit(peaks / 120.0, gains, 1)
+    assert slope / start == pytest.approx(0.1, rel=0.01)
+    small, large = (third_harmonic(FIELD_DEPENDENT_GAIN, 0.1, peak) for peak in (50.0, 100.0))
+    assert large[1] / small[1] == pytest.approx(4.0, rel=0.01)
+    assert large[1] / large[0] == pytest.approx(
+        -8 / (15 * np.pi) * 0.1 / (1.2 + 0.1 * 8 / (3 * np.pi)), rel=0.01
+    )
+
+
+def test_saturation_flattens_both_branches() -> None:
+    """1/sqrt(1 + g) at rated voltage; third harmonic of the other sign than Rayleigh's, g a^2/8."""
+    full = []
+    for gain in (0.0, 0.2):
+        t, voltage = triangle(1.0, 120.0, cycles=1)
+        full.append(np.ptp(driven(linear(SATURATION_OF_STRAIN, gain), t, voltage).y[:, -1]))
+    assert full[1] / full[0] == pytest.approx(1 / np.sqrt(1.2), rel=1e-4)
+    first, third = third_harmonic(SATURATION_OF_STRAIN, 0.02, 60.0)
+    assert third / first == pytest.approx(0.02 / 8 * 0.25, rel=0.01)
+
+
+@every_base
+@pytest.mark.parametrize(("volt", "force"), [(120.0, 0.0), (60.0, 0.0), (0.0, 900.0)])
+def test_load_hardens_with_displacement(
+    base: tuple[Component, ...], volt: float, force: float
+) -> None:
+    """k x + h k_s x^3 / x_s^2 = the force that holds the linear stack there, whoever exerts it."""
+    t = np.linspace(0.0, 1.0, 201)
+    angle, gain = np.arctan(0.2), 0.05  # a pure cubic
+    model, plain = (linear(LOAD_STIFFNESS, g, base, load_angle=angle) for g in (gain, 0.0))
+    x, free = (
+        driven(m, t, volt * np.minimum(t / 0.5, 1.0), force).y[-1, -1] for m in (model, plain)
+    )
+    p = model.values
+    k = p["k_B"] if "k_B" in p else p["k"]
+    k_s, x_s = stiffness_scale(p), stroke_scale(p)
+    h = 20.0 * gain * np.sin(angle)
+    share = h * (x / x_s) ** 3
+    load = k_s * x_s * share / np.sqrt(1.0 + (2.0 * share) ** 2)  # levels off at 0.5 k_s x_s
+    assert k * x + load == pytest.approx(k * free, rel=1e-5)
+    assert x < 0.97 * free
+
+
+@every_base
+def test_contact_kinks_the_curve_at_one_displacement(base: tuple[Component, ...]) -> None:
+    """Slope 1 below, k / (k + g k_s) above, meeting at contact_position of the stroke."""
+    t, voltage = triangle(0.5, 120.0, cycles=1)
+    touched, free = (
+        driven(linear(PRELOAD_LOSS, g, base, contact_position=0.45), t, voltage).y[:, -1]
+        for g in (0.25, 0.0)
+    )
+    p = linear(PRELOAD_LOSS, 0.25, base).values
+    k, k_s = p["k_B"] if "k_B" in p else p["k"], stiffness_scale(p)
+    x_c = 0.45 * stroke_scale(p)
+    for branch in (slice(2, 199), slice(202, 399)):
+        below, above = free[branch] < 0.9 * x_c, free[branch] > 1.1 * x_c
+        lines = [np.polyfit(free[branch][w], touched[branch][w], 1) for w in (below, above)]
+        assert lines[0][0] == pytest.approx(1.0, abs=2e-3)
+        assert lines[1][0] == pytest.approx(k / (k + 0.25 * k_s), abs=2e-3)
+        meeting = (lines[1][1] - lines[0][1]) / (lines[0][0] - lines[1][0])
+        assert meeting == pytest.approx(x_c, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [{"play": (0.05, 0.02, 0.0)}, {"square": (0.04, 0.0, -0.01)}, {"cube": (0.03, -0.02, 0.0)},
+     {"play": (-0.02, 0.0, 0.01), "square": (0.08, 0.03, 0.0), "cube": (-0.05, 0.0, 0.0)}],
+    ids=["plays", "squares", "cubes", "all"],
+)  # fmt: skip
+def test_memory_is_a_sum_of_plays_their_squares_and_cubes(
+    weights: dict[str, tuple[float, float, float]],
+) -> None:
+    """Of ideal plays with the same weights and thresholds, to the roundness of its stops."""
+    values = {f"memory_{name}_{k}": 0.0 for name in ("play", "square", "cube") for k in range(3)}
+    values |= {f"memory_{name}_{k}": w for name, row in weights.items() for k, w in enumerate(row)}
+    plain = linear(HYSTERESIS_MEMORY, 0.0)
+    model = plain.with_values({"memory_gain": 1.0, "memory_threshold": 0.02, **values})
+    t = np.linspace(0.0, 60.0, 6001)
+    voltage = 60.0 * (1.0 - np.cos(2 * np.pi * t / 20.0)) * (1.0 - t / 90.0)
+    shown = driven(model, t, voltage).y[:, -1] - driven(plain, t, voltage).y[:, -1]
+    rated, expected = model.values["u_rated"], np.zeros_like(t)
+    for i, ratio in enumerate((1.0, 2.5, 6.0, 15.0)):
+        p = play(voltage, 0.02 * ratio * rated)
+        for power, name in enumerate(("play", "square", "cube"), 1):
+            terms = np.cos(np.pi * np.arange(3) * (i + 0.5) / 4) * weights.get(name, (0.0,) * 3)
+            expected += np.sum(terms) * (voltage**power - p**power) / rated ** (power - 1)
+    expected *= model.values["k_L"] * static_compliance(model.values)
+    assert np.sqrt(np.mean((shown - expected) ** 2)) < 0.05 * np.ptp(expected)
+
+
+@pytest.mark.parametrize("peak", [30.0, 120.0])
+def test_backlash_dwells_over_the_gap(peak: float) -> None:
+    """Whatever the amplitude: none of the first w of motion, 4 w of the first 6 w get through."""
+    model = linear(BACKLASH, 1.0, backlash_width=0.01)
+    w = 0.01 * stroke_scale(model.values)
+    t, voltage = triangle(1.0, peak)
+    found = driven(model, t, voltage)
+    tip, shown = found.x[:, model.state_names.index("x")], found.y[:, -1]
+    for first, sign in ((600, -1.0), (800, 1.0)):  # the last downward and the last upward branch
+        moved = sign * (tip[first : first + 200] - tip[first])
+        through = sign * (shown[first : first + 200] - shown[first])
+        crossed = [float(np.interp(d * w, moved, through)) / w for d in (0.9, 2.0, 6.0)]
+        assert crossed[0] < 0.01
+        assert crossed[1] < 0.2
+        assert crossed[2] == pytest.approx(4.0, abs=0.02)
+
+
+def test_self_heating_climbs_and_recovers() -> None:
+    """By the area of the loop while it is driven; back with heating_time at a hold.
+
+    What is lost is the loop's work less what the hysteresis stores, A f_H u' - (f_H^2/2)'.
+    """
+    cooling = 0.8
+    t = np.arange(6001) / 1000.0
+    voltage = np.where(t < 3.0, 60.0 * (1.0 - np.cos(2 * np.pi * 20.0 * t)), 60.0)
+    model = stack("P-885.51", **{**QUICK, "delta": 0.0, "gamma": 0.0}).with_effect(
+        SELF_HEATING, {"heating_gain": 0.02, "heating_time": cooling}
+    )
+    found = driven(model, t, voltage)
+    states = dict(zip(model.state_names, found.x.T, strict=True))
+    p = model.values
+    h, u, a = states["f_H"], states["u"], p["A"]
+    share = p["beta"] * p["h_ref"] * p["u_rated"]  # what makes one unit of heat, times |A|
+    lost = 0.5 * (h[1:] + h[:-1]) * np.diff(u) * a - 0.5 * np.diff(h**2)
+    fading = np.exp(-(t[3000] - 0.5 * (t[1:3001] + t[:3000])) / cooling)
+    wanted = float(lost[:3000] @ fading) / share
+    assert states["heat"][3000] == pytest.approx(wanted, rel=0.03)
+    cold = driven(model.with_values({"heating_gain": 0.0}), t, voltage).y[:, -1]
+    excess = (found.y[3100:, -1] - cold[3100:]) / cold[3100:]
+    assert excess[0] == pytest.approx(0.02 * states["heat"][3100], rel=1e-3)
+    rate = np.polyfit(t[3100:5000], np.log(excess[:1900]), 1)[0]
+    assert -1.0 / rate == pytest.approx(cooling, rel=0.01)
+
+
+def test_ageing_is_a_straight_line_in_log_time() -> None:
+    """Of ageing_gain of the gain per decade, and nothing before time zero."""
+    t = np.concatenate([[-20.0, -10.0, 0.0], np.geomspace(0.01, 100.0, 60)])
+    model = linear(AGEING, 0.02, ageing_time=1e-3)
+    x = simulate(model, t, np.full(t.size, 80.0)).displacement
+    fresh = simulate(model.with_values({"ageing_gain": 0.0}), t, np.full(t.size, 80.0)).displacement
+    lost = 1.0 - x / fresh
+    assert np.abs(lost[:3]).max() < 1e-7
+    slope = np.polyfit(np.log10(t[20:]), lost[20:], 1)[0]
+    assert slope == pytest.approx(0.02, rel=1e-3)
+    np.testing.assert_allclose(lost[20:], 0.02 * np.log10(1 + t[20:] / 1e-3), rtol=1e-4)
+
+
+PLANT = tuple(e for e in EFFECTS.values() if e.belongs_to == "plant")
+#: Parameters of a curve's form.
+ANGLES, WAVES = ("load_angle",), ("load_wave",)
+every_effect = pytest.mark.parametrize("effect", PLANT, ids=lambda e: e.name)
+
+
+def bounded(effect: Component) -> bool:
+    """Whether the gain's bounds are within a thousand of its ordinary sizes."""
+    model = ordinary(effect)
+    gain = model.parameter(str(effect.gain))
+    return max(map(abs, gain.bounds)) <= 1e3 * model.values[gain.name]
+
+
+def has_room_in(base: tuple[Component, ...], effect: Component) -> bool:
+    """Whether a base has what an effect needs."""
+    return set(effect.needs) <= {c.name for c in base}
+
+
+@every_effect
+@every_base
+def test_slopes_are_finite(effect: Component, base: tuple[Component, ...]) -> None:
+    """At random points, at rest, and far away before time zero; with gain and without."""
+    if not has_room_in(base, effect):
+        pytest.skip(f"needs {effect.needs}")
+    generator = np.random.default_rng(11)
+    for gains in (False, True):
+        model = random_model((effect,), generator, gains=gains, base=base)
+        point = random_point(model, generator)
+        for time, size in ((point.time, 1.0), (0.0, 0.0), (-5.0, 100.0)):
+            p = ca.DM(model.parameter_vector())
+            at = [ca.DM(time), ca.DM(size * point.x), ca.DM(size * point.u), p]
+            for function in functions_of(model.structure, sensitivities=True).values():
+                slopes = function.call(at)
+                assert all(np.isfinite(np.array(part)).all() for part in slopes)
+
+
+@every_effect
+def test_ordinary_size_shows_and_costs_little(effect: Component) -> None:
+    """Between 0.05 and 10 % of the range, at no more than 1.5 times the steps, at any probe.
+
+    A further resonance costs the steps of its oscillation. A weight may be 0 beside others.
+    """
+    t, voltage = sine_and_steps()
+    base = driven(stack("P-885.51"), t, voltage)
+    grids = {n: grid for n, grid in effect.probe.items() if isinstance(grid, tuple)}
+    grid = [{n: float(v)} for n, values in grids.items() for v in values]
+    grid = [g for g in grid if any(g.values()) or not set(g) & set(effect.linear)]
+    for values in grid or [{}]:
+        found = driven(ordinary(effect, **values), t, voltage)
+        change = np.abs(found.y[:, -1] - base.y[:, -1]).max() / np.ptp(base.y[:, -1])
+        assert 5e-4 < change < 0.1, values
+        assert effect.tone or found.steps <= 1.5 * base.steps, values
+
+
+@pytest.mark.parametrize("effect", [e for e in PLANT if bounded(e)], ids=lambda e: e.name)
+@pytest.mark.parametrize("end", [0, 1])
+def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> None:
+    """Within a thousand ordinary sizes: wider bounds say that stacks have no size in common."""
+    t, voltage = sine_and_steps()
+    bound = ordinary(effect).parameter(str(effect.gain)).bounds[end]
+    grid = [{n: float(v)} for n, values in effect.probe.items() for v in values if n in ANGLES]
+    waves = [{n: v} for n in WAVES for v in (-20.0, 20.0) if n in ordinary(effect).values]
+    for shape in [{}, *grid, *waves]:
+        model = ordinary(effect).with_values({str(effect.gain): bound, **shape})
+        x = driven(model, t, voltage).y[:, -1]
+        assert np.abs(x).max() < 3.0 * stroke_scale(model.values), shape
+
+
+@pytest.mark.parametrize("effect", [e for e in PLANT if e is not AGEING], ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    "base", [BASE, pytest.param(SIMPLIFIED, marks=slow)], ids=["cascade", "single mass"]
+)
+def test_a_held_voltage_holds_the_output(effect: Component, base: tuple[Component, ...]) -> None:
+    """The start at 100 V is an equilibrium of the extended model; ageing alone goes on."""
+    if not has_room_in(base, effect):
+        pytest.skip(f"needs {effect.needs}")
+    model = linear(effect, 0.3, base, **HYSTERESIS)
+    x = simulate(model, np.arange(11) * 10.0, np.full(11, 100.0)).displacement
+    assert x[0] > 0.3 * stroke_scale(model.values)
+    assert np.ptp(x) < 1e-6 * x[0]
+
+
+FloatArray = NDArray[np.float64]
+
+_STROKE, _RATED, _NOISE = 20e-6, 100.0, 20e-9
+
+
+def _plays(v: FloatArray, radii: FloatArray) -> FloatArray:
+    """Ideal play operators (n, k), from rest at 0 V."""
+    found = np.empty((v.size, radii.size))
+    state = np.zeros(radii.size)
+    for k, value in enumerate(v):
+        state = np.clip(state, value - radii, value + radii)
+        found[k] = state
+    return found
+
+
+def _loops() -> dict[str, FloatArray]:
+    """Loops of rising and falling amplitude of a generalised Prandtl-Ishlinskii stack."""
+    t = np.arange(3000) * 2e-3
+    swing = 0.5 * _RATED * np.interp(t, [0.0, 3.0, 6.0], [0.1, 1.0, 0.3])
+    v = swing * (1.0 - np.cos(2.0 * np.pi * 1.5 * t))
+    radii = _RATED * np.array([0.015, 0.04, 0.08, 0.13, 0.2, 0.3])
+    plays = _plays(v, radii) / _RATED
+    weights = np.array([0.04, 0.035, 0.03, 0.03, 0.025, 0.02])
+    x = 0.75 * v / _RATED + plays @ weights + plays**2 @ (0.6 * weights[::-1])
+    noise = np.random.default_rng(7).normal(0.0, _NOISE, t.size)
+    return {"time [s]": t, "voltage [V]": v, "displacement [m]": _STROKE * x / x.max() + noise}
+
+
+def _with_spectrum(**values: Any) -> Model:
+    own = [COMPONENTS["memory_spectrum"] if c.name == "bouc_wen" else c for c in BASE]
+    return compose(own, {"u_rated": 120.0, "play_0": -0.05, "square_0": 0.02, **values})
+
+
+@slow
+def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
+    record = psa.record_from(_loops())
+    bouc_wen = psa.identify(record)
+    best = psa.identify(record, hysteresis="best")
+    assert "memory_spectrum" in [c.name for c in best.model.components]
+    assert any("a spectrum of elements" in s for s in best.sentences)
+    assert bouc_wen.fit.rms > 3.0 * _NOISE
+    assert best.fit.rms < 1.3 * _NOISE
+    psa.save_model(best.model, tmp_path / "model.json")
+    again = psa.load_model(tmp_path / "model.json")
+    assert again.values == best.model.values
+    x = psa.simulate(again, record.time, record.voltage).outputs["displacement"]
+    assert np.ptp(x) == pytest.approx(record.range_m, rel=0.03)
+
+
+@slow
+def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
+    make_record(None, 3, tmp_path / "record.csv")
+    record = psa.read_record(tmp_path / "record.csv").slice(0, 1000)
+    found = psa.identify(record, hysteresis="best")
+    assert "bouc_wen" in [c.name for c in found.model.components]
+    assert any(s.startswith("hysteresis: Bouc-Wen") for s in found.sentences)
+
+
+def test_a_model_without_hysteresis_has_no_other_form() -> None:
+    bare = compose([c for c in BASE if c.name != "bouc_wen"])
+    with pytest.raises(psa.InputError, match="no hysteresis of its own"):
+        forms_of(bare, "spectrum")
+
+
+def test_modelica_has_the_equations_of_the_model() -> None:
+    model = _with_spectrum()
+    assert right_side_error(model, modelica_text(model, include_sensor=True)) < 1e-12

@@ -1,9 +1,0 @@
-"""All records of the exam."""
-
-from tests.exam.record import Record
-from tests.exam.records_drive_ceramic import DRIVE_AND_CERAMIC
-from tests.exam.records_mechanics_sensor import MECHANICS_AND_SENSOR
-from tests.exam.records_others import CLEAN, FOREIGN, TWO_CAUSES
-
-_ONE_CAUSE = sorted((*DRIVE_AND_CERAMIC, *MECHANICS_AND_SENSOR), key=lambda record: record.name)
-RECORDS: tuple[Record, ...] = (*CLEAN, *_ONE_CAUSE, *TWO_CAUSES, *FOREIGN)

@@ -1,0 +1,310 @@
+"""The recipes for other tools: what can run here runs, and every name the rest uses is checked."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import types
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import fmpy.cli
+import lark
+import numpy as np
+import pytest
+import yaml  # type: ignore[import-untyped]
+from fmpy import read_model_description
+from scipy.integrate import solve_ivp
+
+import psa_casadi as psa
+from build_scripts.measured_data import ROOT
+from psa_casadi.component import BALANCES
+from psa_casadi.examples.index import Example, Script, examples
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.simulation.simulate import settled_at
+from tests.examples.oms_stand_in import SSP, CRef
+from tests.examples.recipe_commands import run_command
+from tests.examples.script_calls import calls_of
+from tests.examples.tool_interfaces import BLOCK_PARAMETERS, DYMOLA, OPENMODELICA, bound
+from tests.export.modelica_runs import load
+from tests.export.modelica_stub import STUB
+from tests.tiers import slow
+
+RECIPES = [e.name for e in examples().values() if e.kind == "recipe"]
+
+
+def _shell(recipe: Example) -> list[str]:
+    return re.findall(r"^\$ (.*)$", recipe.text, re.MULTILINE)
+
+
+@pytest.fixture
+def made(request: pytest.FixtureRequest, made_files: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder with what the page's `psa` commands make; the current one for the test."""
+    folder = made_files / str(request.param)
+    folder.mkdir(exist_ok=True)
+    monkeypatch.chdir(folder)
+    for command in _shell(examples()[request.param]):
+        run_command(command)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("recipes")
+
+
+def _script(recipe: str, name: str) -> Script:
+    return next(s for s in examples()[recipe].scripts if s.name == name)
+
+
+def test_every_page_says_what_was_executed() -> None:
+    assert set(RECIPES) >= {"openmodelica", "dymola", "simulink", "omsimulator", "fmpy", "ci"}
+    for name in RECIPES:
+        assert "\n## What was executed\n" in examples()[name].text, name
+
+
+@cache
+def _experiment(text: str, name: str) -> dict[str, float]:
+    body = text.partition(f"model {name} ")[2].partition(f"end {name};")[0]
+    found = re.search(r"experiment\(StartTime=(\S+), StopTime=(\S+),", body)
+    assert found is not None, name
+    return {"startTime": float(found[1]), "stopTime": float(found[2])}
+
+
+@pytest.mark.parametrize(
+    ("made", "interface"),
+    [("openmodelica", OPENMODELICA), ("dymola", DYMOLA)],
+    indirect=["made"],
+    ids=["openmodelica", "dymola"],
+)
+def test_modelica_scripts(made: Path, interface: dict[str, tuple[str, ...]]) -> None:
+    """Functions and arguments exist in the tool; files, classes, times and variables in ours."""
+    text = (made / "PiezoStack.mo").read_text(encoding="utf-8")
+    seen: set[str] = set()
+    for script in examples()[made.name].scripts:
+        for call in calls_of(script.text, script.language):
+            given = bound(call, interface)
+            seen.add(call.function)
+            file = given.get("fileName") or given.get("filename") or given.get("path")
+            if file not in (None, "wrapper"):
+                assert (made / str(file)).is_file(), file
+            simulated = given.get("problem") or given.get("className")
+            if call.function.startswith("simulate"):
+                assert load(text + STUB, str(simulated)) is not None
+                name = str(simulated).rsplit(".", 1)[1]
+                times = {k: float(given[k]) for k in ("startTime", "stopTime")}
+                assert times == _experiment(text, name)
+    assert {"importFMU"} < seen
+    page = examples()[made.name].text
+    for variable in read_model_description("stack.fmu").modelVariables:
+        if variable.causality == "input":
+            assert f"`{variable.name}` [{variable.unit}]" in page
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ['loadFile("PiezoStack.mo")', 'loadFile("a.mo";', 'x = loadFile("a.mo");', "loadFile('a.mo');"],
+)
+def test_bad_syntax_is_seen(wrong: str) -> None:
+    with pytest.raises(lark.exceptions.LarkError):
+        calls_of(wrong, "modelica")
+
+
+@pytest.mark.parametrize(
+    "wrong", ['loadFiles("a.mo");', 'loadFile("a.mo", path="b");', "getErrorString(true, false);"]
+)
+def test_a_function_or_argument_that_the_tool_lacks_is_seen(wrong: str) -> None:
+    (call,) = calls_of(wrong, "modelica")
+    with pytest.raises(ValueError, match="no "):
+        bound(call, OPENMODELICA)
+
+
+@pytest.mark.parametrize("made", ["simulink"], indirect=True)
+@pytest.mark.usefixtures("made")
+def test_the_matlab_script() -> None:
+    """Blocks are added before they are used, ports and parameters are those of the FMU."""
+    script = _script("simulink", "run_stack.m")
+    description = read_model_description("stack.fmu")
+    tunable = {v.name for v in description.modelVariables if v.causality == "parameter"}
+    ports = {k: [v for v in description.modelVariables if v.causality == k]
+             for k in ("input", "output")}  # fmt: skip
+    blocks = {"model": "model"}
+    lines = []
+    for call in calls_of(script.text, "matlab"):
+        if call.function == "add_block":
+            kind, name, *rest = call.arguments
+            blocks[name] = kind
+            assert set(rest[::2]) <= BLOCK_PARAMETERS[kind], rest
+        elif call.function == "set_param":
+            name, *rest = call.arguments
+            known = BLOCK_PARAMETERS[blocks[name]]
+            assert set(rest[::2]) <= (known | tunable if "FMU" in blocks[name] else known), rest
+        elif call.function == "add_line":
+            lines.append(call.arguments[1:])
+    ends = {end.split("/")[0] for line in lines for end in line}
+    assert ends <= {name.partition("/")[2] for name in blocks}
+    assert "'FMUName', 'stack.fmu'" in script.text
+    fed = {int(to.split("/")[1]): source.split("/")[0] for source, to in lines if "Stack/" in to}
+    named = [ports["input"][k - 1].name for k in sorted(fed)]
+    assert named == ["voltage", "load_force"]
+    assert [fed[k] for k in sorted(fed)] == ["Voltage", "Load"]
+    (out,) = [int(source.split("/")[1]) for source, to in lines if "Displacement" in to]
+    assert ports["output"][out - 1].name == "displacement"
+    for kind, variables in ports.items():
+        listed = ", ".join(f"{i} {v.name} [{v.unit}]" for i, v in enumerate(variables, 1))
+        assert f"% {kind}s: {listed}\n" in script.text
+
+
+@slow
+@pytest.mark.parametrize("made", ["omsimulator"], indirect=True)
+def test_the_scripts_for_omsimulator_push_and_move_the_stage(
+    made: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a stand-in that wires and steps the FMUs; the ends are where scipy and the model say."""
+    module = types.ModuleType("OMSimulator")
+    module.SSP, module.CRef = SSP, CRef  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "OMSimulator", module)
+    text = _script("omsimulator", "push_the_stage.py").text
+    exec(compile(text, "push_the_stage.py", "exec"), space := dict[str, Any]())
+    assert float(capsys.readouterr().out) == pytest.approx(_pushed(100.0, 2e-3), rel=1e-3)
+    assert space["model"].calls[-2:] == ["terminate", "delete"]
+    with pytest.raises(ValueError, match="cannot drive"):
+        exec(compile(text.replace('"velocity"', '"current"'), "wrong", "exec"), {})
+    text = _script("omsimulator", "move_the_stage.py").text
+    exec(compile(text, "move_the_stage.py", "exec"), space := dict[str, Any]())
+    model = nanopositioner("P-885.51").model()
+    times = np.linspace(0.0, space["model"].stop, 201)
+    moved = psa.run(model, times, np.full((201, 1), 5e-6), np.zeros(len(model.state_names)))
+    expected = moved.y[-1, model.output_names.index("stage_position")]
+    assert float(capsys.readouterr().out) == pytest.approx(expected, rel=2e-3)
+    files = re.findall(r"\S+\.(?:fmu|ssp)\b", _script("omsimulator", "run_omsimulator.sh").text)
+    assert files == ["held.fmu", "held.fmu", "nanopositioner.ssp"]
+    assert all((made / name).is_file() for name in files)
+
+
+@slow
+@pytest.mark.skipif(shutil.which("OMSimulator") is None, reason="OMSimulator is not installed")
+@pytest.mark.parametrize("made", ["omsimulator"], indirect=True)
+def test_the_shell_commands_of_omsimulator(made: Path) -> None:
+    """A stack that is held at 60 V stays there, a closed loop rests."""
+    for line in _script("omsimulator", "run_omsimulator.sh").text.splitlines():
+        subprocess.run(shlex.split(line), cwd=made, check=True, timeout=120)
+    held = settled_at(psa.stack_model("P-885.51"), 60.0, [120.0, 0.0])
+    expected = psa.simulate(held, [0.0, 1e-3], [60.0, 60.0]).displacement[-1]
+    for name in ("held.csv", "held_cs.csv"):
+        found = np.genfromtxt(made / name, delimiter=",", names=True)["displacement"]
+        assert found == pytest.approx(expected, rel=1e-9)
+    rows = np.loadtxt(made / "nanopositioner.csv", delimiter=",", skiprows=1)
+    assert rows[-1, 0] == pytest.approx(0.01)
+
+
+def _pushed(voltage: float, end: float) -> float:
+    """Return the stage's position [m] after a step of voltage, from one set of equations."""
+    stack = psa.stack_model("P-885.51").plant()
+    stage = psa.compose([psa.COMPONENTS["flexure"]])
+    count, size = len(stack.state_names), np.r_[stack.state_nominals(), stage.state_nominals()]
+    p, q = stack.parameter_vector(), stage.parameter_vector()
+    seen = [stack.output_names.index(n) for n in ("displacement", "velocity")]
+    force_at = stage.output_names.index("reaction_force")
+
+    def rates(t: float, z: Any) -> Any:
+        tip = np.array(stack.structure.f(t, z[:count], [voltage, 0.0], p)[1]).ravel()[seen]
+        slope, out = stage.structure.f(t, z[count:], tip, q)
+        own = stack.structure.f(t, z[:count], [voltage, float(out[force_at])], p)[0]
+        return np.r_[np.array(own).ravel(), np.array(slope).ravel()]
+
+    found = solve_ivp(
+        rates, (0.0, end), np.zeros(len(size)), method="LSODA", rtol=1e-8, atol=1e-10 * size
+    )
+    assert found.success
+    return float(found.y[count, -1])
+
+
+@slow
+@pytest.mark.parametrize("made", ["fmpy"], indirect=True)
+def test_the_shell_commands_of_fmpy(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (made / "voltage.csv").write_text(_script("fmpy", "voltage.csv").text, encoding="utf-8")
+    for line in _script("fmpy", "run_fmpy.sh").text.splitlines():
+        monkeypatch.setattr(sys, "argv", shlex.split(line))
+        if "validate" in line:  # ends with the number of problems
+            with pytest.raises(SystemExit, match=r"^0$"):
+                fmpy.cli.main()
+        else:
+            fmpy.cli.main()
+    two, three = (
+        np.genfromtxt(made / name, delimiter=",", names=True) for name in ("out.csv", "out3.csv")
+    )
+    assert two["displacement"].max() == pytest.approx(16e-6, rel=0.05)
+    assert three["displacement"][-1] == pytest.approx(two["displacement"][-1], rel=1e-3)
+
+
+@slow
+def test_the_jobs_of_ci_are_yaml_and_their_commands_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """GitHub's own actions excepted, and what the installation depends on."""
+    (job,) = yaml.safe_load(_script("ci", "fmu.yml").text)["jobs"].values()
+    assert job["runs-on"] == "ubuntu-latest"
+    actions = [step["uses"] for step in job["steps"] if "uses" in step]
+    assert all(re.fullmatch(r"actions/[a-z-]+@v\d+", a) for a in actions)
+    commands = [c for step in job["steps"] for c in step.get("run", "").splitlines()]
+    other = yaml.safe_load(_script("ci", "gitlab-ci.yml").text)
+    assert set(other["fmu"]["script"]) <= set(commands)
+    assert other["fmu"]["artifacts"]["reports"]["junit"] == "*.xml"
+    assert job["steps"][0]["with"]["submodules"] is True
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "psa_casadi").symlink_to(ROOT)
+    psa.save_model(psa.stack_model("demo"), "model.json")
+    shutil.copy(ROOT / "psa_casadi" / "data" / "demo.csv", "record.csv")
+    Path("judge.py").write_text(_script("ci", "judge.py").text, encoding="utf-8")
+    for command in commands:
+        program, *words = shlex.split(command)
+        if program == "psa":
+            run_command(command)
+            continue
+        if "install" in words:  # what builds it is here, what it depends on may not be
+            pytest.importorskip("pip")
+            words += ["--dry-run", "--no-deps", "--no-build-isolation", "--no-index"]
+        subprocess.run([sys.executable, *words], check=True, timeout=300)
+    kept = {
+        p.name for glob in job["steps"][-1]["with"]["path"].split() for p in tmp_path.glob(glob)
+    }
+    assert kept == {"stack.fmu", "stack3.fmu", "diagnosis.xml", "check.xml", "check3.xml"}
+    psa.export_fmu(psa.stack_model("P-885.51"), "other.fmu")
+    judge = [sys.executable, "judge.py", "model.json", "other.fmu"]
+    said = subprocess.run(judge, check=False, capture_output=True, text=True).stderr
+    assert said.endswith("ModelExchange differs by more than 0.1 % of the range\n")
+
+
+def test_scripts_are_found_on_a_page() -> None:
+    page = replace(examples()["fmpy"], text="# T\n```sh run.sh\na\nb\n```\n```console\n$ c\n```\n")
+    assert page.scripts == (Script("sh", "run.sh", "a\nb\n"),)
+
+
+def test_the_page_on_own_effects_has_every_balance() -> None:
+    text = examples()["own_effect"].text
+    rows = [f"| `{b.name}` | {b.unit} | {b.description} |" for b in BALANCES.values()]
+    assert [row for row in rows if row not in text] == []
+
+
+@slow
+def test_an_own_effect_is_found_with_the_size_that_was_put_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for command in _shell(examples()["own_effect"]):
+        if command.startswith("python "):
+            subprocess.run([sys.executable, *shlex.split(command)[1:]], check=True)
+        else:
+            run_command(command)
+    own = psa.own_effects("pickup")
+    monkeypatch.delitem(sys.modules, "pickup")
+    values = psa.load_model("extended.json", own.values()).values
+    assert values["pickup_gain"] == pytest.approx(4e-9, rel=0.02)
+    assert values["pickup_time"] == pytest.approx(0.05, rel=0.02)
+    names = [v.name for v in read_model_description("stack.fmu").modelVariables]
+    assert "pickup_gain" in names
+    assert (tmp_path / "pickup.png").stat().st_size > 0

@@ -1,0 +1,108 @@
+"""FMI 3.0 instances for tests that look at every status, and at what happens within a step."""
+
+import ctypes
+from collections.abc import Callable, Mapping
+from ctypes import c_bool, c_double
+from functools import cache
+from typing import Any, NamedTuple, Self
+
+from psa_casadi.export.importer import fmu as importer
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
+from tests.export.fmu_models import exported
+
+
+class Update(NamedTuple):
+    """What the FMU says between two steps of its solver."""
+
+    time: float
+    set_requested: bool
+    get_allowed: bool
+    step_finished: bool
+    can_return_early: bool
+
+
+class Step(NamedTuple):
+    """What fmi3DoStep returned."""
+
+    status: int
+    event_needed: bool
+    terminate: bool
+    early: bool
+    time: float
+
+
+#: Called between solver steps; returns the time at which the step shall end early, or None.
+Watcher = Callable[["Instance3", Update], float | None]
+
+
+@cache
+def loaded(name: str) -> Fmu:
+    """Return a loaded FMU of a named model, once per process."""
+    return Fmu(exported(name, 3))
+
+
+def try_step(instance: Instance, point: float, size: float) -> Step:
+    """Do one communication step and return all it says, the status included."""
+    event, end, early, reached = c_bool(), c_bool(), c_bool(), c_double()
+    places = (ctypes.byref(v) for v in (event, end, early, reached))
+    status = instance.call("DoStep", point, size, True, *places)
+    return Step(status, event.value, end.value, early.value, reached.value)
+
+
+class Instance3(importer.Instance):
+    """One instance; what it does not succeed in raises FmuError, what is tried returns a status.
+
+    `watcher` is called between two steps of the solver (intermediate update) and may end the step
+    there if `early`; `events` asks for event mode in co-simulation.
+    """
+
+    def __init__(
+        self, fmu: Fmu, interface: int = CO_SIMULATION, *, events: bool = False,
+        early: bool = True, watcher: Watcher | None = None,
+    ) -> None:  # fmt: skip
+        def look(_: int, *told: Any) -> None:
+            *update, wanted, until = told
+            end = watcher(self, Update(*update)) if watcher else None
+            if end is not None:
+                wanted[0], until[0] = c_bool(True), c_double(end)
+
+        options: dict[str, Any] = {}
+        if interface == CO_SIMULATION:
+            options = {"eventModeUsed": events, "earlyReturnAllowed": early}
+        if watcher:
+            options["intermediateUpdate"] = look
+        super().__init__(fmu, interface, **options)
+
+    def start(self, values: Mapping[str, float] | None = None, **experiment: Any) -> Self:
+        """Initialise with start values, into step mode or continuous-time mode."""
+        self.setup(values=values, **experiment)
+        if self.interface == MODEL_EXCHANGE:
+            self.require("EnterContinuousTimeMode")
+        return self
+
+    def try_step(self, point: float, size: float) -> Step:
+        """Do one communication step and return all it says, the status included."""
+        return try_step(self, point, size)
+
+    def try_set(self, values: Mapping[str, float]) -> int:
+        """Set variables and return the status."""
+        count = len(values)
+        numbers = (c_double * count)(*values.values())
+        return self.call("SetFloat64", self.references(list(values)), count, numbers, count)
+
+    def serialized(self) -> bytes:
+        """Return the instance's state as bytes."""
+        snapshot = self.save()
+        data = self.serialize(snapshot)
+        self.drop(snapshot)
+        return data
+
+    def try_restore(self, data: bytes) -> int:
+        """Go to a state given as bytes; return the status of the first call that fails."""
+        try:
+            snapshot = self.deserialize(data)
+        except importer.FmuError as error:
+            return error.status
+        status = self.call("SetFMUState", snapshot)
+        self.drop(snapshot)
+        return status

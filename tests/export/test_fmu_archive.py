@@ -1,0 +1,321 @@
+"""What is inside an FMU: sources that compile alone, binaries that load, terminals, icons, pages.
+
+And what the check says of FMUs that another version of CasADi made.
+"""
+
+import html
+import io
+import re
+import shutil
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import casadi as ca
+import fmpy
+import matplotlib.image
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+from lxml import etree  # type: ignore[import-untyped]
+
+from psa_casadi.component import Component, Equations
+from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.export.check.check import CheckRow, check_fmu
+from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu import sources
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
+from psa_casadi.export.fmu.sources import STRICT, write_sources
+from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
+from psa_casadi.variables import Output
+from tests.export.fmu_models import assert_valid, entries, model_named, rewritten
+from tests.tiers import slow_but
+
+STACK = "P-885.51"
+
+
+@pytest.mark.skipif(not shutil.which("gcc"), reason="gcc is not installed")
+@pytest.mark.parametrize("name", slow_but(["flexure"], ["slow_creep", "flexure"]))
+def test_sources_compile_alone_without_warnings(name: str, tmp_path: Path) -> None:
+    """By gcc; zig's compiler is tried by `build_scripts.compile_c`."""
+    written = write_sources(model_named(name).plant(), tmp_path / "sources")
+    line = next(
+        t for t in (tmp_path / "sources" / "README.txt").read_text().splitlines() if " cc " in t
+    )
+    command = ["gcc", *line.split()[1:], *STRICT]
+    output = command[command.index("-o") + 1]
+    run_compiler(command, tmp_path / "sources")
+    assert (tmp_path / "sources" / output).stat().st_size > 10_000
+    assert {p.name for p in written} >= {"model.c", "model_config.h", "fmi_data.c", "fmi2.c"}
+
+
+@pytest.mark.usefixtures("without_binary")
+def test_sensor_stays_out_unless_wanted(tmp_path: Path) -> None:
+    model = compose((*BASE, EFFECTS["sensor_delay"], EFFECTS["offset_drift"]))
+    plain = fmpy.read_model_description(str(export_fmu(model, tmp_path / "plant.fmu")))
+    whole_path = export_fmu(model, tmp_path / "whole.fmu", include_sensor=True)
+    names = {v.name for v in plain.modelVariables}
+    assert "displacement" in names
+    assert "measured_displacement" not in names
+    whole = {v.name for v in fmpy.read_model_description(str(whole_path)).modelVariables}
+    assert names < whole
+    assert "measured_displacement" in whole
+
+
+def test_impossible_exports_are_refused(tmp_path: Path) -> None:
+    model = model_named(STACK)
+    with pytest.raises(InputError, match="cannot name an FMU"):
+        export_fmu(model, tmp_path / "a.fmu", name="P-885.51")
+    with pytest.raises(InputError, match="'amiga' is not known"):
+        export_fmu(model, tmp_path / "a.fmu", platforms=["host", "amiga"])
+    flexure = COMPONENTS["flexure"]
+    twice = replace(
+        flexure,
+        outputs=(Output("x_f", "m", "position"),),
+        equations=lambda s: replace(flexure.equations(s), out={"x_f": s.x_f}),
+    )
+    with pytest.raises(InputError, match="Two variables of 'psa' are named 'x_f'"):
+        variable_table(compose([twice]))
+    gain = Component("gain", "none", "none", lambda s: Equations())
+    with pytest.raises(InputError, match="has no state"):
+        variable_table(compose([gain]))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For each source, name, platform and version of the compiler, and never half of one."""
+    calls = []
+
+    def compiled(command: list[str], directory: Path) -> None:
+        calls.append(command)
+        (directory / command[-1]).write_bytes(b"binary %d" % len(calls))
+
+    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", compiled)
+    texts, linux = {"model.c": "int a;"}, PLATFORMS["x86_64-linux"]
+    first = compile_library(texts, "psa", linux)
+    assert compile_library(dict(texts), "psa", linux) == first == b"binary 1"
+    others = [
+        compile_library({"model.c": "int b;"}, "psa", linux),
+        compile_library(texts, "other", linux),
+        compile_library(texts, "psa", PLATFORMS["aarch64-linux"]),
+    ]
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.version", lambda _: "99")
+    others.append(compile_library(texts, "psa", linux))
+    assert len({first, *others}) == len(calls) == 5
+    own = replace(linux, target=None)  # a machine's own compiler may change without a new name
+    assert compile_library(texts, "psa", own) != compile_library(texts, "psa", own)
+
+    def fails(command: list[str], directory: Path) -> None:
+        raise PsaError("no compiler")
+
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", fails)
+    for _ in range(2):
+        with pytest.raises(PsaError, match="no compiler"):
+            compile_library({"model.c": "int c;"}, "psa", linux)
+    assert compile_library(texts, "psa", linux) == others[-1]
+
+
+#: Two models in both versions, the others in one of them in turn.
+TWICE = ("P-885.51", "flexure")
+TRIED = [(name, fmi) for name in TWICE for fmi in (2, 3)]
+TRIED += [
+    (name, 2 + k % 2)
+    for k, name in enumerate((*STACKS, "every_effect", "single_mass")) if name not in TWICE
+]  # fmt: skip
+
+
+@pytest.mark.usefixtures("without_binary")
+@pytest.mark.parametrize(("name", "fmi"), slow_but(TRIED[:4], TRIED))
+def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
+    """What is checked are the description and the list of sources."""
+    path = export_fmu(model_named(name), tmp_path / "m.fmu", name="m", fmi=fmi, include_sensor=True)
+    assert validate_fmu(str(path)) == []
+    description = fmpy.read_model_description(str(path))
+    assert description.fmiVersion == f"{fmi}.0"
+    assert len(description.modelVariables) == len(variable_table(model_named(name)))
+
+
+@pytest.mark.usefixtures("without_binary")
+def test_archive_of_fmi_3(tmp_path: Path) -> None:
+    """Folders are named by FMI 3's platform tuples; the same model gives the same bytes."""
+    paths = [tmp_path / "a.fmu", tmp_path / "b.fmu"]
+    for path in paths:
+        export_fmu(model_named("demo"), path, name="demo", platforms=["all"], fmi=3)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    with zipfile.ZipFile(paths[0]) as archive:
+        names = archive.namelist()
+        assert names == sorted(names)
+        assert {i.date_time for i in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+    binaries = {n.removeprefix("binaries/") for n in names if n.startswith("binaries/")}
+    assert binaries == {
+        "x86_64-linux/demo.so",
+        "aarch64-linux/demo.so",
+        "riscv64-linux/demo.so",
+        "aarch32-linux/demo.so",
+        "x86-linux/demo.so",
+        "x86_64-windows/demo.dll",
+        "x86-windows/demo.dll",
+        "x86_64-darwin/demo.dylib",
+        "aarch64-darwin/demo.dylib",
+    }
+    assert {"sources/buildDescription.xml", "sources/README.txt", "resources/model.json"} < {*names}
+    with pytest.raises(InputError, match="FMI 4 is not known"):
+        export_fmu(model_named("demo"), tmp_path / "c.fmu", fmi=4)
+
+
+XML = "modelDescription.xml"
+NOW = ca.CasadiMeta.version()
+
+
+def _as_another_writes(text: str) -> str:
+    """What differs from CasADi 3.8.0 to 3.8.2, and names of variables, which may come to differ."""
+    return text.replace(f"CasADi {NOW}", "CasADi 3.7.9").replace("a0", "b0") + "/* no version */\n"
+
+
+@pytest.fixture(scope="module")
+def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An FMU whose C another CasADi generated; what is tried here needs no binary."""
+    generate, derivatives = generate_c, c_code
+
+    def generated(*args: Any, **options: Any) -> dict[str, str]:
+        return {n: _as_another_writes(t) for n, t in generate(*args, **options).items()}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sources, "generate_c", generated)
+        patch.setattr(sources, "c_code", lambda *args: _as_another_writes(derivatives(*args)))
+        patch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
+        return export_fmu(model_named(STACK), tmp_path_factory.mktemp("fmu") / "older.fmu")
+
+
+def _reproducible(path: Path) -> CheckRow:
+    return next(row for row in check_fmu(path).rows if row.name == "reproducible")
+
+
+@pytest.mark.usefixtures("code_runs_here")
+def test_an_export_of_another_casadi_is_reproducible(older: Path) -> None:
+    row = _reproducible(older)
+    assert row.passed, row.remark
+    assert "CasADi 3.7.9" in row.remark
+    assert f"CasADi {NOW}" in row.remark
+
+
+#: What is changed in it, and what the row says then.
+CHANGES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+    "equation": ("sources/model.c", lambda t: t.replace(b"b0", b"c0", 1), "the token is"),
+    "version": ("sources/model.c", lambda t: t.replace(b"3.7.9", NOW.encode()), "model.c differs"),
+    "start value": ("sources/fmi_data.c", lambda t: t + b"\n", "fmi_data.c differs"),
+    "solver": ("sources/solver.c", lambda t: t + b"\n", "solver.c differs"),
+    "bound": (XML, lambda t: t.replace(b'min="', b'min="-', 1), f"{XML} differs"),
+}
+
+
+@pytest.mark.usefixtures("code_runs_here")
+@pytest.mark.parametrize("change", slow_but(["equation", "start value"], CHANGES))
+def test_a_change_of_it_is_found(change: str, older: Path, tmp_path: Path) -> None:
+    place, edit, said = CHANGES[change]
+    row = _reproducible(rewritten(older, tmp_path / "changed.fmu", {place: edit}))
+    assert not row.passed
+    assert said in row.remark
+
+
+flexure = compose([COMPONENTS["flexure"]], name="flexure")
+every_effect = compose((*BASE, *EFFECTS.values()), name="every_effect")
+
+
+# Terminals
+
+
+@pytest.mark.parametrize("model", [stack_model(STACK), compose(SIMPLIFIED), flexure, every_effect])
+def test_terminals_are_valid_and_their_variables_exist(model: Model) -> None:
+    text = terminals_and_icons(model)
+    assert_valid(text, "schema", "fmi3", "fmi3TerminalsAndIcons.xsd")
+    known = {*model.input_names, *model.output_names}
+    root = ET.fromstring(text)
+    members = [m.attrib["variableName"] for m in root.iter("TerminalMemberVariable")]
+    assert len(members) >= 3
+    assert len(set(members)) == len(members)
+    assert set(members) <= known
+    icons = {g.attrib["iconBaseName"] for g in root.iter("TerminalGraphicalRepresentation")}
+    assert icons <= set(ICONS)
+
+
+def test_a_stack_and_a_flexure_connect() -> None:
+    """Equal names of members, an input on one side for each output on the other; forces opposed."""
+    stack = stack_model(STACK)
+    near = next(t for t in terminals_of(stack) if t.name == "mechanical")
+    (far,) = terminals_of(flexure)
+    ours, theirs = ({m: (v, k) for v, m, k in t.members} for t in (near, far))
+    assert set(ours) == set(theirs)
+    for member, (variable, kind) in ours.items():
+        other, other_kind = theirs[member]
+        assert (variable in stack.output_names) == (other in flexure.input_names)
+        assert {kind, other_kind} in ({"signal"}, {"inflow", "outflow"})
+
+
+# Icons
+
+
+@pytest.mark.parametrize("name", ICONS)
+def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
+    """Every pixel of the PNG has the colour of the last rectangle of the SVG that covers it."""
+    picture = matplotlib.image.imread(io.BytesIO(png(ICONS[name])), format="png")
+    assert picture.shape == (SIDE, SIDE, 4)
+    expected = np.zeros_like(picture)
+    for r in ET.fromstring(svg(ICONS[name])):
+        left, top, width, height = (int(r.attrib[a]) for a in ("x", "y", "width", "height"))
+        assert 0 <= left < left + width <= SIDE
+        assert 0 <= top < top + height <= SIDE
+        colour = [int(r.attrib["fill"][k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
+        expected[top : top + height, left : left + width] = [*colour, 1.0]
+    seen = expected[..., 3] > 0.0
+    assert np.array_equal(picture[..., 3] > 0.0, seen)
+    assert picture[seen] == pytest.approx(expected[seen], abs=1e-6)
+
+
+# Documentation
+
+
+@pytest.mark.parametrize("model", [stack_model(STACK), flexure, every_effect])
+def test_documentation_is_complete(model: Model) -> None:
+    page = documentation(model)
+    said = html.unescape(re.sub(r"<[^>]*>", "\n", page))
+    for component in model.components:
+        for text in (component.name, component.description, component.equation_text):
+            assert text in said, component.name
+        assert component.source in said
+    for declared in variable_table(model):
+        if declared.kind in ("parameter", "input", "output", "state"):
+            assert f"<td>{declared.name}</td>" in page
+            assert declared.description in said
+    for switch in model.structure.switches:
+        assert f"switch.{switch}" in said
+
+
+def test_documentation_stands_alone() -> None:
+    """Well-formed, nothing loaded from elsewhere, every link leads to a file of the archive."""
+    page = entries(STACK, 3)["documentation/index.html"].decode()
+    etree.fromstring(page.partition("\n")[2].replace('<meta charset="utf-8">', ""))
+    assert not re.search(r"<(script|link|img|iframe)|@import|url\(|https?://(?!www\.w3\.org)", page)
+    links = re.findall(r'href="([^"]*)"', page)
+    assert len(links) == 4
+    assert all(link.removeprefix("../") in entries(STACK, 3) for link in links)
+
+
+def test_documentation_escapes_what_users_write() -> None:
+    model = replace(flexure, name="a<b>", description="x < y & <script>alert(1)</script>")
+    page = documentation(model)
+    assert "<script" not in page
+    assert "x &lt; y &amp; &lt;script&gt;" in page
+    assert "<title>a&lt;b&gt;</title>" in page

@@ -1,0 +1,428 @@
+"""FMUs broken in one way each: the check must find every one, and name it."""
+
+import platform
+import shutil
+import time
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from fmpy.validation import _validate_variable_names
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.check import agreement, binaries, check, description
+from psa_casadi.export.check.agreement import expected_outputs
+from psa_casadi.export.check.binaries import FUNCTIONS, read_binary
+from psa_casadi.export.check.check import CheckReport, check_fmu
+from psa_casadi.export.check.rows import OF_BINARIES
+from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu, write_archive
+from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library, host_platform
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.importer.masters import Signals
+from psa_casadi.model.compose import Model
+from psa_casadi.report.words.text import check_sentence
+from psa_casadi.units import FloatArray
+from tests.export.broken_descriptions import DESCRIPTIONS, STACK
+from tests.export.c_host.build import binary
+from tests.export.fmu_models import entries, exported, model_named, rewritten
+from tests.tiers import slow, slow_but
+
+XML = "modelDescription.xml"
+VERSIONS = (2, 3)
+#: Mistakes in the description that the quick tier tries.
+FEW = ("wrong token", "missing dependency", "wrong start value", "wrong unit of a derivative")
+#: Mistakes that each version has in a way of its own; the others come in one version, in turn.
+TWICE = ("wrong token", "missing dependency", "wrong unit of a derivative",
+         "wrong number of event indicators")  # fmt: skip
+WRONG = [(fault, fmi) for k, fault in enumerate(DESCRIPTIONS) for fmi in VERSIONS
+         if fault in (*TWICE, *FEW) or fmi == VERSIONS[k % 2]]  # fmt: skip
+harmless = pytest.mark.usefixtures("code_runs_here")
+#: Any change of description or sources is found by this row too.
+ALWAYS = "reproducible"
+
+
+def _failures(report: CheckReport) -> dict[str, str]:
+    return {row.name: row.remark for row in report.failures}
+
+
+def _edit(old: str, new: str) -> Callable[[bytes], bytes]:
+    return lambda content: content.replace(old.encode(), new.encode(), 1)
+
+
+def _binary(fmi: int) -> str:
+    return next(n for n in entries(STACK, fmi) if n.startswith("binaries/"))
+
+
+def _recompiled(target: Path, fmi: int, edits: Mapping[str, tuple[tuple[str, str], ...]]) -> Path:
+    """Change source files, compile all, and put the binary in place."""
+    texts = {
+        n.removeprefix("sources/"): content.decode()
+        for n, content in entries(STACK, fmi).items()
+        if n.startswith("sources/")
+    }
+    for file, changes in edits.items():
+        for old, new in changes:
+            if old not in texts[file]:
+                raise ValueError(f"{file} has no '{old}'")
+            texts[file] = texts[file].replace(old, new, 1)
+    library = compile_library(texts, "psa", host_platform())
+    return rewritten(exported(STACK, fmi), target, {_binary(fmi): lambda _: library})
+
+
+@pytest.fixture(autouse=True)
+def _reference_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a sound FMU would give is the same for every fault: it is computed once."""
+    monkeypatch.setattr(agreement, "expected_outputs", _remembered_outputs)
+
+
+_OUTPUTS: dict[tuple[object, ...], FloatArray] = {}
+
+
+def _remembered_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
+    arrays = (times, inputs.times, inputs.values)
+    key = (
+        tuple(c.name for c in model.components), tuple(sorted(model.values.items())),
+        inputs.names, inputs.held, *(a.tobytes() for a in arrays),
+    )  # fmt: skip
+    if key not in _OUTPUTS:
+        _OUTPUTS[key] = expected_outputs(model, times, inputs)
+    return _OUTPUTS[key]
+
+
+@harmless
+@pytest.mark.parametrize(("fault", "fmi"), slow_but([(fault, 2) for fault in FEW], WRONG))
+def test_wrong_description(fault: str, fmi: int, tmp_path: Path) -> None:
+    edit, rows, remark = DESCRIPTIONS[fault]
+    changes = {XML: _edit(*edit(fmi))}
+    found = _failures(check_fmu(rewritten(exported(STACK, fmi), tmp_path / "b.fmu", changes)))
+    assert set(found) == rows | {ALWAYS}, found
+    assert any(remark in found[row] for row in rows), found
+
+
+CORE = {
+    "wrong sign of a derivative": (
+        "model_casadi.c",
+        "return call(psa_ode, t, x, u, p, xdot, NULL, w);",
+        "const int r = call(psa_ode, t, x, u, p, xdot, NULL, w); xdot[0] = -xdot[0]; return r;",
+        {"equations", "directional derivatives"},
+    ),
+    "wrong directional derivative": (
+        "model_directional.c",
+        "arg[5] = dx;",
+        "arg[5] = NULL; (void)dx;",
+        {"directional derivatives"},
+    ),
+    "state shared by instances": (
+        "instance.c",
+        "const psa_status status =\n            psa_solver_advance(",
+        "static double shared; shared += 1.0; solver->x[0] += 1e-6 * shared;"
+        " const psa_status status = psa_solver_advance(",
+        {"life cycle", "independent instances", "snapshots"},
+    ),
+    "input held where a rate is given": (
+        "values.c",
+        "state->input.rate[index] = rate[i];",
+        "state->input.rate[index] = 0.0 * rate[i];",
+        {"co-simulation, step 0.001 s"},
+    ),
+    "a start without the rise": (
+        "start.c",
+        "input.rate[PSA_VOLTAGE] = state->start_voltage / RISE;",
+        "input.rate[PSA_VOLTAGE] = 0.0;",
+        {"settled start"},
+    ),
+    "no line of the input": (
+        "instance.c",
+        "if (state->stride > 0.0)",
+        "if (state->stride < 0.0)",
+        {"line of the input"},
+    ),
+    "parameters without effect during a run": (
+        "values.c",
+        "else state->p[v->index] = value;",
+        "else if (state->phase == PSA_INSTANTIATED) state->p[v->index] = value;",
+        {"parameter changes"},
+    ),
+    "indicators that stand still": (
+        "values.c",
+        "state->facing[i] * instance->z[i] +",
+        "0.0 * instance->z[i] +",
+        {"event indicators", "event indicators of the model"},
+    ),
+    "checksum not looked at": (
+        "snapshot.c",
+        "if (found.checksum != expected.checksum)",
+        "if (found.checksum != expected.checksum && size == 0)",
+        {"snapshots"},
+    ),
+    "a step beside the communication point": (
+        "instance.c",
+        "{size + (point - now), point + size};",
+        "{0.999 * size + (point - now), point + size};",
+        {"co-simulation, step 0.01 s"},
+    ),
+}
+
+
+#: Faults that share a binary, as each has a row that none of the others in it fails.
+TOGETHER = (
+    ("wrong sign of a derivative",),
+    ("state shared by instances",),
+    ("input held where a rate is given", "parameters without effect during a run",
+     "indicators that stand still"),
+    ("wrong directional derivative", "a start without the rise", "no line of the input",
+     "checksum not looked at", "a step beside the communication point"),
+)  # fmt: skip
+
+
+@slow
+@harmless
+@pytest.mark.parametrize(
+    "faults", [TOGETHER[0], *(pytest.param(t, marks=slow) for t in TOGETHER[1:])]
+)
+def test_wrong_sources(faults: tuple[str, ...], tmp_path: Path) -> None:
+    edits: dict[str, tuple[tuple[str, str], ...]] = {}
+    for file, old, new, _ in (CORE[fault] for fault in faults):
+        edits[file] = (*edits.get(file, ()), (old, new))
+    report = check_fmu(_recompiled(tmp_path / "b.fmu", 2, edits))
+    assert report.compared
+    found = set(_failures(report))
+    assert all(CORE[fault][3] <= found for fault in faults), found
+
+
+def test_every_fault_is_tried_once() -> None:
+    assert sorted(fault for faults in TOGETHER for fault in faults) == sorted(CORE)
+
+
+#: Faults of the FMI 3.0 face that share a binary, as each has a row of its own.
+FACE = {
+    "fmi3_values.c": (
+        (
+            "    return psa_fmi3_status(psa_adjoint_derivative(core, unknowns, nunknowns, knowns,"
+            " nknowns, seed,\n                                                  sensitivity));",
+            "    const psa_result r = psa_adjoint_derivative(core, unknowns, nunknowns, knowns,"
+            " nknowns, seed, sensitivity);\n    if (nknowns) sensitivity[0] *= 1.0 + 1e-6;\n"
+            "    return psa_fmi3_status(r);",
+        ),
+    ),
+    "fmi3_interfaces.c": (("*terminate = fmi3False;", "*terminate = fmi3True;"),),
+    "values.c": (("state->facing[i] = -state->facing[i];", "instance->fresh = 0;"),),
+}
+MISSING = {
+    "fmi3_clocks.c": (
+        (
+            "fmi3Status fmi3ActivateModelPartition(",
+            "FMI3_Export fmi3Status fmi3ActivateModelPartitions(fmi3Instance, fmi3ValueReference,"
+            " fmi3Float64);\nfmi3Status fmi3ActivateModelPartitions(",
+        ),
+    ),
+}
+
+
+@slow
+@harmless
+def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
+    found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, FACE)))
+    assert {"adjoint derivatives", "life cycle", "event indicators"} == set(found), found
+    assert "stays negative after an event" in found["event indicators"]
+
+
+@slow
+@harmless
+def test_a_function_under_another_name(tmp_path: Path) -> None:
+    found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, MISSING)))
+    assert {"functions present", "no other symbols", "binary loads"} == set(found), found
+    assert "fmi3ActivateModelPartition is missing" in found["functions present"]
+    assert "fmi3ActivateModelPartitions is exported" in found["no other symbols"]
+    assert "fmi3ActivateModelPartition" in found["binary loads"]
+
+
+@slow
+@pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
+def test_binaries_that_cannot_be_used(fmi: int, tmp_path: Path) -> None:
+    """Missing, cut off, or of something else: found, whatever loading them does."""
+    name, content = _binary(fmi), entries(STACK, fmi)[_binary(fmi)]
+    left = {n: c for n, c in entries(STACK, fmi).items() if n != name}
+    for wrong in (None, content[: len(content) // 2], b"no library at all"):
+        path = tmp_path / "b.fmu"
+        write_archive(path, left if wrong is None else {**left, name: wrong})
+        report = check_fmu(path)
+        assert not report.compared
+        assert "binary loads" in _failures(report)
+        assert {row.name for row in report.rows if row.passed} >= {"units defined", ALWAYS}
+
+
+@slow
+@pytest.mark.xdist_group("platforms")
+@pytest.mark.parametrize("name", PLATFORMS)
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_binaries_of_all_platforms_are_inspected(name: str, fmi: int) -> None:
+    found = read_binary(binary(fmi, PLATFORMS[name]))
+    assert (found.platform, found.exports) == (name, FUNCTIONS[fmi])
+    assert any(n.startswith("GLIBC_2.") for n in found.needs) == name.endswith("linux")
+
+
+def test_without_lief_the_binaries_are_not_inspected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(binaries, "has_lief", lambda: False)
+    with pytest.raises(InputError, match="run `pip install lief`"):
+        check_fmu(exported(STACK, 2), portable=True)
+    monkeypatch.setattr(check, "rows_apart", lambda *_: [])
+    report = check_fmu(exported(STACK, 2))
+    assert report.left_out == OF_BINARIES
+    said = check_sentence(report)
+    assert "Left out, as lief is not installed (`pip install lief`): functions present" in said
+
+
+@slow
+@harmless
+@pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
+def test_a_need_of_a_newer_library(tmp_path: Path) -> None:
+    change = {_binary(2): _edit("GLIBC_2.2.5\0", "GLIBC_2.99\0\0")}
+    found = _failures(check_fmu(rewritten(exported(STACK, 2), tmp_path / "b.fmu", change)))
+    assert "needs GLIBC_2.99" in found["GNU libc"]
+
+
+@pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
+def test_the_oldest_system_that_a_binary_loads_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that loads here passes, with a note; `portable` and other platforms ask for more."""
+    path, change = tmp_path / "b.fmu", _edit("GLIBC_2.2.5\0", "GLIBC_2.29\0\0")
+    with Archive(rewritten(exported(STACK, 2), path, {_binary(2): change})) as newer:
+        for libc, portable, problem in (
+            ("2.36", False, None), ("2.29", False, None),
+            ("2.28", False, "systems with GNU libc 2.28"), ("", False, "with GNU libc 2.17 "),
+            ("2.36", True, "with GNU libc 2.17 "),
+        ):  # fmt: skip
+            monkeypatch.setattr(platform, "libc_ver", lambda v=libc: ("glibc", v))
+            row = binaries.libc_row(newer, portable=portable)
+            assert row.passed == (problem is None)
+            assert (problem or "loads on GNU libc 2.29 and later") in row.remark
+        monkeypatch.setattr(platform, "libc_ver", lambda: ("glibc", "2.36"))
+        other = "riscv64-linux" if host_platform().name != "riscv64-linux" else "x86_64-linux"
+        monkeypatch.setattr(binaries, "host_platform", lambda: PLATFORMS[other])
+        foreign = binaries.libc_row(newer)
+    assert "needs GLIBC_2.29, which systems with GNU libc 2.17 lack" in foreign.remark
+
+
+@slow
+@harmless
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a compiler of the system")
+def test_what_the_compiler_of_the_system_makes_passes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No wheel of a compiler: the FMU is for systems like this one, and sound."""
+    monkeypatch.setattr("psa_casadi.export.fmu.platforms.has_zig", lambda: False)
+    monkeypatch.setenv("CC", "gcc")
+    report = check_fmu(export_fmu(model_named(STACK), tmp_path / "own.fmu"))
+    assert report.passed, _failures(report)
+    assert "loads on GNU libc 2." in next(r.remark for r in report.rows if r.name == "GNU libc")
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) -> None:
+    """Importers go by the folder alone, and would fail to load it."""
+    path, found = tmp_path / "b.fmu", entries(STACK, fmi)
+    write_archive(path, {**found, "binaries/riscv64-linux/psa.so": found[_binary(fmi)]})
+    with Archive(path) as moved:
+        (said,) = binaries.misplaced_binaries(moved)
+    assert said.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
+    with Archive(exported(STACK, fmi)) as whole:
+        assert not list(binaries.misplaced_binaries(whole))
+
+
+@slow
+@harmless
+@pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
+def test_sources_and_model_that_are_not_those_of_the_binary(fmi: int, tmp_path: Path) -> None:
+    path = tmp_path / "b.fmu"
+    change = _edit("\n", "\n\n")
+    found = _failures(
+        check_fmu(rewritten(exported(STACK, fmi), path, {"sources/solver.c": change}))
+    )
+    assert found == {ALWAYS: "sources/solver.c differs"}
+    lost = {n: c for n, c in entries(STACK, fmi).items() if n != "sources/linear.c"}
+    write_archive(path, lost)
+    assert "sources/linear.c is missing" in _failures(check_fmu(path))[ALWAYS]
+    changed = {MODEL_ENTRY: lambda _: b"{"}
+    report = check_fmu(rewritten(exported(STACK, fmi), path, changed))
+    assert set(_failures(report)) == {"model inside"}
+    assert not report.compared
+
+
+@slow
+@harmless
+def test_a_folder_in_place_of_a_source(tmp_path: Path) -> None:
+    path, name = tmp_path / "b.fmu", "sources/solver.c"
+    files = {f"{n}/x" if n == name else n: c for n, c in entries(STACK, 2).items()}
+    write_archive(path, files)
+    assert set(_failures(check_fmu(path))) == {ALWAYS}
+
+
+@harmless
+@pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
+def test_another_model(fmi: int) -> None:
+    report = check_fmu(exported(STACK, fmi), model_named("manipulator"))
+    assert {"start values", ALWAYS, "co-simulation, step 0.01 s", "model exchange"} <= set(
+        _failures(report)
+    )
+
+
+def test_no_fmu(tmp_path: Path) -> None:
+    path = tmp_path / "text.fmu"
+    path.write_text("no archive")
+    with pytest.raises(InputError, match="cannot be read as an FMU"):
+        check_fmu(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(
+            XML, entries(STACK, 2)[XML].replace(b'fmiVersion="2.0"', b'fmiVersion="1.0"')
+        )
+    with pytest.raises(InputError, match="export it again"):
+        check_fmu(path)
+
+
+NAMES = [
+    "a", "_b1", "a.b[3].c", "a[1,2]", "der(a.b)", "der(a,2)", "'x y'.z", "'a b'[1]", "'?-~'", "",
+    "1a", "a b", "a.", "a[]", "a[1", "der(a", "der()", "ä", "a\n", "'", "''", "a..b", "a[b]", "'ä'",
+]  # fmt: skip
+
+
+def test_names_are_judged_as_by_the_grammar_of_fmpy() -> None:
+    made = SimpleNamespace(
+        variableNamingConvention="structured",
+        modelVariables=[SimpleNamespace(name=n, sourceline=1) for n in NAMES],
+    )
+    found = " ".join(_validate_variable_names(made))
+    assert [n for n in NAMES if not description._NAMES["structured"].fullmatch(n)] == [
+        n for n in NAMES if f'"{n}" (line 1) is not a legal' in found
+    ]
+
+
+def test_many_variables_take_little_time_each(tmp_path: Path) -> None:
+    """The grammar of fmpy took half a minute for them."""
+    kind = '" valueReference="9" variability="tunable" causality="parameter"><Real start="1"/>'
+    more = "".join(f'<ScalarVariable name="e_{k}{kind}</ScalarVariable>' for k in range(20_000))
+    more += f'<ScalarVariable name="no name{kind}</ScalarVariable>'
+    end = "</ModelVariables>"
+    path = rewritten(exported(STACK, 2), tmp_path / "m.fmu", {XML: _edit(end, more + end)})
+    with Archive(path) as archive:
+        begun = time.process_time()
+        found = list(description.invalid(archive))
+        assert time.process_time() - begun < 10.0
+    assert len(found) == 1
+    assert found[0].startswith("'no name' (line ")
+
+
+def test_the_time_of_a_check_is_that_of_all_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slowly(archive: Archive) -> tuple[str, ...]:
+        time.sleep(0.2)
+        return ()
+
+    monkeypatch.setitem(description.DESCRIBED, "units defined", slowly)
+    monkeypatch.setitem(description.DESCRIBED, "units consistent", slowly)
+    report = check_fmu(exported(STACK, 2), timeout=0.3)
+    assert not report.passed
+    assert report.rows[-1].name == "time"
+    assert "time limit of 0.3 s of the whole check (--timeout sets it)" in report.rows[-1].remark

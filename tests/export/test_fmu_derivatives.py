@@ -1,0 +1,230 @@
+"""Directional and adjoint derivatives, at a point and through a co-simulation step."""
+
+import math
+from collections.abc import Mapping, Sequence
+from ctypes import c_double, c_size_t
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.importer.fmu import (
+    CO_SIMULATION,
+    DISCARD,
+    ERROR,
+    MODEL_EXCHANGE,
+    OK,
+    Fmu,
+)
+from tests.export.fmi3_instances import Instance3, Update, loaded
+from tests.export.fmu_models import exported, model_named
+from tests.tiers import slow_but
+
+FloatArray = npt.NDArray[np.float64]
+
+MODELS = ["P-885.51", "PTBS200", "manipulator", "slow_creep"]
+#: Central differences of eighth order: f'(x) h is the sum of c_k (f(x + k h) - f(x - k h))
+EIGHTH = {1: 4.0 / 5.0, 2: -1.0 / 5.0, 3: 4.0 / 105.0, 4: -1.0 / 280.0}
+
+
+@cache
+def _names(name: str) -> dict[str, list[str]]:
+    """Return the variables of a model by kind."""
+    kinds: dict[str, list[str]] = {}
+    for variable in variable_table(model_named(name).plant()):
+        kinds.setdefault(variable.kind, []).append(variable.name)
+    return kinds
+
+
+@cache
+def _point(name: str) -> dict[str, float]:
+    """Return values of states, inputs and parameters in full motion, away from every kink."""
+    random = np.random.default_rng(20)
+    point, model = {}, model_named(name).plant()
+    sizes = dict(zip(model.state_names, model.state_nominals(), strict=True))
+    for v in variable_table(model):
+        if v.kind == "parameter":
+            point[v.name] = _inside(float(v.start or 0.0), *(v.bounds or (-math.inf, math.inf)))
+        elif v.kind in ("state", "input"):
+            point[v.name] = float(sizes.get(v.name, v.nominal) or 1.0) * random.uniform(0.3, 0.6)
+    # the voltage rises; the hysteresis force grows from where it is, without passing zero
+    point["u"] = 0.5 * point["voltage"]
+    point["f_H"] = math.copysign(point["f_H"], point["A"])
+    return point
+
+
+def _inside(value: float, low: float, high: float) -> float:
+    """Return a value that differences, of up to 2 %, do not take out of its bounds."""
+    room = 0.02 * abs(value)
+    return min(max(value, low + room), high - room)
+
+
+def _scales(names: Sequence[str], name: str) -> FloatArray:
+    point = _point(name)
+    return np.array([abs(point.get(n, 1.0)) or 1.0 for n in names])
+
+
+def _jacobian(
+    instance: Instance3, unknowns: Sequence[str], knowns: Sequence[str], *, backwards: bool = False
+) -> FloatArray:
+    """Return d unknowns / d knowns, one product for each column or each row."""
+    if backwards:
+        rows = np.eye(len(unknowns))
+        return np.array([instance.adjoint(unknowns, knowns, list(row)) for row in rows])
+    columns = np.eye(len(knowns))
+    return np.array([instance.directional(unknowns, knowns, list(c)) for c in columns]).T
+
+
+def _worst(found: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
+    """Return the largest difference, each row relative to its largest effect."""
+    effects = np.abs(truth * scales)
+    rows = np.maximum(effects.max(axis=1), 1e-300)
+    return float((np.abs((found - truth) * scales) / rows[:, None]).max())
+
+
+@pytest.mark.parametrize("name", slow_but(MODELS[:1], MODELS))
+def test_point_derivatives_in_model_exchange_are_exact(name: str) -> None:
+    kinds, point = _names(name), _point(name)
+    unknowns = [*kinds["derivative"], *kinds["output"], *kinds["indicator"]]
+    knowns = [*kinds["state"], *kinds["input"], *kinds["parameter"]]
+    columns = []
+    with Instance3(loaded(name), MODEL_EXCHANGE) as instance:
+        instance.start(point)
+        for known in knowns:
+            step, slope = 4e-3 * (abs(point[known]) or 1.0), np.zeros(len(unknowns))
+            for k, weight in EIGHTH.items():
+                values = []
+                for sign in (1.0, -1.0):
+                    instance.set({known: point[known] + sign * k * step})
+                    values.append(instance.get(unknowns))
+                slope += weight * (values[0] - values[1]) / step
+            instance.set({known: point[known]})
+            columns.append(slope)
+        exact = _jacobian(instance, unknowns, knowns)
+        back = _jacobian(instance, unknowns, knowns, backwards=True)
+    scales = _scales(knowns, name)
+    assert _worst(exact, np.array(columns).T, scales) < 1e-10
+    assert _worst(back, exact, scales) < 1e-13
+
+
+def test_both_versions_and_interfaces_agree_at_a_point() -> None:
+    name = MODELS[0]
+    kinds, point = _names(name), _point(name)
+    unknowns = [*kinds["derivative"], *kinds["output"], *kinds["indicator"]]
+    with (
+        Instance3(loaded(name), MODEL_EXCHANGE) as exchange,
+        Instance3(loaded(name), CO_SIMULATION) as stepping,
+        Fmu(exported(name)) as fmu,
+        fmu.start(CO_SIMULATION, values=point) as older,
+    ):
+        for instance in (exchange, stepping):
+            instance.start(point)
+        for known in ("u", "voltage", "C_p"):
+            found = [i.directional(unknowns, [known], [1.0]) for i in (exchange, stepping)]
+            result = (len(unknowns) * c_double)()
+            older.require(
+                "GetDirectionalDerivative", older.references(unknowns), c_size_t(len(unknowns)),
+                older.references([known]), c_size_t(1), (1 * c_double)(1.0), result,
+            )  # fmt: skip
+            assert found[0].tobytes() == found[1].tobytes() == bytes(result)
+
+
+def test_what_cannot_be_differentiated_is_refused() -> None:
+    name, one, value = MODELS[0], c_size_t(1), (c_double * 2)()
+    with Instance3(loaded(name), MODEL_EXCHANGE) as instance:
+        instance.start()
+        for kind in ("Directional", "Adjoint"):
+            for unknown, known, said in (
+                ("u", "voltage", "'u' is not calculated"),
+                ("voltage", "u", "'voltage' is not calculated"),
+                ("current", "charge", "'charge' is calculated and cannot be varied"),
+            ):
+                vectors = (instance.references([unknown]), one, instance.references([known]), one)
+                status = instance.call(f"Get{kind}Derivative", *vectors, value, one, value, one)
+                assert status == ERROR
+                assert said in instance.messages[-1]
+            status = instance.call(f"Get{kind}Derivative", *vectors, value, c_size_t(2), value, one)
+            assert status == ERROR
+            assert "scalars" in instance.messages[-1]
+
+
+def _stepped(
+    name: str, values: Mapping[str, float], sizes: Sequence[float], tolerance: float
+) -> Instance3:
+    """Return an instance that has done steps of these sizes with inputs held; free it."""
+    instance = Instance3(loaded(name)).start(values, tolerance=tolerance)
+    time = 0.0
+    for size in sizes:
+        assert instance.try_step(time, size).status == OK
+        time += size
+    return instance
+
+
+@pytest.mark.parametrize("name", slow_but(MODELS[:1], MODELS))
+def test_step_sensitivity_is_that_of_the_numbers_returned(name: str) -> None:
+    """Against differences of eighth order of whole steps from changed starts."""
+    kinds, point = _names(name), _point(name)
+    states, outputs = kinds["state"], kinds["output"]
+    knowns = [*states, *kinds["input"], *kinds["parameter"]]
+    size, columns, output_columns = [1e-5], [], []
+    for known in knowns:
+        step = 2e-3 * (abs(point[known]) or 1.0)
+        slope, output_slope = np.zeros(len(states)), np.zeros(len(outputs))
+        for k, weight in EIGHTH.items():
+            for sign in (1.0, -1.0):
+                changed = {**point, known: point[known] + sign * k * step}
+                with _stepped(name, changed, size, 1e-10) as instance:
+                    slope += sign * weight * instance.get(states) / step
+                    output_slope += sign * weight * instance.get(outputs) / step
+        columns.append(slope)
+        output_columns.append(output_slope)
+    scales = _scales(knowns, name)
+    with _stepped(name, point, size, 1e-10) as instance:
+        exact = _jacobian(instance, states, knowns)
+        back = _jacobian(instance, states, knowns, backwards=True)
+        # chained: outputs through the step
+        at_end = _jacobian(instance, outputs, knowns)
+        at_end[:, : len(states)] = 0.0
+        whole = at_end + _jacobian(instance, outputs, states) @ exact
+    assert _worst(exact, np.array(columns).T, scales) < 1e-9
+    assert _worst(whole, np.array(output_columns).T, scales) < 1e-9
+    assert _worst(back, exact, scales) < 1e-13
+
+
+def test_sensitivities_of_steps_multiply() -> None:
+    """d x2/d x0 = d x2/d x1 d x1/d x0, where the second step starts with the first one's slope."""
+    name, point = MODELS[0], _point(MODELS[0])
+    states = _names(name)["state"]
+    with _stepped(name, point, [2e-5], 1e-8) as instance:
+        first = _jacobian(instance, states, states)
+        assert instance.try_step(2e-5, 3e-5).status == OK
+        second = _jacobian(instance, states, states)
+    with _stepped(name, point, [5e-5], 1e-8) as instance:
+        both = _jacobian(instance, states, states)
+    assert _worst(second @ first, both, _scales(states, name)) < 1e-6
+    assert _worst(second, both, _scales(states, name)) > 1e-3
+
+
+def test_unknown_step_sensitivity_is_refused_with_the_reason() -> None:
+    name, one = MODELS[0], c_size_t(1)
+    value = (2 * c_double)()
+
+    def watcher(instance: Instance3, update: Update) -> None:
+        if update.set_requested:
+            instance.set({"voltage": 10.0})
+
+    with Instance3(loaded(name), watcher=watcher) as instance:
+        instance.start({"voltage": 50.0})
+        assert instance.try_step(0.0, 1e-3).status == OK
+        vectors = (instance.references(["u"]), one, instance.references(["C_p"]), one)
+        rest = (value, one, value, one)
+        assert instance.call("GetDirectionalDerivative", *vectors, *rest) == DISCARD
+        assert "changed within it" in instance.messages[-1]
+        instance.directional(["current"], ["u"], [1.0])
+    with Instance3(loaded(name)) as instance:
+        instance.start({"voltage": 1e300})
+        assert instance.try_step(0.0, 1e-3).status == DISCARD
+        assert instance.call("GetAdjointDerivative", *vectors, *rest) == DISCARD
+        assert "that step failed" in instance.messages[-1]

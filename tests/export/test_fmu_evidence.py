@@ -1,0 +1,192 @@
+"""The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them.
+
+And what an FMU says outside of what the records behind its model have shown.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.components.outputs import OUTPUT
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.check.evidence import repeated
+from psa_casadi.export.check.measured import Playback, played_again
+from psa_casadi.export.fmu import evidence
+from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
+from psa_casadi.export.fmu.reference_run import FOLDER
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
+from psa_casadi.export.importer.masters import Signals, communicate
+from psa_casadi.variables import Interval
+from tests.export.fmu_models import assert_valid
+from tests.model.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
+from tests.tiers import slow, slow_but
+
+
+def test_experiments_name_files_that_are_there() -> None:
+    found = files_inside(evident_fmu())
+    (whole,) = ET.fromstring(found[evidence.VALIDATION])
+    spread = ET.fromstring(found[evidence.UNCERTAINTY])
+    assert [e.tag for e in whole] == ["Parameters", "Stimuli", "References"]
+    assert len(spread) == 1 + 2 * 3 + 2  # the mean, pairs of three parameters, two samples
+    for experiment in (whole, *spread):
+        assert all(f"{FOLDER}/{e.attrib['source']}" in found for e in experiment)
+
+
+def test_meta_data_and_page_say_the_same() -> None:
+    """Names and order as the schema of SSP Traceability 1.0 has them (SRMD.xsd, STC.xsd)."""
+    found, model = files_inside(evident_fmu()), evident_model()
+    root = ET.fromstring(found[evidence.META_DATA])
+    space = "{http://ssp-standard.org/SSPTraceability1/%s}"
+    assert root.tag == space % "SimulationResourceMetaData" + "SimulationResourceMetaData"
+    assert set(root.attrib) == {"version", "name", "generationTool"}
+    entries: dict[str, list[str]] = {}
+    for part in root:
+        assert part.tag == space % "SSPTraceabilityCommon" + "Classification"
+        assert set(part.attrib) == {"type"}
+        for entry in part:
+            assert entry.tag == space % "SSPTraceabilityCommon" + "ClassificationEntry"
+            entries.setdefault(entry.attrib["keyword"], []).append(entry.text or "")
+    page = found[evidence.PAGE].decode()
+    assert model.evidence is not None
+    assert model.evidence.held_out is not None
+    (record,) = entries["record"]
+    assert noisy_record().sha256 in record
+    assert f"{1e6 * model.evidence.held_out.rms_m:.4g} um rms" in entries["held-out error"][0]
+    assert entries["temperature"] == ["not recorded"]
+    row = [float(v) for v in entries["covariance.A"][0].split()]
+    assert row == list(model.evidence.covariance.matrix[1])
+    assert re.fullmatch(r"[\d.]+ N/V, standard error [\d.e-]+", entries["k_L"][0])
+    for keyword in ("record", "held-out error", "voltage", "duration", "k_L"):
+        assert entries[keyword][0] in page
+    assert all(link in ("index.html",) for link in re.findall(r'href="([^"]*)"', page))
+    assert "../documentation/evidence.html" in found["documentation/index.html"].decode()
+
+
+def test_parameter_sets_are_as_their_schema_has_them() -> None:
+    found = files_inside(evident_fmu())
+    sets = [n for n in found if n.endswith(".ssv")]
+    assert len(sets) == 9 + 2
+    for name in sets:
+        assert_valid(found[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
+    names = re.findall(
+        r'Parameter name="(\w+)"', found[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
+    )
+    assert names == ["k_L", "A", "tau"]
+
+
+def test_a_model_without_evidence_has_no_such_files() -> None:
+    assert evidence.evidence_files(psa.stack_model("demo"), 20).entries == {}
+    none = evidence.evidence_files(evident_model().plant(), 0)
+    assert not [n for n in none.entries if n.startswith(evidence.SETS)]
+    assert evidence.UNCERTAINTY not in none.related
+
+
+def test_what_a_person_says_of_a_record_stays_text() -> None:
+    """A record's name may hold what means something in HTML and XML."""
+    model = evident_model().plant()
+    told = model.evidence
+    assert told is not None
+    assert told.reference is not None
+    name = "<b>&\"'"
+    odd = replace(
+        told,
+        runs=(replace(told.runs[0], record=name),),
+        reference=replace(told.reference, record=name),
+    )
+    texts = evidence.evidence_texts(replace(model, evidence=odd), 0)
+    assert "&lt;b&gt;&amp;" in texts[evidence.PAGE]
+    assert "<b>" not in texts[evidence.PAGE]
+    read = "".join(ET.fromstring(texts[evidence.META_DATA]).itertext())
+    assert f"{name}, sha256" in read
+
+
+@pytest.mark.slow
+def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) -> None:
+    psa.save_model(evident_model(), tmp_path / "m.json")
+    path, sets = tmp_path / "m.fmu", tmp_path / "sets"
+    line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
+    said = CliRunner().invoke(app, f"{line} --parameter-sets 1 --sets-to {sets}".split())
+    assert said.exit_code == 0, said.output
+    assert "documentation/evidence.html (records: short), 8 parameter sets" in said.output
+    found = files_inside(path)
+    assert len(list(sets.iterdir())) == 8
+    for file in sets.iterdir():
+        assert found[f"{evidence.SETS}/{file.name}"] == file.read_bytes()
+    with Fmu(path) as fmu:  # with the sensor, whose reading is compared then
+        playback = repeated(fmu, evident_model(), [noisy_record()])[-1]
+        assert isinstance(playback, Playback)
+        assert playback.output == "measured_displacement"
+        assert played_again(fmu, playback).figure < 1e-4
+
+
+_SAID = "From here on the results are extrapolated."
+
+
+def messages(
+    fmi: int, peak: float, duration: float, *, start: float = 0.0, steps: int = 100
+) -> tuple[list[str], np.ndarray]:
+    """Return what an FMU says of a triangle, and the output, in co-simulation."""
+    times = start + np.linspace(0.0, duration, steps + 1)
+    volts = peak * (1.0 - np.abs(np.linspace(-1.0, 1.0, steps + 1)))
+    inputs = Signals(("voltage",), times, volts[:, None])
+    with Fmu(evident_fmu(fmi)) as fmu, fmu.start(CO_SIMULATION, start_time=start) as instance:
+        found = communicate(instance, times, inputs, [OUTPUT])
+        return [m for m in instance.messages if _SAID in m], found[:, 0]
+
+
+@pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
+def test_inside_nothing_is_said(fmi: int) -> None:
+    said, outside = messages(fmi, 75.0, 0.5, start=1e3)
+    assert said == []
+    assert np.all(outside == 0.0)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
+    said, outside = messages(fmi, 120.0, 0.6)
+    (line,) = said
+    assert line.startswith("voltage is 7")
+    seen = evident_model().evidence
+    assert seen is not None
+    high = seen.seen.voltage.high
+    assert f"from {seen.seen.voltage.low:.6g} to {high:.6g}." in line
+    beyond = (120.0 - high) / (high - seen.seen.voltage.low) - 0.01
+    assert np.max(outside) == pytest.approx(beyond, abs=2e-3)
+    assert outside[0] == outside[-1] == 0.0
+
+
+@slow
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
+    said, outside = messages(fmi, 75.0, 0.01)
+    assert len(said) == 1
+    assert said[0].startswith("The rate per second of voltage is 1")
+    assert np.max(outside) > 1.0
+    said, outside = messages(fmi, 75.0, 0.8)
+    assert len(said) == 1
+    assert said[0].startswith("The time since the start is 0.64")
+    assert np.all(outside == 0.0)
+
+
+def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
+    model = evident_model()
+    assert model.evidence is not None
+    seen = replace(model.evidence.seen, temperature=Interval(290.0, 300.0))
+    told = replace(model.evidence, seen=seen)
+    assert "seen_temperature_low" not in with_validity(replace(model, evidence=told)).values
+    warm = replace(model.with_effect(EFFECTS["temperature"]), evidence=told)
+    watched = with_validity(warm)
+    column = watched.output_names.index(OUTPUT)
+    x = [q.start for q in watched.structure.states]
+    for kelvins, outside in ((295.0, 0.0), (300.05, 0.0), (310.0, 0.99), (285.0, 0.49)):
+        u = [kelvins if n == "temperature" else 0.0 for n in watched.input_names]
+        y = watched.structure.f(0.0, x, u, watched.parameter_vector())[1]
+        assert float(y[column]) == pytest.approx(outside, abs=1e-12)
+    assert seen_inputs(watched)[watched.input_names.index("temperature")] == (290.0, 300.0, np.inf)

@@ -1,0 +1,266 @@
+"""The Modelica package: its text, its refusals, the acausal stack in a circuit."""
+
+import difflib
+import re
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.component import Component, Equations
+from psa_casadi.components import BASE, COMPONENTS
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.modelica.package import export_modelica, modelica_text, reciprocal
+from psa_casadi.model.compose import compose
+from psa_casadi.model.ode_model import ode_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import Input, Output, Parameter, State
+from tests.export.modelica_runs import load, model_named, simulated, text_of
+from tests.export.modelica_stub import STUB
+from tests.tiers import slow_but
+
+_GOLDEN = Path(__file__).parent / "golden" / "P-885.51.mo"
+_ACCEPT = "psa export modelica --stack P-885.51 -o tests/export/golden/P-885.51.mo"
+
+
+def _without_version(text: str) -> list[str]:
+    return re.sub(r"psa_casadi \d[\w.+]*", "psa_casadi", text).splitlines(keepends=True)
+
+
+def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
+    path = export_modelica(stack_model("P-885.51"), tmp_path / "stack.mo")
+    expected = _without_version(_GOLDEN.read_text(encoding="utf-8"))
+    found = _without_version(path.read_text(encoding="utf-8"))
+    diff = "".join(difflib.unified_diff(expected, found, "accepted", "found", n=1))
+    assert not diff, f"{diff}\nIf this is meant: {_ACCEPT}"
+
+
+def test_every_balance_and_state_has_one_equation_and_is_declared_once() -> None:
+    model = compose((*BASE, *EFFECTS.values()))
+    text = modelica_text(model, include_sensor=True)
+    signal = re.sub(r"//[^\n]*", "", text.split("  model Signal")[1].split("annotation(")[0])
+    declared, equations = signal.split("\n  equation\n")
+    names = [*model.structure.balances, *model.output_names]
+    for name in dict.fromkeys(names):
+        assert len(re.findall(rf"(?:^|;)\s*{name} =", equations, re.M)) == 1, name
+        assert len(re.findall(rf"Real {name}\b", declared)) == 1, name
+    for name in model.state_names:
+        assert equations.count(f"der({name}) =") == 1, name
+    for parameter in model.structure.parameters:
+        assert f'parameter Real {parameter.name}(unit="{parameter.unit}"' in declared
+
+
+def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> Component:
+    return Component(
+        "decay",
+        'a "decay" \\ of <z>',
+        "none",
+        lambda s: Equations(
+            der={state: -getattr(s, parameter) * getattr(s, state) + s.pull},
+            out={output: 2 * getattr(s, state)},
+        ),
+        parameters=(Parameter(parameter, 2.0, "1/s", (0.0, float("inf")), "rate"),),
+        states=(State(state, "counts", "z", 1.0, start=1.0),),
+        inputs=(Input("pull", "counts/s", "pull", start=0.5),),
+        outputs=(Output(output, "counts", "twice z"),),
+    )
+
+
+def test_names_that_modelica_has_taken_are_changed_and_texts_escaped() -> None:
+    text = modelica_text(compose([_decay("model", "output", "der")], name="decay"))
+    assert 'parameter Real model_2(unit="1/s", min=0.0) = 2.0 "rate";' in text
+    assert "der(der_2) = pull - model_2*der_2;" in text
+    assert "output_2 = 2*der_2;" in text
+    assert 'input Real pull(unit="1/s", start=0.5, nominal=1.0)' in text
+    assert 'decay: a "decay" \\ of <z>' in text  # in a comment
+    assert 'a \\"decay\\" \\\\ of &lt;z&gt;' in text  # in the documentation
+    assert (
+        "Signal device(pull=0.5 + 0.5*height*(1 - cos(6.283185307179586*frequency*time)))" in text
+    )
+    assert "Acausal" not in text.split("annotation(Doc")[0]
+    assert "uses(Modelica" not in text
+
+
+@pytest.mark.parametrize("name", ["2stack", "model", "Piezo-Stack", ""])
+def test_a_name_that_no_package_can_have_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="cannot name a Modelica package"):
+        modelica_text(stack_model("P-885.51"), name=name)
+
+
+def test_names_that_clash_are_refused() -> None:
+    with pytest.raises(InputError, match="named 'z', which Modelica does not allow"):
+        modelica_text(compose([_decay(output="z")]))
+    with pytest.raises(InputError, match="output 'tip_force' of 'psa' differs from the balance"):
+        modelica_text(compose([*BASE, _decay(output="tip_force")]))
+
+
+def test_a_start_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    endless = Component(
+        "endless",
+        "no start",
+        "none",
+        lambda s: Equations(der={"z": -s.z}),
+        states=(State("z", "1", "z", 1.0, start=float("inf")),),
+    )
+    with pytest.raises(InputError, match="start of state 'z' is inf, which Modelica cannot write"):
+        export_modelica(compose([endless]), tmp_path / "x.mo")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_writes_the_package_and_says_what_is_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "PiezoStack.mo"
+    arguments = ["export", "modelica", "--stack", "P-885.51", "-o", str(path)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "left out: sensor" in result.output
+    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in result.output
+    assert path.read_text(encoding="utf-8") == modelica_text(stack_model("P-885.51"))
+
+
+@pytest.mark.parametrize(("start", "rests"), [(0.0, True), (2.0, True), (1.0, False)])
+def test_the_text_says_whether_the_states_rest_at_the_start(start: float, rests: bool) -> None:
+    """x' = x (2 - x) rests at 0 and at 2."""
+    x = ca.SX.sym("x")
+    states = [State("x", "1", "a population", 1.0, start=start)]
+    model = ode_model({"x": x, "ode": x * (2.0 - x)}, name="logistic", states=states)
+    text = modelica_text(model)
+    assert ("states start at rest." in text) == rests
+    assert ("states start at their start values" in text) != rests
+
+
+FloatArray = NDArray[np.float64]
+
+_WIRED = "PiezoStack.Examples.Wired"
+
+
+def _value(text: str, part: str, name: str) -> float:
+    """Return what the example gives a parameter of one of its parts."""
+    example = text.split("model Wired")[1]
+    found = example.split(f" {part}(")[1].split(f"{name}=")[1]
+    return float(found.split(",")[0].split(")")[0])
+
+
+def _by_hand(p: dict[str, float], text: str, t: FloatArray) -> FloatArray:
+    """Return displacement, mass position and current, from equations written out here.
+
+    The load's spring and damper pull at the stack's output, the bonding layers at the wafers.
+    """
+    amplitude, frequency = _value(text, "source", "V"), _value(text, "source", "f")
+    c, d = _value(text, "springDamper", "c"), _value(text, "springDamper", "d")
+    m = _value(text, "mass", "m")
+
+    def current(time: float, u: float) -> float:
+        source = amplitude * (1.0 - np.cos(2.0 * np.pi * frequency * time))
+        return float(source - u) / p["R_s"]
+
+    def rates(time: float, state: FloatArray) -> list[float]:
+        u, f_H, f_out, y, v_y, x, v_x, s, v = state
+        rate = current(time, u) / p["C_p"]
+        sign = rate / np.hypot(rate, p["hold_rate"])
+        power = (abs(f_H) / p["h_ref"]) ** p["n"]
+        bend = p["beta"] * rate * sign * np.sign(f_H) * power + p["gamma"] * rate * power
+        pull = p["c_B"] * (v_x - v_y) + p["k_B"] * (x - y)
+        load = c * (s - x) + d * (v - v_x)
+        return [
+            rate,
+            p["A"] * rate - bend + p["delta"] * u * sign,
+            (p["k_L"] * u + f_H - f_out) / p["tau"],
+            v_y,
+            (f_out + pull - p["c_P"] * v_y - p["k_P"] * y) / p["m_P"],
+            v_x,
+            (load - pull) / p["m_B"],
+            v,
+            -load / m,
+        ]
+
+    size = np.array([100.0, 100.0, 1e3, 1e-5, 1e-2, 1e-5, 1e-2, 1e-5, 1e-2])
+    span = (0.0, float(t[-1]))
+    found = solve_ivp(rates, span, np.zeros(9), "Radau", t, rtol=1e-10, atol=1e-12 * size)
+    drawn = np.array([current(time, u) for time, u in zip(t, found.y[0], strict=True)])
+    return np.array([found.y[5], found.y[7], drawn])
+
+
+@pytest.mark.parametrize("name", slow_but(["P-885.51"], ["P-885.51", "WYDS0808020"]))
+def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
+    model = stack_model(name)
+    text = modelica_text(model)
+    span = float(text.split("model Wired")[1].split("StopTime=")[1].split(",")[0])
+    got = simulated(STUB + text, _WIRED, span, rtol=1e-10)
+    t = got["time"]
+    expected = _by_hand(dict(model.values), text, t)
+    for values, name_of_it in zip(
+        expected, ("stack.displacement", "mass.s", "stack.current"), strict=True
+    ):
+        assert np.abs(got[name_of_it] - values).max() < 1e-6 * np.ptp(values), name_of_it
+
+
+@pytest.mark.parametrize(
+    "name",
+    slow_but(["P-885.51", "slow_creep", "every_effect"], [*STACKS, *EFFECTS, "every_effect"]),
+)
+def test_every_wired_example_is_a_balanced_system(name: str) -> None:
+    model = load(STUB + text_of(name), _WIRED)
+    structure = model.structure()
+    assert structure.is_balanced
+    assert structure.is_matched
+
+
+def test_the_reaction_is_there_whatever_the_gain_of_the_model() -> None:
+    assert "final parameter Real reciprocal_gain" in text_of("P-885.51")
+    model = model_named("reciprocal_coupling")
+    assert model.values["reciprocal_gain"] == 0.25
+    signal, acausal = modelica_text(model).split("  model Acausal")
+    assert "max=1.2) = 0.25" in signal
+    assert "max=1.2) = 1.0" in acausal
+    assert "reciprocal_gain = 1, action and reaction" in acausal
+
+
+def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
+    """The stage between a spring to the ground and a position that is given."""
+    text = modelica_text(compose([COMPONENTS["flexure"]], name="flexure"), name="Stage")
+    bench = """
+    model Mover
+      Modelica.Mechanics.Translational.Interfaces.Flange_b flange_b;
+      Real s(start=0, fixed=true);
+    equation
+      der(s) = 1e-4;
+      flange_b.s = s;
+    end Mover;
+    model Bench
+      Stage.Acausal stage;
+      Mover mover;
+    equation
+      connect(mover.flange_b, stage.flange_a);
+    end Bench;
+    """
+    got = simulated(STUB + text + bench, "Bench", 0.05, rtol=1e-10)
+    contact = 5e7 * (got["mover.s"] - got["stage.x_f"]) + 500.0 * (1e-4 - got["stage.v_f"])
+    np.testing.assert_allclose(got["stage.flange_a.f"], contact, rtol=1e-6, atol=1e-9)
+    # slow motion: contact and flexure are springs in series, but for the damper's drag
+    drag = 50.0 * got["stage.v_f"][-1]
+    assert contact[-1] == pytest.approx(5e6 * got["stage.x_f"][-1] + drag, rel=1e-3)
+
+
+def test_scaled_forces_give_the_free_stroke_of_the_cascade() -> None:
+    """What the documentation of `Acausal` says about its stroke."""
+    model = stack_model("P-885.51")
+    p = model.values
+    scale = (p["k_P"] + p["k_B"]) / p["k_B"]
+    assert f"{1 / scale:.4g} times that of the cascade" in modelica_text(model)
+    forces = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
+    scaled = reciprocal(model.with_values({n: scale * p[n] for n in forces}))
+    t = np.linspace(0.0, 1.0, 101)
+    u = np.column_stack([60.0 * np.minimum(2 * t, 1.0), np.zeros(101)])
+    ends = [
+        run(m, t, u, np.zeros(len(m.state_names)), rtol=1e-9).x[-1, m.state_names.index("x")]
+        for m in (model, scaled, reciprocal(model))
+    ]
+    assert ends[1] == pytest.approx(ends[0], rel=1e-6)
+    assert ends[2] == pytest.approx(ends[0] / scale, rel=1e-6)

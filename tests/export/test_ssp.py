@@ -1,0 +1,199 @@
+"""SSP archives: what is inside, and whether it follows the standard."""
+
+import re
+import zipfile
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from fmpy.ssp.ssd import read_ssd
+from lxml import etree  # type: ignore[import-untyped]
+
+from psa_casadi.errors import InputError
+from psa_casadi.export.common.variable_table import OPTIONS
+from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
+from psa_casadi.export.ssp.drawing import OUTSIDE, Port
+from psa_casadi.export.ssp.steps import stable_step
+from psa_casadi.export.ssp.structure import shared_parameters
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.system import System
+from tests.export.fmu_models import assert_valid, model_named
+from tests.export.ssp_master import SspArchive
+from tests.export.ssp_systems import STACK, archive_of, closed_loop, pushed_stage
+from tests.tiers import slow, slow_but
+
+#: Each archive is exported once: with pytest-xdist by one process.
+pytestmark = pytest.mark.xdist_group("ssp")
+
+_SCHEMAS = {
+    ".ssd": "SystemStructureDescription.xsd",
+    ".ssv": "SystemStructureParameterValues.xsd",
+    ".ssm": "SystemStructureParameterMapping.xsd",
+}
+
+
+def texts(path: Path) -> dict[str, str]:
+    """Return the XML files of an archive."""
+    with zipfile.ZipFile(path) as archive:
+        names = [n for n in archive.namelist() if Path(n).suffix in _SCHEMAS]
+        return {n: archive.read(n).decode() for n in names}
+
+
+@pytest.mark.parametrize("name", slow_but(["pushed_stage"], ["pushed_stage", "closed_loop"]))
+def test_every_file_follows_its_schema_and_names_what_the_fmus_have(name: str) -> None:
+    path = archive_of(name)
+    for place, text in texts(path).items():
+        assert_valid(text, "ssp", "schema", _SCHEMAS[Path(place).suffix])
+    system = read_ssd(str(path)).system
+    with SspArchive(path) as archive:
+        for component in system.elements:
+            known = {v.name: v for v in archive.fmus[component.name].description.modelVariables}
+            for connector in component.connectors:
+                assert known[connector.name].causality == connector.kind
+        for part, values in archive.parameters.items():
+            assert {n: known_start(archive, part, n) for n in values} == values
+            assert {*values} == {*archive.fmus[part].names("parameter")} - {*OPTIONS}
+
+
+def known_start(archive: SspArchive, part: str, name: str) -> float:
+    variables = archive.fmus[part].description.modelVariables
+    return float(next(v.start for v in variables if v.name == name))
+
+
+@slow
+def test_units_of_connectors_are_defined_and_equal_across_every_wire() -> None:
+    root = etree.fromstring(texts(archive_of("closed_loop"))["SystemStructure.ssd"].encode())
+    defined = {u.get("name"): dict(u[0].attrib) for u in root.iter("{*}Unit")}
+    assert defined["V"] == {"kg": "1", "m": "2", "s": "-3", "A": "-1"}
+    units = {}
+    for connector in root.iter("{*}Connector"):
+        owner = connector.getparent().getparent()
+        part = OUTSIDE if etree.QName(owner).localname == "System" else owner.get("name")
+        units[Port(part, connector.get("name"))] = connector.find("{*}Real").get("unit")
+    assert set(units.values()) <= set(defined)
+    wires = wiring_of(closed_loop()).wires
+    assert len(units) > len(wires)
+    assert all(units[w.start] == units[w.end] for w in wires)
+
+
+def test_the_same_system_gives_the_same_bytes(tmp_path: Path) -> None:
+    again = export_ssp(pushed_stage(), tmp_path / "again.ssp")
+    assert again.read_bytes() == archive_of("pushed_stage").read_bytes()
+
+
+@slow
+def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
+    shared = shared_parameters(closed_loop().parts)
+    assert set(shared["k_L"]) == {"compensator", "stack"}
+    assert {"A", "beta", "gamma", "delta", "n"} <= set(shared)
+    other = model_named(STACK).with_values({"beta": 0.9 * model_named(STACK).values["beta"]})
+    mistuned = nanopositioner(STACK, compensator_stack=other.plant())
+    assert "beta" not in shared_parameters(mistuned.parts)
+    mapping = texts(archive_of("closed_loop"))["resources/shared.ssm"]
+    assert re.findall(r'source="k_L" target="(.*?)"', mapping) == ["compensator.k_L", "stack.k_L"]
+
+
+@slow
+def test_a_changed_parameter_set_reaches_both_parts(tmp_path: Path) -> None:
+    """The value stands once, so a user who edits it changes the stack and its observer."""
+    changed = tmp_path / "changed.ssp"
+    with zipfile.ZipFile(archive_of("closed_loop")) as old, zipfile.ZipFile(changed, "w") as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == "resources/shared.ssv":
+                known = r'(name="k_L".*?value=")[^"]*'
+                text = re.sub(known, r"\g<1>9.5", content.decode(), count=1, flags=re.S)
+                content = text.encode()
+            new.writestr(name, content)
+    with SspArchive(changed) as archive:
+        assert archive.parameters["stack"]["k_L"] == 9.5
+        assert archive.parameters["compensator"]["k_L"] == 9.5
+
+
+def test_no_wire_runs_through_a_part_or_on_another_wire() -> None:
+    layout = layout_of(wiring_of(closed_loop()))
+    pieces: list[tuple[tuple[float, float], tuple[float, float], int]] = []
+    for number, path in enumerate(layout.paths):
+        for a, b in pairwise(path):
+            assert a[0] == b[0] or a[1] == b[1], "wires have right angles"
+            for box in layout.boxes:
+                x1, x2 = sorted((a[0], b[0]))
+                y1, y2 = sorted((a[1], b[1]))
+                apart = x2 <= box.x1 or x1 >= box.x2 or y2 <= box.y1 or y1 >= box.y2
+                assert apart, (layout.wires[number], box.name)
+            pieces.append((a, b, number))
+    starts = [w.start for w in layout.wires]
+    for a, b, first in pieces:
+        for c, d, second in pieces:
+            if first < second and starts[first] != starts[second]:
+                assert not _on_each_other(a, b, c, d), (layout.wires[first], layout.wires[second])
+
+
+def _on_each_other(
+    a: tuple[float, float], b: tuple[float, float], c: tuple[float, float], d: tuple[float, float]
+) -> bool:
+    for along in (0, 1):
+        across = 1 - along
+        if a[across] == b[across] == c[across] == d[across]:
+            low = max(min(a[along], b[along]), min(c[along], d[along]))
+            high = min(max(a[along], b[along]), max(c[along], d[along]))
+            return high > low
+    return False
+
+
+@slow
+def test_the_picture_shows_every_part_and_port(tmp_path: Path) -> None:
+    wiring = wiring_of(closed_loop())
+    layout = layout_of(wiring)
+    svg = save_wiring(wiring, layout, tmp_path / "wiring.svg").read_bytes()
+    with zipfile.ZipFile(archive_of("closed_loop")) as archive:
+        assert archive.read("documentation/wiring.svg") == svg
+    root = etree.fromstring(svg)
+    shown = [e.text for e in root.iter("{*}text")]
+    assert set(wiring.parts) <= set(shown)
+    assert {p.name for p in layout.places if p.part} <= set(shown)
+    png = save_wiring(wiring, layout, tmp_path / "wiring.png").read_bytes()
+    assert png.startswith(b"\x89PNG")
+    with pytest.raises(InputError, match=r"\.svg or \.png"):
+        save_wiring(wiring, layout, tmp_path / "wiring.gif")
+
+
+def test_a_system_that_cannot_be_wired_is_refused_before_anything_is_compiled(
+    tmp_path: Path,
+) -> None:
+    wires = (*pushed_stage().wires, ("flexure.stage_position", "stack.load_force"))
+    wrong = System(**{**vars(pushed_stage()), "wires": wires})
+    with pytest.raises(InputError, match="load_force"):
+        export_ssp(wrong, tmp_path / "wrong.ssp")
+    assert not (tmp_path / "wrong.ssp").exists()
+
+
+@pytest.mark.parametrize("name", slow_but(["pushed_stage"], ["pushed_stage", "closed_loop"]))
+def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
+    """As its importer reads it: this annotation, by these prefixes, and no canvas.
+
+    OMSimulator 3.0.0.post114 ended with "Unable to add System" without the one, and with "wrong
+    xml schema detected" at the other.
+    """
+    text = texts(archive_of(name))["SystemStructure.ssd"]
+    assert "SystemGeometry" not in text
+    found = re.search(
+        r'<ssd:Annotations>\s*<ssc:Annotation type="org.openmodelica">\s*<oms:Annotations>\s*'
+        r'<oms:SimulationInformation>\s*<oms:FixedStepMaster description="oms-ma"'
+        r' stepSize="(0\.\d+)" relativeTolerance="(0\.\d+)" />',
+        text,
+    )
+    assert found is not None
+    root = etree.fromstring(text.encode())
+    assert root.nsmap["oms"].endswith("/OMSimulator/master/schema/oms.xsd")
+    assert [c.tag.partition("}")[2] for c in root[0]][-2:] == ["Connections", "Annotations"]
+    wiring = wiring_of(pushed_stage() if name == "pushed_stage" else closed_loop())
+    step = float(found[1])
+    assert 0.0 < step <= 0.05 * stable_step(wiring, rates=False)
+    assert step <= 1e-3 * float(root.find("{*}DefaultExperiment").get("stopTime"))
+    assert f"{step:.0e}"[0] in "125"
+    results = re.search(
+        r'<oms:SimulationInformation resultFile="(\w+)\.csv" loggingInterval="', text
+    )
+    assert results is not None
+    assert results[1] == wiring.name

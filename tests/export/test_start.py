@@ -1,0 +1,383 @@
+"""The state at the start of a record, its derivatives, and how they go on into a run."""
+
+import html
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi import reference
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.check.agreement import truth_of
+from psa_casadi.export.check.description import wrong_start_values
+from psa_casadi.export.check.structure import wrong_start
+from psa_casadi.export.fmu.documentation import documentation
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.masters import Signals, co_simulate
+from psa_casadi.model.model_file import dumps, loads, save_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.records import read_record, write_record
+from psa_casadi.simulation.simulate import memory_after, settled_at, simulate
+from psa_casadi.simulation.start import initial_slope, start_state
+from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
+from tests.export.fmu_models import exported, model_named
+from tests.model.stack_models import jacobian, sine, stack
+from tests.tiers import slow
+
+
+@pytest.mark.parametrize(
+    "effects", [(), pytest.param(tuple(EFFECTS), marks=slow)], ids=["base", "all"]
+)
+@pytest.mark.parametrize("name", sorted(STACKS))
+def test_rest_is_rest(name: str, effects: tuple[str, ...]) -> None:
+    model = stack(name)
+    gains = {"creep_gain": 0.05, "mode_gain": 0.1, "memory_gain": 0.1, "sensor_delay": 1e-3}
+    for effect in effects:
+        model = model.with_effect(EFFECTS[effect])
+    model = model.with_values({k: v for k, v in gains.items() if k in model.values})
+    memory = {"f_H": 0.3 * model.values["h_ref"]}
+    inputs = [{"voltage": 80.0, "load_force": 50.0}.get(n, 293.15) for n in model.input_names]
+    start = start_state(model, inputs, memory=memory)
+    rate = np.array(model.structure.f(0.0, start.x, inputs, model.parameter_vector())[0])
+    size = model.state_nominals()
+    assert start.x[model.state_names.index("u")] == pytest.approx(80.0, rel=1e-12)
+    assert start.x[model.state_names.index("f_H")] == memory["f_H"]
+    fastest = np.abs(np.linalg.eigvals(jacobian(stack(name)))).max()
+    assert np.all(np.abs(rate.ravel()) < 1e-9 * fastest * size)
+    held = simulate(model, [0.0, 0.1, 2.0], [80.0] * 3, load_force=[50.0] * 3, memory=memory)
+    assert np.ptp(held.displacement) < 1e-9 * held.displacement[0]
+
+
+def test_a_memory_that_relaxes_in_a_bent_model_leaves_the_others_at_rest() -> None:
+    """They only follow it."""
+    gains = {"saturation_gain": 0.1, "leak_gain": 0.1}
+    model = stack("P-885.51")
+    for effect in ("saturation_of_strain", "charge_leakage"):
+        model = model.with_effect(EFFECTS[effect])
+    model = model.with_values(gains)
+    start = start_state(model, [60.0, 0.0], memory={"leak_voltage": 9.0})
+    rate = np.array(model.structure.f(0.0, start.x, [60.0, 0.0], model.parameter_vector())[0])
+    shares = np.abs(rate.ravel()) / model.state_nominals()
+    fast = np.array([not s.memory for s in model.structure.states])
+    assert shares[model.state_names.index("leak_voltage")] > 1e-2
+    assert np.max(shares[fast]) < 1e-2
+
+
+@pytest.mark.parametrize("name", sorted(STACKS))
+def test_a_record_that_starts_in_motion_starts_without_a_transient(name: str) -> None:
+    """The start on a ramp is the state that a long ramp has led to."""
+    model = stack(name)
+    p = model.values
+    end = max(0.04, 200 * p["tau"])
+    rate = 0.5 * p["u_rated"] / end
+    bend = p["tau"] * abs(p["delta"]) / (p["k_L"] + p["A"])  # delta bends the ramp of the force
+    t = np.linspace(0.0, end, 41)
+    led = simulate(model, t, rate * t, from_rest_at_zero=True, rtol=1e-10)
+    memory = {"f_H": float(led.states["f_H"][-1])}
+    moving = start_state(model, [rate * t[-1], 0.0], [rate, 0.0], memory, t[-1]).x
+    still = start_state(model, [rate * t[-1], 0.0], None, memory, t[-1]).x
+    for k, state in enumerate(model.state_names):
+        off, lag = (abs(x[k] - led.states[state][-1]) for x in (moving, still))
+        assert off <= (1e-3 + bend) * lag + 1e-9 * model.state_nominals()[k], state
+    assert abs(still[0] - led.states["u"][-1]) > 1e-5 * p["u_rated"]
+
+
+def test_start_derivatives_are_differences_of_starts() -> None:
+    model = stack("WYDS0808020").with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.05})
+    inputs, rates, memory = [60.0, 20.0], [3e3, 0.0], {"f_H": -30.0, "z_c2": 2e-7}
+    start = start_state(model, inputs, rates, memory)
+    for k, name in enumerate(model.parameter_names):
+        step = 1e-5 * model.parameter(name).typical(model.values)
+        ends = [
+            start_state(model.with_values({name: model.values[name] + h}), inputs, rates, memory).x
+            for h in (step, -step)
+        ]
+        found = (ends[0] - ends[1]) / (2 * step) * model.parameter(name).typical(model.values)
+        exact = start.by_parameter[:, k] * model.parameter(name).typical(model.values)
+        assert np.all(np.abs(found - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
+    names = ("f_H", "z_c1", "z_c2", "z_c3")
+    assert start.by_memory.shape == (len(start.x), len(names))
+    for k, name in enumerate(names):
+        size = model.state_nominals()[model.state_names.index(name)]
+        moved = [{**memory, name: memory.get(name, 0.0) + h * size} for h in (1e-5, -1e-5)]
+        ends = [start_state(model, inputs, rates, m).x for m in moved]
+        found = (ends[0] - ends[1]) / 2e-5
+        exact = start.by_memory[:, k] * size
+        assert np.all(np.abs(found - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
+
+
+def test_sensitivity_to_a_start_is_the_difference_of_runs() -> None:
+    model = stack("P-885.51")
+    t = np.linspace(0.0, 1e-3, 2001)
+    u = np.column_stack([sine(t, 700.0), 0.0 * t])
+    start: FloatArray = 0.1 * model.state_nominals()
+    unknowns = [model.state_names.index(n) for n in ("f_H", "f_out", "x")]
+    exact = run(model, t, u, start, rtol=1e-8, unknowns=unknowns).sensitivity
+    assert exact is not None
+    for column, k in enumerate(unknowns):
+        step: FloatArray = 1e-3 * np.eye(len(start))[k] * model.state_nominals()
+        ends = [run(model, t, u, start + sign * step, rtol=1e-8).y[:, -1] for sign in (1, -1)]
+        found = (ends[0] - ends[1]) / (2 * step[k])
+        size = np.abs(exact[:, column]).max()
+        np.testing.assert_allclose(found, exact[:, column], rtol=0, atol=1e-4 * size)
+
+
+def test_initial_slope_sees_motion_and_no_step() -> None:
+    t = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert initial_slope(t, np.array([1.0, 1.3, 1.5, 1.9, 0.0])) == pytest.approx(2.0)
+    assert initial_slope(t, np.array([1.0, 0.7, 0.5, 0.1, 9.0])) == pytest.approx(-2.0)
+    assert initial_slope(t, np.array([1.0, 5.0, 5.0, 5.0, 5.0])) == 0.0
+    assert initial_slope(t, np.array([1.0, 1.1, 1.0, 1.1, 1.0])) == 0.0
+
+
+STACK = stack_model("P-885.51")
+
+
+def _falling() -> tuple[FloatArray, FloatArray]:
+    t = np.linspace(0.0, 1.0, 1001)
+    return t, 60.0 + 60.0 * np.cos(np.pi * t)
+
+
+@slow
+def test_a_record_that_begins_at_the_top_follows_the_reference_played_from_zero() -> None:
+    """Independent: the reference integrates the way up and the record in one piece."""
+    t, voltage = _falling()
+    whole_t = np.concatenate([np.linspace(0.0, 1.0, 501), 1.0 + t[1:]])
+    whole_v = np.concatenate([np.linspace(0.0, 120.0, 501), voltage[1:]])
+    expected = reference.simulate(
+        STACK.values, lambda time: float(np.interp(time, whole_t, whole_v)), whole_t,
+        mechanics="cascade", breakpoints=[1.0],
+    ).states["x"][500:]  # fmt: skip
+    span = float(np.ptp(expected))
+    memory = memory_after(STACK, [], at=120.0)
+    after = simulate(STACK, t, voltage, memory=memory).displacement
+    relaxed = simulate(STACK, t, voltage).displacement
+    # the reference comes to the first sample in motion, the record begins at rest
+    assert np.abs(after - expected)[1:].max() < 2e-5 * span
+    assert np.abs(relaxed - expected).max() > 0.05 * span
+
+
+def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
+    creeping = STACK.with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02, "creep_time": 0.1})
+    model = creeping.with_effect(EFFECTS["hysteresis_memory"], {"memory_gain": 0.05})
+    turns, sweep, rest = [0.0, 100.0, 20.0, 80.0, 50.0], 0.7, 2.0
+    corners = np.append(sweep * np.arange(len(turns)), sweep * (len(turns) - 1) + rest)
+    t = np.linspace(0.0, 1.0, 501)
+    voltage = 50.0 + 30.0 * np.sin(2 * np.pi * t)
+    before = np.linspace(0.0, corners[-1], 2401)
+    played = np.interp(before, corners, [*turns, turns[-1]])
+    whole = simulate(
+        model, np.append(before, corners[-1] + t[1:]), np.append(played, voltage[1:])
+    ).displacement[2400:]
+    memory = memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
+    # the record begins in motion: the fast states start there, as `start_state` has it
+    found = simulate(model, t, voltage, memory=memory).displacement
+    assert np.abs(found - whole)[50:].max() < 1e-4 * np.ptp(whole)
+
+
+def test_no_history_is_the_relaxed_start() -> None:
+    assert set(memory_after(STACK, [], at=0.0).values()) == {0.0}
+
+
+@slow
+def test_an_exported_model_starts_settled_and_stays_while_its_voltage_does(tmp_path: Path) -> None:
+    """By fmpy: no transient at 60 V, where the way up and back down has left the hysteresis."""
+    fmpy = pytest.importorskip("fmpy")
+    settled = settled_at(STACK, 60.0, [120.0])
+    path = psa.export_fmu(settled, tmp_path / "held.fmu", name="held")
+    t = np.linspace(0.0, 0.02, 201)
+    played = np.array([(0.0, 60.0), (0.02, 60.0)], dtype=[("time", float), ("voltage", float)])
+    found = fmpy.simulate_fmu(
+        str(path), stop_time=0.02, output_interval=1e-4, input=played, output=["displacement"]
+    )["displacement"]
+    down = np.concatenate([np.linspace(0.0, 120.0, 401), np.linspace(120.0, 60.0, 201)[1:]])
+    way = np.linspace(0.0, 3.0, down.size)
+    expected = reference.simulate(
+        STACK.values, lambda time: float(np.interp(time, way, down)), way,
+        mechanics="cascade", breakpoints=[2.0],
+    ).states["x"]  # fmt: skip
+    span = float(np.ptp(expected))
+    assert len(found) == len(t)
+    assert np.ptp(found) < 1e-7 * span
+    # the reference comes down at 60 V/s, a lag of microseconds behind
+    assert found[0] == pytest.approx(expected[-1], abs=1e-3 * span)
+    assert abs(found[0] - simulate(STACK, t, np.full(t.size, 60.0)).displacement[0]) > 0.01 * span
+
+
+def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> None:
+    settled = settled_at(STACK, 60.0, [120.0])
+    assert settled.own_starts()["voltage"] == 60.0
+    extended = settled.with_effect(EFFECTS["sensor_lag"], {"sensor_lag_time": 1e-4})
+    assert loads(dumps(extended)).own_starts() == extended.own_starts()
+    assert extended.plant().own_starts() == settled.own_starts()
+    assert STACK.own_starts() == settled.with_declared_starts().own_starts() == {}
+    assert "starts" not in dumps(STACK)
+    with pytest.raises(InputError, match="no state or input 'q'"):
+        STACK.with_starts({"q": 1.0})
+    with pytest.raises(InputError, match="finite"):
+        STACK.with_starts({"u": np.inf})
+    broken = dumps(extended).replace('"voltage": 60.0', '"voltage": "high"')
+    with pytest.raises(InputError, match=r"'starts\.voltage' is 'high'; give a number"):
+        loads(broken)
+
+
+def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
+    path = tmp_path / "PiezoStack.mo"
+    command = ["export", "modelica", "--stack", "P-885.51", "-o", str(path)]
+    done = CliRunner().invoke(app, [*command, "--start-voltage", "60", "--history", "120"])
+    assert done.exit_code == 0, done.output
+    text = path.read_text()
+    starts = settled_at(STACK, 60.0, [120.0]).own_starts()
+    assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
+    assert 'input Real voltage(unit="V", start=60.0' in text
+    refused = CliRunner().invoke(app, [*command, "--history", "120"])
+    assert refused.exit_code == 2
+    assert "--start-voltage" in refused.output
+
+
+@pytest.mark.parametrize(
+    ("turns", "options", "said"),
+    [
+        ([np.nan], {}, "not finite"),
+        ([10.0], {"sweep": 0.0}, "above 0"),
+        ([10.0], {"rest": -1.0}, "0 or more"),
+    ],
+)
+def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        memory_after(STACK, turns, at=5.0, **options)
+
+
+def test_the_command_takes_a_history(tmp_path: Path) -> None:
+    t, voltage = _falling()
+    given, out = tmp_path / "v.csv", tmp_path / "out.csv"
+    write_record(given, {"time [s]": t, "voltage [V]": voltage})
+    command = ["simulate", "--stack", "P-885.51", "--input", str(given), "-o", str(out)]
+    done = CliRunner().invoke(app, [*command, "--history", "120,0,120", "--rest", "3"])
+    assert done.exit_code == 0, done.output
+    memory = memory_after(STACK, [120.0, 0.0, 120.0], at=120.0, rest=3.0)
+    expected = simulate(STACK, t, voltage, memory=memory).displacement
+    written = read_record(out).displacement
+    assert written is not None
+    np.testing.assert_allclose(written, expected, rtol=0, atol=1e-9)
+    refused = CliRunner().invoke(app, [*command, "--history", "high"])
+    assert refused.exit_code == 2
+    assert "--history is 'high'" in refused.output
+
+
+OPTIONS = ["--start-voltage", "60", "--history", "120,0"]
+TIME = np.linspace(0.0, 0.1, 1001)
+VOLTAGE = 60.0 + 60.0 * np.sin(2 * np.pi * 10.0 * TIME)
+
+
+def _run(*words: str) -> str:
+    done = CliRunner().invoke(app, list(words))
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sine about 60 V, the stack as a model file, with and without starts, and its FMU."""
+    made = tmp_path_factory.mktemp("starts")
+    write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
+    save_model(STACK, made / "plain.json")
+    save_model(settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
+    said = _run(
+        "export", "fmu", "--model", str(made / "plain.json"), "-o", str(made / "m.fmu"), *OPTIONS
+    )
+    assert "start: the start values of the model at 60 V" in said
+    return made
+
+
+def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str]:
+    out = folder / "out.csv"
+    files = ["--model", str(folder / model), "--input", str(folder / "v.csv"), "-o", str(out)]
+    said = _run("simulate", *files, *options)
+    found = read_record(out).displacement
+    assert found is not None
+    return found, next(line for line in said.splitlines() if line.startswith("start: "))
+
+
+def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
+    folder: Path,
+) -> None:
+    """Also where the start is in the model file; without it the two differ, and it is said."""
+    inputs = Signals(("voltage",), TIME, VOLTAGE[:, None])
+    with Fmu(folder / "m.fmu") as fmu:
+        truth = co_simulate(fmu, TIME, inputs, ["displacement"], tolerance=1e-9)[:, 0]
+    span = float(np.ptp(truth))
+    for model, options in (("plain.json", OPTIONS), ("held.json", [])):
+        found, said = _simulated(folder, model, *options)
+        assert np.abs(found - truth).max() < 3e-6 * span, model
+        assert "at 60 V, as an exported FMU has them" in said
+        assert "step" not in said
+    relaxed, said = _simulated(folder, "plain.json")
+    assert np.abs(relaxed - truth).max() > 0.02 * span
+    assert "settled at 60 V" in said
+    assert "--start-voltage 60" in said
+    _, said = _simulated(folder, "held.json", "--start-voltage", "0")
+    assert "at 0 V" in said
+    assert "step from there to 60 V" in said
+    _, said = _simulated(folder, "held.json", "--history", "120,0")
+    assert "where the history 120,0 V leaves them" in said
+
+
+def test_the_option_that_is_named_begins_as_the_fmu_does(folder: Path) -> None:
+    """A relaxed start at 60 V and one that rose there from 0 V remember other things."""
+    inputs = Signals(("voltage",), TIME, VOLTAGE[:, None])
+    with Fmu(exported("P-885.51")) as fmu:
+        truth = co_simulate(
+            fmu, TIME, inputs, ["displacement"], tolerance=1e-9, values={"start_voltage": 60.0}
+        )[:, 0]
+    relaxed, said = _simulated(folder, "plain.json")
+    assert "give --start-voltage 60 here too to begin as it does" in said
+    named, _ = _simulated(folder, "plain.json", "--start-voltage", "60")
+    assert np.abs(named - truth).max() < 1e-5 * np.ptp(truth)
+    assert np.abs(relaxed - truth).max() > 0.05 * np.ptp(truth)
+
+
+def test_a_history_is_played_from_relaxed_whatever_start_the_model_has() -> None:
+    held = settled_at(STACK, 60.0, [120.0])
+    assert memory_after(held, [100.0], at=30.0) == memory_after(STACK, [100.0], at=30.0)
+    t, v = TIME[:3], np.full(3, 60.0)
+    one, other = (simulate(m, t, v, as_exported=False).displacement for m in (held, STACK))
+    assert np.array_equal(one, other)
+    assert abs(simulate(held, t, v).displacement[0] - other[0]) > 1e-7
+
+
+def test_the_check_has_a_row_for_the_start(folder: Path) -> None:
+    plain, settled = STACK.plant(), settled_at(STACK, 60.0, [120.0, 0.0]).plant()
+    with Fmu(folder / "m.fmu") as fmu:
+        assert list(wrong_start(fmu, truth_of(settled, 2))) == []
+        found = list(wrong_start(fmu, truth_of(plain, 2)))
+        assert any("co-simulation 'voltage' starts at 60, the model at 0" in f for f in found)
+        assert any("model exchange 'voltage' starts at 60" in f for f in found)
+    with Archive(folder / "m.fmu") as archive:
+        assert any(
+            f.startswith("'voltage' starts at 60") for f in wrong_start_values(archive, plain)
+        )
+    with Fmu(exported("flexure", 3)) as fmu:
+        assert list(wrong_start(fmu, truth_of(model_named("flexure"), 3))) == []
+
+
+def test_the_page_states_the_start() -> None:
+    page = html.unescape(documentation(STACK))
+    assert "It starts relaxed at 0 V" in page
+    assert "keep their start values it stays there" in page
+    settled = settled_at(STACK, 60.0, [120.0])
+    page = html.unescape(documentation(settled))
+    assert "It starts at 60 V with the start values of the tables" in page
+    assert "it stays there" in page
+    at_start = simulate(settled, TIME[:2], [60.0, 60.0]).displacement[0]
+    assert f"{1e6 * at_start:.6g} um" in page
+    moving = settled.with_starts({"voltage": 0.0})
+    assert "it moves from there" in html.unescape(documentation(moving))
+    assert replace(moving, name="x").starts_itself

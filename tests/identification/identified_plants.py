@@ -1,0 +1,113 @@
+"""Records of plants whose truth is known, identified; each once per process."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi.components import BASE
+from psa_casadi.identification.determinacy import covariance_of
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.prediction import predict_record
+from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.model.compose import compose
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import Record, read_record
+from psa_casadi.records.split import Experiment, whole
+from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.stack import Stack, loop_width
+
+FloatArray = NDArray[np.float64]
+
+
+@cache
+def plant(seed: int) -> tuple[Truth, Record]:
+    """Return a plant without a hidden effect and its record."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "record.csv")
+        return make_record(None, seed, path), read_record(path)
+
+
+@cache
+def identified(seed: int) -> Identification:
+    return identify([plant(seed)[1]])
+
+
+def noise(truth: Truth) -> float:
+    """Return the noise put in [m], with that of rounding to the sensor's count."""
+    return float(np.hypot(truth.sigma, truth.quantum / np.sqrt(12.0)))
+
+
+def values_of(s: Stack) -> dict[str, float]:
+    """Return a plant's parameters under the model's names."""
+    return {
+        "R_s": s.r_s, "C_p": s.c_p_el, "k_L": s.k_l, "A": s.a, "beta": s.beta, "gamma": s.gamma,
+        "delta": s.delta, "n": s.n, "h_ref": s.h_ref, "tau": s.tau, "m_P": s.m_p, "c_P": s.c_p,
+        "k_P": s.k_p, "m_B": s.m_b, "c_B": s.c_b, "k_B": s.k_b, "u_rated": s.u_rated,
+    }  # fmt: skip
+
+
+def combinations(p: Mapping[str, float]) -> dict[str, float]:
+    """Return what voltage and displacement determine, whatever the scale of force.
+
+    slope: of displacement on voltage just after a reversal [m/V]; width: of the loop at rated
+    voltage [m]; asymmetry: delta as displacement [m/(V.s)]; n; lag: the sum of all lags [s], the
+    first-order term of the transfer function from voltage to displacement.
+    """
+    compliance = 1 / p["k_P"] + 1 / p["k_B"]
+    lag = p["tau"] + p["R_s"] * p["C_p"] + p["c_P"] / p["k_P"] + p["c_B"] / p["k_B"]
+    own = {name: p[name] for name in ("beta", "gamma", "delta", "n", "h_ref", "tau", "u_rated")}
+    stack = Stack(
+        r_s=p["R_s"], c_p_el=p["C_p"], k_l=p["k_L"], a=p["A"], m_p=p["m_P"], c_p=p["c_P"],
+        k_p=p["k_P"], m_b=p["m_B"], c_b=p["c_B"], k_b=p["k_B"], **own,
+    )  # fmt: skip
+    return {
+        "slope": (p["k_L"] + p["A"]) * compliance,
+        "width": loop_width(stack) * compliance,
+        "asymmetry": p["delta"] * compliance,
+        "n": p["n"],
+        "lag": lag - (p["c_P"] + p["c_B"]) / (p["k_P"] + p["k_B"]),
+    }
+
+
+def standard_errors(
+    found: Fit, experiments: Sequence[Experiment], extra: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the standard errors of the combinations, from the fit's covariance."""
+    count = len(found.unknowns.names)
+    slopes = found.unknowns.slopes(found.theta)
+    covariance = slopes @ covariance_of(found, experiments)[:count, :count] @ slopes.T
+    p = {**found.model.values, **extra}
+    gradients: dict[str, list[float]] = {}
+    for name in found.unknowns.names:
+        step = 1e-4 * abs(p[name])
+        up, down = (combinations({**p, name: p[name] + h}) for h in (step, -step))
+        for key, value in up.items():
+            gradients.setdefault(key, []).append((value - down[key]) / (2 * step))
+    return {k: float(np.sqrt(np.array(g) @ covariance @ np.array(g))) for k, g in gradients.items()}
+
+
+#: What `psa identify` finds for a named stack with a record of its own.
+IDENTIFIED = ("k_L", "A", "beta", "gamma", "n", "tau", "delta", "R_s", "c_P", "c_B")
+
+
+def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
+    """The named stack meets its record as well as any values of what was identified for it.
+
+    A search from nothing is at least as good. It may be better: it frees masses besides, and in the
+    demonstration's record, half as far off, it takes the hidden creep for a lag of the wafers, with
+    c_P on its bound, which it says. Offset and memory are fitted.
+    """
+    model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
+    y: FloatArray = np.asarray(record.displacement)
+    found = fit(model, [whole(record)], [], sigma=[rms])
+    again = fit(model, [whole(record)], IDENTIFIED, sigma=[rms])
+    assert found.rms == pytest.approx(again.rms, rel=1e-3)
+    assert rms < 1.001 * found.rms
+    x, _, _ = predict_record(model, record, found.start(0), [],
+                             stop=record.n, rtol=1e-8)  # fmt: skip
+    assert np.std(x - y) == pytest.approx(found.rms, rel=2e-3)

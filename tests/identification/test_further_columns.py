@@ -1,0 +1,284 @@
+"""Columns beside the displacement: fitted, each with its own noise, and what each decided.
+
+The plants are independent ones (`tests/studies/plants/further_columns.py`): other equations than
+the effects, and sensors with scales and zeros of their own.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.components.outputs import MONITOR
+from psa_casadi.components.surroundings import FLEXURE
+from psa_casadi.diagnosis.diagnose import decided
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.identification.fitting.fit import Objective, fit
+from psa_casadi.identification.fitting.further import COLUMNS, scaled
+from psa_casadi.identification.prepare import columns_of, with_levels
+from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
+from psa_casadi.model.compose import compose
+from psa_casadi.notes import texts
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import split, whole
+from psa_casadi.report.page.results import write_report
+from psa_casadi.simulation.simulate import Way, simulate
+from tests.studies.plants import further_columns as plants
+from tests.studies.plants.excitations import ExcitationKind
+from tests.tiers import slow
+
+BENDS = ("load_stiffness", "sensor_nonlinearity")
+VOLTAGES = ("amplifier_nonlinearity", "saturation_of_strain")
+CHARGES = ("field_dependent_capacitance", "field_dependent_gain")
+SAMPLES = 3000
+Hide = Callable[[plants.Truth, float], plants.Truth]
+
+
+def diagnosed(
+    hide: Hide,
+    gain: float,
+    column: str,
+    effects: tuple[str, ...],
+    excitation: ExcitationKind = "rich",
+    seed: int = 2,
+) -> psa.Diagnosis:
+    truth = hide(plants.plain(seed, excitation), gain)
+    record = truth.record(seed, column, samples=SAMPLES)
+    return psa.diagnose([record], effects=[EFFECTS[n] for n in effects])
+
+
+def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path) -> None:
+    """A file with all columns, under laboratories' names too; the sensors' scales come back."""
+    truth = plants.plain(1)
+    r = truth.record(1, *COLUMNS, samples=1500)
+    path = tmp_path / "a.csv"
+    names = ("time", "voltage", "displacement", "monitor_voltage", "charge", "current")
+    sizes = (1.0, 1.0, 1e6, 1.0, 1e6, 1e3, 1e6, 1e6)
+    columns = [
+        size * getattr(r, n)
+        for n, size in zip((*names, "displacement_2", "strain"), sizes, strict=True)
+    ]
+    header = "t [s],u [V],x [um],V_mon [V],q [uC],i [mA],x2 [um],strain [um/m]"
+    np.savetxt(
+        path, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.9g"
+    )
+    read = read_record(path)
+    for name in COLUMNS:
+        np.testing.assert_allclose(getattr(read, name), getattr(r, name), rtol=1e-6, atol=1e-12)
+    start = starting_model([read])
+    found = columns_of(start, [read])
+    assert found.fitted == tuple(COLUMNS)
+    assert not found.left_out
+    experiments = with_levels([whole(read)], found.fitted)
+    free = ["k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s"]
+    fitted = fit(found.model, experiments, free, sigma=[plants.NOISE * read.range_m])
+    p = fitted.model.values
+    assert p["monitor_scale"] == pytest.approx(0.01, rel=3e-3)
+    assert p["sensor_2_scale"] == pytest.approx(0.83, rel=3e-3)
+    assert p["strain_scale"] == pytest.approx(55.0, rel=3e-3)
+    for f in fitted.further:
+        if f.column == "current":  # which shows lags that the displacement does not tell
+            assert f.rms < 2.0 * f.straight
+            continue
+        given = {n: getattr(read, n) for n in COLUMNS}[f.column]
+        assert f.rms == pytest.approx(plants.FURTHER_NOISE * np.ptp(given), rel=0.2), f.column
+    # a charge tells the capacitance of the free stack, with what the displacement frees
+    told = capacitance_of([replace(read, current=None)])
+    assert told is not None
+    assert told.source == "charge"
+    stack, slope = truth.run.stack, np.polyfit(truth.voltage, truth.displacement, 1)[0]
+    assert told.value == pytest.approx(stack.c_p_el + stack.k_l * slope, rel=0.05)
+
+
+@slow
+def test_the_derivatives_of_further_columns_are_those_of_their_residuals() -> None:
+    r = plants.plain(1).record(1, "charge", "monitor_voltage", samples=300)
+    found = columns_of(starting_model([r]), [r])
+    experiments = with_levels([whole(r)], found.fitted)
+    some = fit(found.model, experiments, ["k_L", "A", "R_s"], sigma=[1e-8], evaluations=1)
+    way = Way(1e-9, 1e-9)
+    evaluate = Objective(found.model, experiments, some.unknowns, [1e-8], way)
+    theta, rows = some.theta, slice(300, 900)
+    at = evaluate(theta)
+    assert at is not None
+    for k in range(3):
+        step = np.zeros_like(theta)
+        step[k] = 1e-4
+        up, down = evaluate(theta + step), evaluate(theta - step)
+        assert up is not None
+        assert down is not None
+        cost = 0.5 * (np.sum(up[0][rows] ** 2) - np.sum(down[0][rows] ** 2)) / 2e-4
+        # Kaufman's Jacobian has the gradient of the cost exactly
+        assert at[1][rows, k] @ at[0][rows] == pytest.approx(cost, rel=2e-3, abs=1e-3)
+
+
+def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_out() -> None:
+    time = np.linspace(0.0, 1.0, 50)
+    r = Record(
+        name="r",
+        time=time,
+        voltage=10 * time,
+        displacement=1e-6 * time,
+        monitor_voltage=time,
+        strain=0.0 * time,
+    )
+    with pytest.raises(InputError, match="'monitor_voltage', but the model 'psa' does not give it"):
+        columns_of(compose([FLEXURE]), [r])
+    found = columns_of(starting_model([r]), [r])
+    assert found.fitted == ("monitor_voltage",)
+    assert texts(found.left_out) == ("strain is left out: it never changes.",)
+    assert "monitor_voltage" in found.model.output_names
+    turned = replace(r, current=-np.gradient(time), monitor_voltage=None, strain=None)
+    (said,) = columns_of(starting_model([turned]), [turned]).left_out
+    assert "does not follow the voltage as a capacitance's does" in str(said)
+    with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
+        replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
+
+
+def test_a_monitor_goes_along_into_plant_and_file(tmp_path: Path) -> None:
+    time, voltage, displacement = _line()
+    r = Record(name="r", time=time, voltage=voltage, displacement=displacement)
+    model = starting_model([r])
+    model = model.with_components((*model.components, MONITOR))
+    psa.save_model(model, tmp_path / "m.json")
+    again = psa.load_model(tmp_path / "m.json").plant()
+    assert "monitor_voltage" in again.output_names
+    run = simulate(again.with_values({"monitor_scale": 0.1}), time, voltage)
+    np.testing.assert_allclose(run.outputs["monitor_voltage"], 0.1 * run.states["u"])
+
+
+def _line() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    time = np.linspace(0.0, 1.0, 50)
+    return time, 20.0 * time, 1e-6 * time
+
+
+def test_a_turned_sign_is_told() -> None:
+    r = plants.plain(1).record(1, "charge", samples=400)
+    turned = replace(r, charge=-np.asarray(r.charge))
+    for record, told in ((r, False), (turned, True)):
+        found = columns_of(starting_model([record]), [record])
+        experiments = with_levels([whole(record)], found.fitted)
+        (further,) = fit(found.model, experiments, [], sigma=[1e-8], evaluations=1).further
+        assert ("its sign is probably turned" in texts(further.notes)[-1]) is told
+
+
+@pytest.mark.parametrize(
+    ("now", "then", "said"),
+    [
+        ({}, {}, "agrees with the model"),
+        ({"slow_creep": 1.0}, {"slow_creep": 1.0}, "changes no name; it adds 7 "),
+        ({"slow_creep": 1.0}, {}, "Only with monitor_voltage is there slow_creep; without it noth"),
+        ({}, {"slow_creep": 1.0}, "nothing is named; without it slow_creep 100 %"),
+        ({"slow_creep": 1.0}, {"drive_lag": 0.6, "slow_creep": 0.4}, "the amplifier is ruled out"),
+        ({"slow_creep": 1.0}, {"ageing": 0.6, "slow_creep": 0.4}, "With monitor_voltage ageing is"),
+        (
+            {"drive_lag": 1.0},
+            {"ageing": 0.6, "sensor_lag": 0.4},
+            "the sensor and the stack with its load are rul",
+        ),
+    ],
+)
+def test_decisions_in_words(now: dict[str, float], then: dict[str, float], said: str) -> None:
+    assert said in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
+
+
+def test_a_column_explains_nothing_where_something_is_left() -> None:
+    of = {"load_stiffness": 0.5, "sensor_nonlinearity": 0.5}
+    clear = str(decided("load_force", {}, of, 0.0, EFFECTS, clear=True))
+    assert "load_stiffness is in the column" in clear
+    assert "nothing is named" in str(decided("load_force", {}, of, 0.0, EFFECTS, clear=False))
+    assert "decides nothing" in str(decided("load_force", {}, {}, 0.0, EFFECTS, clear=False))
+
+
+def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> None:
+    r = plants.plain(1).record(1, "displacement_2", samples=400)
+    found = columns_of(starting_model([r]), [r])
+    some = fit(found.model, with_levels([split(r)], found.fitted), [], sigma=[1e-8], evaluations=1)
+    (further,) = some.further
+    assert further.straight == pytest.approx(1e-3 * further.spread)
+    model, (beside,) = scaled(some.model, some.further)
+    assert model.values == pytest.approx(some.model.values)  # the scale is in the model already
+    assert beside.factors == pytest.approx([1.0])
+    assert "displacement_2: fitted beside the displacement" in str(further.notes[0])
+
+
+@slow
+def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(tmp_path: Path) -> None:
+    right = "sensor_nonlinearity"
+    found = diagnosed(plants.bent_sensor, 0.03, "displacement_2", BENDS)
+    assert [c.effect for c in found.causes] == [right]
+    assert found.causes[0].cannot_be_told_from == ()
+    (decided,) = found.columns
+    assert set(decided.named_without) == set(BENDS)
+    assert decided.ruled_out == tuple(n for n in decided.named_without if n != right)
+    assert decided.base_rms is not None
+    assert decided.noise == pytest.approx(decided.extended_rms, rel=0.1)
+    assert decided.evidence > 20.0
+    said = " ".join(psa.story(found).split())
+    assert "With displacement_2 the stack with its load is ruled out" in said
+    assert json.loads(found.to_json())["columns"][0]["named"] == {right: pytest.approx(1.0)}
+    write_report(found, tmp_path / "page.html", still=True)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "What the further columns decided" in page
+    assert "With displacement_2" in page
+
+
+@slow
+def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
+    """The measured load is an input; a load that stiffens is in the column then."""
+    bent = diagnosed(plants.bent_sensor, 0.03, "load_force", BENDS)
+    assert [c.effect for c in bent.causes] == ["sensor_nonlinearity"]
+    assert bent.columns[0].ruled_out == ("load_stiffness",)
+    loaded = diagnosed(plants.stiffening_load, 0.03, "load_force", BENDS)
+    assert loaded.verdict == "adequate"
+    (decided,) = loaded.columns
+    assert decided.role == "input"
+    assert set(decided.named_without) == set(BENDS)
+    assert "load_stiffness is in the column" in decided.sentence
+    # and it tells the stiffness that it meets, which nothing else does
+    stiffness = 1.0 / plants.plain(2).run.stack.compliance
+    assert loaded.model.values["k_B"] == pytest.approx(stiffness, rel=0.15)
+
+
+@slow
+@pytest.mark.parametrize(
+    ("hide", "right", "place"),
+    [
+        (plants.soft_amplifier, "amplifier_nonlinearity", "the stack with its load"),
+        (plants.saturating_stack, "saturation_of_strain", "the amplifier"),
+    ],
+)
+def test_a_monitor_voltage_tells_the_amplifier_from_the_stack(
+    hide: Hide, right: str, place: str
+) -> None:
+    found = diagnosed(hide, 0.1, "monitor_voltage", VOLTAGES, "triangle")
+    assert [c.effect for c in found.causes] == [right]
+    (decided,) = found.columns
+    assert set(decided.named_without) == set(VOLTAGES)
+    assert f"{place} is ruled out" in decided.sentence
+    assert decided.named[right] > 0.99
+
+
+@slow
+def test_a_capacitance_that_grows_shows_in_the_charge_alone() -> None:
+    found = diagnosed(plants.growing_capacitance, 0.3, "charge", CHARGES, seed=1)
+    assert [c.effect for c in found.causes] == ["field_dependent_capacitance"]
+    (decided,) = found.columns
+    assert decided.named_without == {}
+    assert "Only with charge" in decided.sentence
+
+
+@slow
+def test_a_column_of_a_clean_stack_raises_no_alarm() -> None:
+    record = plants.plain(2).record(2, "current", samples=SAMPLES)
+    found = psa.diagnose([record], effects=[EFFECTS[n] for n in (*VOLTAGES, *CHARGES)])
+    assert found.verdict == "adequate"
+    (decided,) = found.columns
+    assert "agrees with the model" in decided.sentence
+    assert decided.base_rms == pytest.approx(decided.noise, rel=0.25)

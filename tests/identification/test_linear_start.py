@@ -1,0 +1,264 @@
+"""Starting values of the linear part: against truths that the search never sees."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.start.linear_response import transfer
+from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.start.starting_points import LinearStart, linear_start
+from psa_casadi.model.compose import compose
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import Record
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
+from tests.studies.benchmarks.records import loop_voltage, multisine_voltage, step_voltage
+from tests.tiers import slow, slow_but
+
+Values = Mapping[str, float]
+PAPER = ("PTBS200", "WYDS0808020", "P-885.51")
+
+
+def values_of(name: str) -> dict[str, float]:
+    return {key: figure.value for key, figure in STACKS[name].values.items()}
+
+
+def simulated(
+    values: Values, time: FloatArray, voltage: FloatArray, effect: str = ""
+) -> FloatArray:
+    extra = [e for e in EFFECTS.values() if e.name == effect]
+    gain = {str(e.gain): 0.04 for e in extra}
+    model = compose((*BASE, *extra), {**values, **gain})
+    return simulate(model, time, voltage, from_rest_at_zero=True, rtol=1e-7).displacement
+
+
+def noisy(name: str, time: FloatArray, voltage: FloatArray, x: FloatArray, share: float) -> Record:
+    noise = share * np.ptp(x) * np.random.default_rng(1).standard_normal(x.size)
+    return Record(name=name, time=time, voltage=voltage, displacement=x + noise)
+
+
+@cache
+def step_of(name: str, effect: str = "") -> Record:
+    values = values_of(name)
+    time, voltage = step_voltage(values)
+    return Record(
+        name="step",
+        time=time,
+        voltage=voltage,
+        displacement=simulated(values, time, voltage, effect),
+    )
+
+
+def step(name: str, share: float, effect: str = "") -> Record:
+    clean = step_of(name, effect)
+    return noisy("step", clean.time, clean.voltage, np.asarray(clean.displacement), share)
+
+
+def theta_of(v: Values) -> FloatArray:
+    """ln (T, tau, a_P, q_P, a_B, q_B, r) of a stack."""
+    times = [v["R_s"] * v["C_p"], v["tau"]]
+    for part in "PB":
+        times += [v[f"c_{part}"] / v[f"k_{part}"], v[f"m_{part}"] / v[f"k_{part}"]]
+    return np.log([*times, v["k_P"] / v["k_B"]])
+
+
+def errors(found: LinearStart | None, truth: Values, record: Record) -> list[float]:
+    """Relative L2 error of every candidate's transfer function where the truth is above 1 %."""
+    assert found is not None
+    base = starting_model([record]).values
+    f = np.geomspace(1.0 / record.duration, 0.25 / record.sample_time, 200)
+    true = transfer(theta_of(truth), f)
+    seen = np.abs(true) > 0.01
+    missed = [
+        transfer(theta_of({**base, **c.values}), f)[seen] - true[seen] for c in found.candidates
+    ]
+    return [float(np.linalg.norm(m) / np.linalg.norm(true[seen])) for m in missed]
+
+
+def start(*records: Record) -> LinearStart | None:
+    return linear_start(records, starting_model(records).values)
+
+
+#: The share of noise and the largest error of each stack's step.
+STEP_ERRORS = [
+    ("PTBS200", 1e-3, 0.03), ("WYDS0808020", 1e-3, 0.08), ("P-885.51", 1e-3, 0.08),
+    ("PTBS200", 1e-2, 0.15), ("WYDS0808020", 1e-2, 0.12), ("P-885.51", 1e-2, 0.15),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "share", "first"), slow_but([STEP_ERRORS[0], STEP_ERRORS[-1]], STEP_ERRORS)
+)
+def test_a_step_tells_the_transfer_function(name: str, share: float, first: float) -> None:
+    record = step(name, share)
+    found = start(record)
+    missed = errors(found, values_of(name), record)
+    assert found is not None
+    assert missed[0] < first
+    assert min(missed) < 0.06
+    assert found.candidates[0].misfit == pytest.approx(share, rel=0.1)
+    assert len(found.candidates) <= 4
+    assert found.static_misfit > 5 * share
+
+
+def test_a_ringing_step_tells_the_bonding_layers() -> None:
+    """Wafers and bonding layers exchanged respond almost alike: both are among the candidates."""
+    record, truth = step("PTBS200", 1e-3), values_of("PTBS200")
+    found, k_B = start(record), starting_model([record]).values["k_B"]
+    assert found is not None
+    assert all({"m_P", "m_B"} <= set(c.told) for c in found.candidates)
+    true = truth["m_B"] / truth["k_B"]
+    right = [c for c in found.candidates if abs(c.values["m_B"] / k_B / true - 1.0) < 0.01]
+    assert 0 < len(right) < len(found.candidates)
+    damping = [c.values["c_B"] / k_B / (truth["c_B"] / truth["k_B"]) for c in right]
+    assert damping == pytest.approx([1.0] * len(right), rel=0.05)
+
+
+@pytest.mark.parametrize("name", slow_but(["PTBS200"], PAPER))
+def test_a_multisine_tells_it_in_spite_of_the_loop(name: str) -> None:
+    values = values_of(name)
+    time, voltage = multisine_voltage(values, seed=3)
+    record = noisy("multisine", time, voltage, simulated(values, time, voltage), 1e-3)
+    assert errors(start(record), values, record)[0] < 0.2
+
+
+@pytest.mark.parametrize("share", slow_but([1e-3], [1e-3, 1e-2]))
+def test_slow_loops_show_no_dynamics(share: float) -> None:
+    """Also where the shape of the loop is not that of play operators."""
+    values = values_of("PTBS200")
+    records = []
+    for amplitude, frequency in ((0.3, 1.0), (1.0, 1.0), (0.3, 10.0), (1.0, 10.0)):
+        time, voltage = loop_voltage(values, amplitude, frequency)
+        records.append(noisy("loop", time, voltage, simulated(values, time, voltage), share))
+    assert start(*records) is None
+    with_step = start(*records, step("PTBS200", share))
+    assert with_step is not None
+    assert with_step.records == ("step",)
+
+
+def test_without_displacement_or_motion_there_is_no_start() -> None:
+    record = step("PTBS200", 1e-3)
+    base = starting_model([record]).values
+    assert linear_start([replace(record, displacement=None)], base) is None
+    assert linear_start([replace(record, voltage=np.full(record.n, 5.0))], base) is None
+    assert linear_start([record.slice(0, 10)], base) is None
+
+
+@slow
+@pytest.mark.parametrize("scale", slow_but([40.0], [5.0, 40.0]))
+def test_no_size_is_built_in(scale: float) -> None:
+    """Times, volts and metres in other units give the same candidates in those units."""
+    record = step("WYDS0808020", 1e-3)
+    assert record.displacement is not None
+    other = Record(
+        name="scaled",
+        time=scale * record.time,
+        voltage=0.1 * record.voltage,
+        displacement=3.0 * record.displacement,
+    )
+    base = starting_model([record]).values
+    first, second = linear_start([record], base), linear_start([other], base)
+    assert first is not None
+    assert second is not None
+    for a, b in zip(first.candidates, second.candidates, strict=True):
+        assert b.misfit == pytest.approx(a.misfit, rel=1e-3)
+        for key, value in a.values.items():
+            power = {"m": 2, "k": 0}.get(key[0], 1)
+            assert b.values[key] == pytest.approx(scale**power * value, rel=0.02), key
+
+
+def test_gaps_offset_clock_and_polarity_do_not_matter() -> None:
+    record = step("PTBS200", 1e-3)
+    x = np.array(record.displacement)
+    x[np.random.default_rng(0).uniform(size=x.size) < 0.2] = np.nan
+    x[300:340] = np.nan
+    other = Record(
+        name="gaps", time=record.time + 7.0, voltage=record.voltage - 50.0, displacement=3e-5 - x
+    )
+    assert errors(start(other), values_of("PTBS200"), other)[0] < 0.05
+
+
+@slow
+def test_irregular_samples_are_put_on_a_grid() -> None:
+    values, rng = values_of("WYDS0808020"), np.random.default_rng(2)
+    time = np.sort(step_of("WYDS0808020").duration * rng.random(4000))
+    voltage: FloatArray = np.where(time > 0.05 * time[-1], 200.0, 0.0)
+    record = noisy("random", time, voltage, simulated(values, time, voltage), 1e-3)
+    assert errors(start(record), values, record)[0] < 0.06
+
+
+@pytest.mark.parametrize("between", [False, True])
+def test_coarse_samples_tell_the_slower_part(between: bool) -> None:
+    """Eight samples a period of the ringing; the jump is a ramp of one sample, or lies in it."""
+    values = values_of("PTBS200")
+    fine = step_of("PTBS200")
+    time, voltage = fine.time[::5], fine.voltage[::5]
+    ramp = simulated(values, time, voltage)
+    x = np.asarray(fine.displacement)[::5] if between else ramp
+    record = noisy("coarse", time, voltage, x, 1e-3)
+    assert errors(start(record), values, record)[0] < 0.1
+
+
+@slow
+def test_a_long_record_is_cut_to_what_is_fast_and_a_coarse_whole() -> None:
+    values = values_of("WYDS0808020")
+    time = np.linspace(0.0, 5e-3, 100_000)
+    voltage = np.where(time < 1e-4, 0.0, 200.0)
+    record = noisy("long", time, voltage, simulated(values, time, voltage), 1e-3)
+    found = start(record)
+    assert errors(found, values, record)[0] < 0.06
+    assert found is not None
+    assert set(found.records) == {"long, fastest part", "long, coarse"}
+
+
+@pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "structural_mode"]))
+def test_what_the_model_lacks_does_not_mislead(effect: str) -> None:
+    record = step("PTBS200", 1e-3, effect)
+    assert min(errors(start(record), values_of("PTBS200"), record)) < 0.15
+
+
+@pytest.mark.parametrize("seed", slow_but([1], range(4)))
+def test_stacks_of_any_speed(seed: int) -> None:
+    """Resonances from 100 Hz to 300 kHz, light to heavy damping, k_P/k_B from 1.5 to 12."""
+    values = random_stack(np.random.default_rng(seed))
+    time, voltage = step_voltage(values)
+    record = noisy("step", time, voltage, simulated(values, time, voltage), 1e-3)
+    assert min(errors(start(record), values, record)) < 0.1
+
+
+@pytest.mark.parametrize("ratio", slow_but([0.6], [1.0, 0.6]))
+def test_a_zero_in_the_band_tells_the_stiffness_ratio(ratio: float) -> None:
+    """Ringing wafers, overdamped bonding layers: b of eq. (11) is far from both a_P and a_B."""
+    values = {**values_of("PTBS200"), "tau": 2e-5, "R_s": 5.0}
+    values["k_P"] = ratio * values["k_B"]
+    for part, omega, damping in (("P", 2e5, 0.05), ("B", 1e5, 1.2)):
+        k = values[f"k_{part}"]
+        values |= {f"m_{part}": k / omega**2, f"c_{part}": 2.0 * damping * k / omega}
+    time, voltage = step_voltage(values)
+    record = noisy("step", time, voltage, simulated(values, time, voltage), 5e-4)
+    found = start(record)
+    assert found is not None
+    k_B = starting_model([record]).values["k_B"]
+    told = [c.values["k_P"] / k_B for c in found.candidates if "k_P" in c.told]
+    assert told
+    assert min(abs(np.log(t / ratio)) for t in told) < 0.5
+
+
+def random_stack(rng: np.random.Generator) -> dict[str, float]:
+    def between(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    slow = 2.0 * np.pi * between(100.0, 3e5)
+    values = {**values_of("PTBS200"), "k_B": between(1e6, 5e8)}
+    values["k_P"] = values["k_B"] * between(1.5, 12.0)
+    for part, omega in (("P", slow * between(1.0, 4.0)), ("B", slow)):
+        k, damping = values[f"k_{part}"], between(0.02, 2.0)
+        values |= {f"m_{part}": k / omega**2, f"c_{part}": 2.0 * damping * k / omega}
+    values["tau"] = max(between(0.1, 10.0) / slow, 1e-7)
+    values["R_s"] = between(0.05, 5.0) / (slow * values["C_p"])
+    return values

@@ -1,0 +1,168 @@
+"""The search: exchanges, interruption, records of different kinds at once, what it warns of."""
+
+import threading
+import time
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi.identification.fitting import fit as fitting
+from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.refitting import exchanges
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.notes import texts
+from psa_casadi.records import Record
+from tests.studies.benchmarks.coverage import one_run
+from tests.studies.benchmarks.records import clean_loops, with_noise
+from tests.tiers import slow
+
+FloatArray = NDArray[np.float64]
+
+pytestmark = pytest.mark.xdist_group("search")
+
+
+def truth(name: str) -> dict[str, float]:
+    return {key: figure.value for key, figure in STACKS[name].values.items()}
+
+
+@slow
+def test_a_stack_is_found_from_its_records_alone() -> None:
+    """Step, loops and multisine of the reference with 0.1 % noise; no start is given."""
+    run = one_run("PTBS200", 3)
+    assert run.converged
+    assert run.rms_ratio == pytest.approx(1.0, abs=0.05)
+    assert all(run.white)
+    told = {f.name: f for f in run.found if f.determined}
+    assert {"k_L", "A", "beta", "gamma", "delta", "n"} <= set(told)
+    for name_of, limit in {"k_L": 0.01, "A": 0.01, "n": 0.05, "beta": 0.05}.items():
+        assert told[name_of].relative < limit, name_of
+    assert sum(not f.covered for f in told.values()) <= 2
+    assert all(abs(f.value - f.truth) < 4.5 * f.error for f in told.values())
+
+
+def test_exchanging_twice_changes_nothing() -> None:
+    p = truth("P-885.51")
+    again = {}
+    for what, values in exchanges(p):
+        moved = {**p, **values}
+        again[what] = {**moved, **dict(exchanges(moved)).get(what, {})}
+    assert len(again) == 6  # two lags and two overdamped oscillators
+    for what in ("drive lag and creep lag", "wafers and bonding layers"):
+        for name, value in p.items():
+            assert again[what][name] == pytest.approx(value, rel=1e-12), name
+    assert len(list(exchanges(truth("PTBS200")))) == 2  # a ringing oscillator is no lag
+    single = {k: v for k, v in p.items() if k not in ("k_P", "k_B")}
+    assert [what for what, _ in exchanges(single)] == ["drive lag and creep lag"]
+
+
+def _response(p: dict[str, float], frequency: FloatArray) -> FloatArray:
+    """Displacement over force of creep lag, wafers and bonding layers, real and imaginary [m/N]."""
+    s = 2j * np.pi * frequency
+    parts = [1.0 / (p[f"k_{q}"] + p[f"c_{q}"] * s + p[f"m_{q}"] * s**2) for q in "PB"]
+    both = (parts[0] + parts[1]) / (1.0 + p["tau"] * s)
+    return np.concatenate([both.real, both.imag])
+
+
+@pytest.mark.parametrize(("part", "other"), ["PB", "BP"])
+def test_a_slow_pole_beside_a_cancelled_zero_may_be_the_creep_lag(part: str, other: str) -> None:
+    """With a creep lag that cancels the zero, the oscillator's slow pole is all that is seen."""
+    p = truth("demo")
+    p |= {f"k_{part}": 3e8, f"c_{part}": 1e-3 * 3e8, f"m_{part}": 0.1, f"k_{other}": 5e7}
+    slow, what = {**p, "tau": 1e-3 * 3e8 / 3.5e8}, {"P": "wafers", "B": "bonding layers"}[part]
+    found = dict(exchanges(slow))[f"creep lag for the slow pole of the {what}"]
+    moved = {**slow, **found}
+    seen, f = _response(slow, np.zeros(1))[0], np.geomspace(1.0, 2e3, 50)
+    np.testing.assert_allclose(_response(moved, f), _response(slow, f), rtol=0, atol=0.02 * seen)
+    assert moved["tau"] == pytest.approx(1e-3)
+    apart = {**slow, "tau": 1.2 * slow["tau"]}
+    assert not [w for w, _ in exchanges(apart) if "slow pole" in w]
+
+
+@cache
+def loops() -> list[Record]:
+    return with_noise(clean_loops(truth("P-885.51"))[2:4], 1e-3, seed=4)
+
+
+@pytest.fixture(scope="module")
+def found() -> Identification:
+    return identify(loops())
+
+
+def test_every_record_has_its_own_noise_level() -> None:
+    quiet, loud = with_noise(loops()[:1], 2e-3, 1)[0], loops()[1]
+    found = identify([quiet, loud])
+    first, second = (
+        float(np.std(found.fit.residuals[found.fit.of_record(found.experiments, r)]))
+        for r in (0, 1)
+    )
+    assert first > 1.5 * second
+    assert found.fit.sigma == pytest.approx((first, second), rel=0.1)
+
+
+def test_what_loops_leave_open_is_told_in_words(found: Identification) -> None:
+    assert found.fit.converged
+    lags = {"tau", "R_s", "c_P", "c_B"}
+    assert lags & set(found.determinacy.undetermined)
+    assert any("determined by these records" in w for w in found.warnings)
+    assert any(lags & set(c.parameters) for c in found.combinations)
+    assert any("step" in a.sentence or "multisine" in a.sentence for a in found.advice)
+    assert any(s.agrees for s in found.starts)
+
+
+def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    objective, count = fitting.Objective, [0]
+
+    def interrupted(*arguments):  # type: ignore[no-untyped-def]
+        evaluate = objective(*arguments)
+
+        def wrapped(theta):  # type: ignore[no-untyped-def]
+            count[0] += 1
+            if count[0] == 8:
+                raise KeyboardInterrupt
+            return evaluate(theta)
+
+        return wrapped
+
+    monkeypatch.setattr(fitting, "Objective", interrupted)
+    begin = time.perf_counter()
+    found = identify(loops()[:1])
+    assert count[0] == 8  # nothing was evaluated after the interrupt
+    assert found.fit.interrupted
+    assert not found.fit.converged
+    assert found.warnings[0].startswith("The search was interrupted")
+    assert found.fit.rms < 0.2 * loops()[0].range_m
+    assert time.perf_counter() - begin < 60.0
+    assert threading.active_count() < 20
+
+
+def test_drop_outs_and_outliers_do_not_move_the_fit(found: Identification) -> None:
+    spoiled = []
+    for k, r in enumerate(loops()):
+        y = np.array(r.displacement)
+        draw = np.random.default_rng(k)
+        y[100 + draw.choice(r.n - 200, 12, replace=False)] += 0.2 * r.range_m
+        y[300:340] = y[300]
+        spoiled.append(replace(r, displacement=y))
+    again = identify(spoiled)
+    assert any("masked" in s for s in again.sentences)
+    for name in ("k_L", "A", "n"):
+        error = found.determinacy.standard_errors[name]
+        assert abs(again.model.values[name] - found.model.values[name]) < 3.0 * error
+    assert again.fit.rms == pytest.approx(found.fit.rms, rel=0.05)
+
+
+def test_oversampled_records_are_averaged_and_say_so() -> None:
+    t: FloatArray = 2.5e-6 * np.arange(400_000.0)
+    v: FloatArray = 50.0 * (1.0 - np.cos(2 * np.pi * t))
+    y: FloatArray = 1e-7 * v + 1e-9 * np.random.default_rng(1).standard_normal(t.size)
+    shorter, notes = prepared(Record(name="fast", time=t, voltage=v, displacement=y))
+    factor = t.size // shorter.n
+    assert factor >= 8
+    assert f"averaged in blocks of {factor}" in texts(notes)[-1]
+    assert float(np.std(np.asarray(shorter.displacement) - 1e-7 * shorter.voltage)) == (
+        pytest.approx(1e-9 / np.sqrt(factor), rel=0.1)
+    )

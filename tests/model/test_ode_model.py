@@ -1,0 +1,209 @@
+"""Any CasADi ODE as a model: against scipy, in fmpy, in rumoca, and what is refused in words."""
+
+import math
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from fmpy import read_model_description, simulate_fmu
+from scipy.integrate import solve_ivp
+
+import psa_casadi as psa
+from psa_casadi.examples.van_der_pol import model as van_der_pol
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.modelica.package import modelica_text
+from tests.export.modelica_runs import load, simulated
+
+SPAN, MU = 10.0, 3.0
+_FOLDER = tempfile.TemporaryDirectory()
+
+
+def _oscillation(times: Any) -> Any:
+    """Return the position (n,) of the oscillator with mu = MU, by scipy and by hand."""
+    found = solve_ivp(
+        lambda _, z: [z[1], MU * (1.0 - z[0] ** 2) * z[1] - z[0]],
+        (0.0, SPAN), [2.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-12, t_eval=times,
+    )  # fmt: skip
+    assert found.success
+    return found.y[0]
+
+
+@cache
+def _oscillator(fmi: int) -> Path:
+    return psa.export_fmu(van_der_pol(), Path(_FOLDER.name) / f"oscillator{fmi}.fmu", fmi=fmi)
+
+
+@pytest.mark.parametrize(
+    ("fmi", "kind"), [(3, "CoSimulation"), pytest.param(2, "ModelExchange", marks=pytest.mark.slow)]
+)
+def test_the_oscillator_runs_in_fmpy(fmi: int, kind: str) -> None:
+    fmu = _oscillator(fmi)
+    assert read_model_description(str(fmu)).fmiVersion.startswith(str(fmi))
+    found = simulate_fmu(
+        str(fmu), fmi_type=kind, stop_time=SPAN, output_interval=0.05, relative_tolerance=1e-10,
+        start_values={"mu": MU}, output=["position"],
+    )  # fmt: skip
+    assert len(found) > 190
+    assert found["position"] == pytest.approx(_oscillation(found["time"]), abs=1e-6)
+
+
+def test_the_oscillator_runs_in_a_modelica_compiler() -> None:
+    text = modelica_text(van_der_pol().with_values({"mu": MU}), name="VanDerPol")
+    harness = "model Harness VanDerPol.Signal device; end Harness;"
+    found = simulated(text + harness, "Harness", SPAN)
+    expected = _oscillation(found["time"])
+    assert found["device.position"] == pytest.approx(expected, abs=1e-6)
+    assert load(text, "VanDerPol.Examples.Free") is not None
+
+
+def _heated() -> psa.Model:
+    """A rod that a current heats, in a room whose temperature swings by the day of 60 s."""
+    T, T2 = ca.MX.sym("T"), ca.MX.sym("T2")
+    u, p, t = ca.MX.sym("u"), ca.MX.sym("p", 3), ca.MX.sym("t")
+    room = p[2] * ca.sin(2 * math.pi * t / 60.0)
+    ode = ca.vertcat((p[0] * u**2 - (T - T2)) / p[1], ((T - T2) - (T2 - room)) / p[1])
+    return psa.ode_model(
+        {"t": t, "x": ca.vertcat(T, T2), "u": u, "p": p, "ode": ode, "y": [T - room, u * T]},
+        name="rod",
+        states=[psa.State("T", "K", "inner", 10.0, 1.0), psa.State("T2", "K", "outer", 10.0)],
+        inputs=[psa.Input("current", "A", "heats the rod", nominal=2.0, display_unit="mA")],
+        parameters=[
+            psa.Parameter("R", 2.0, "K/A", (0.0, 100.0), "heating"),
+            "lag",
+            psa.Parameter("swing", 3.0, "K", (0.0, 50.0), "swing of the room"),
+        ],
+        outputs=["above_room", psa.Output("heat", "A.K", "a product", 20.0)],
+        values={"lag": 4.0, "R": 2.5},
+    )
+
+
+def _heated_rates(t: float, z: Any, u: float) -> list[float]:
+    room = 3.0 * math.sin(2 * math.pi * t / 60.0)
+    return [(2.5 * u**2 - (z[0] - z[1])) / 4.0, ((z[0] - z[1]) - (z[1] - room)) / 4.0]
+
+
+def test_inputs_outputs_parameters_and_time_against_scipy(tmp_path: Path) -> None:
+    model = _heated()
+    assert model.values == {"R": 2.5, "lag": 4.0, "swing": 3.0}
+    expected = solve_ivp(
+        lambda t, z: _heated_rates(t, z, 2.0), (0.0, 30.0), [1.0, 0.0], method="DOP853",
+        rtol=1e-12, atol=1e-12, t_eval=np.linspace(0.0, 30.0, 61),
+    )  # fmt: skip
+    room = 3.0 * np.sin(2 * math.pi * expected.t / 60.0)
+    above, product = expected.y[0] - room, 2.0 * expected.y[0]
+    own = psa.run(model, expected.t, np.full((61, 1), 2.0), np.array([1.0, 0.0]), rtol=1e-10)
+    assert own.y == pytest.approx(np.column_stack([above, product]), abs=1e-7)
+    fmu = psa.export_fmu(model, tmp_path / "rod.fmu")
+    ends = np.array([(0.0, 2.0), (30.0, 2.0)], dtype=[("time", float), ("current", float)])
+    found = simulate_fmu(
+        str(fmu), fmi_type="CoSimulation", stop_time=30.0, output_interval=0.5, input=ends,
+        relative_tolerance=1e-9, output=["above_room", "heat"],
+    )  # fmt: skip
+    assert found["above_room"] == pytest.approx(above, abs=1e-6)
+    assert found["heat"] == pytest.approx(product, abs=1e-6)
+    described = {v.name: v for v in read_model_description(str(fmu)).modelVariables}
+    assert (described["current"].unit, described["heat"].unit) == ("A", "A.K")
+    assert (described["T"].start, described["lag"].start) == ("1.0", "4.0")
+
+
+def test_a_function_of_casadi_is_an_ode_too() -> None:
+    x, u, k = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("k")
+    rates = ca.vertcat(x[1], u - k * x[0])
+    given = ca.Function("given", [x, u, k], [rates], ["x", "u", "p"], ["xdot"])
+    model = psa.ode_model(given, name="spring", parameters=["k"], values={"k": 4.0})
+    assert model.state_names == ("x_0", "x_1")
+    assert model.output_names == ("x_0_out", "x_1_out")
+    assert model.input_names == ("u",)
+    t = np.linspace(0.0, 2.0, 21)
+    steps = psa.run(model, t, np.full((21, 1), 2.0), np.zeros(2), rtol=1e-10)
+    assert steps.y[:, 0] == pytest.approx(0.5 * (1.0 - np.cos(2.0 * t)), abs=1e-8)
+
+
+def test_a_kink_that_is_named_is_met_with_care_and_is_an_event_of_the_fmu() -> None:
+    """x' = |sin 3t| for 3 s: a solver that looks for the kinks errs by less than half."""
+    x, t = ca.SX.sym("x"), ca.SX.sym("t")
+    ode = {"t": t, "x": x, "ode": ca.fabs(ca.sin(3.0 * t))}
+    blind, aware = (
+        psa.ode_model(given, name=name)
+        for given, name in ((ode, "blind"), ({**ode, "zero": ca.sin(3.0 * t)}, "aware"))
+    )
+    turns = int(9.0 / math.pi)
+    expected = (2.0 * turns + 1.0 - math.cos(9.0 - turns * math.pi)) / 3.0
+    rough, fine = (
+        abs(psa.run(m, np.array([0.0, 3.0]), np.zeros((2, 0)), np.zeros(1)).y[-1, 0] - expected)
+        for m in (blind, aware)
+    )
+    assert fine < min(0.5 * rough, 1e-4)
+    assert [v.name for v in variable_table(aware) if v.kind == "indicator"] == ["switch.kink"]
+    assert not [v for v in variable_table(blind) if v.kind == "indicator"]
+
+
+X, K = ca.SX.sym("x"), ca.SX.sym("k")
+BALANCE = ca.SX.sym("displacement")
+
+
+def _solved() -> dict[str, Any]:
+    u, q = ca.MX.sym("u"), ca.MX.sym("q")
+    root = ca.rootfinder("root", "newton", {"x": q, "p": u, "g": q**3 + q - u})
+    return {"x": u, "ode": root(x0=0.0, p=u)["x"]}
+
+
+#: What is wrong, what is given, words of the sentence.
+WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
+    "unknown symbol": (lambda: {"x": X, "ode": K * X}, {}, "'ode' uses the symbol 'k'"),
+    "unknown symbol in y": (lambda: {"x": X, "ode": X, "y": K}, {}, "'y' uses the symbol 'k'"),
+    "rows": (lambda: {"x": X, "ode": ca.vertcat(X, X)}, {}, "'x' has 1 row and 'ode' 2 rows"),
+    "matrix": (lambda: {"x": X, "ode": X, "y": ca.SX(2, 2) + X}, {}, "'y' is 2 by 2"),
+    "both kinds": (lambda: {"x": X, "p": ca.MX.sym("k"), "ode": X}, {}, "mixes SX and MX"),
+    "symbol twice": (lambda: {"x": X, "p": X, "ode": X}, {}, "'x' stands 2 times in x and p"),
+    "two symbols of one name": (
+        lambda: {"x": X, "p": ca.SX.sym("x"), "ode": X}, {}, "a name of its own"),
+    "expression for a symbol": (lambda: {"x": 2 * X, "ode": X}, {}, "must be symbols"),
+    "two times": (lambda: {"x": X, "t": ca.SX.sym("t", 2), "ode": X}, {}, "time is one symbol"),
+    "algebraic": (lambda: {"x": X, "z": K, "alg": K, "ode": X}, {}, "algebraic equations"),
+    "unknown word": (lambda: {"x": X, "ode": X, "rhs": X}, {}, "'rhs', which is not known"),
+    "no states": (lambda: {"ode": X}, {}, "lacks 'x'"),
+    "no mapping": (lambda: [X], {}, "give a mapping"),
+    "no expression": (lambda: {"x": X, "ode": "k*x"}, {}, "no SX expression"),
+    "no formula": (_solved, {}, "no elementary function"),
+    "too many names": (lambda: {"x": X, "ode": X}, {"states": ["a", "b"]}, "2 of the states"),
+    "no name": (lambda: {"x": X, "ode": X}, {"states": [3]}, "give a State or a name"),
+    "no number": (lambda: {"x": X, "p": K, "ode": X}, {}, "'k' has no number"),
+    "no such parameter": (
+        lambda: {"x": X, "ode": X}, {"values": {"k": 1.0}}, "'k', which is no parameter"),
+    "out of bounds": (
+        lambda: {"x": X, "p": K, "ode": X},
+        {"parameters": [psa.Parameter("k", 2.0, "1", (0.0, 1.0), "k")]}, "outside its bounds"),
+    "reserved": (lambda: {"x": BALANCE, "ode": BALANCE}, {}, "choose another name"),
+    "velocity": (
+        lambda: {"x": X, "ode": X, "y": X}, {"outputs": ["velocity"]}, "named 'velocity'"),
+    "name clash": (
+        lambda: {"x": X, "ode": X, "y": X}, {"outputs": ["x"]}, "Two variables are named 'x'"),
+    "not an identifier": (lambda: {"x": X, "ode": X}, {"states": ["x 1"]}, "cannot name a var"),
+    "model name": (lambda: {"x": X, "ode": X}, {"name": "1st"}, "'1st' cannot name a model"),
+    "unit": (
+        lambda: {"x": X, "ode": X}, {"states": [psa.State("x", "furlang", "", 1.0)]},
+        "unit 'furlang'"),
+    "not finite": (
+        lambda: {"x": X, "ode": X}, {"states": [psa.State("x", "m", "", 1.0, math.nan)]},
+        "not finite"),
+    "foreign size": (
+        lambda: {"x": X, "ode": X}, {"states": [psa.State("x", "m", "", lambda v: v["stroke"])]},
+        "parameter 'stroke'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_said_in_a_sentence(what: str) -> None:
+    given, words, sentence = WRONG[what]
+    with pytest.raises(psa.InputError) as caught:
+        psa.ode_model(given(), **{"name": "model", **words})
+    assert sentence in str(caught.value)
+    for problem in caught.value.problems:
+        assert problem.endswith(".")
+        assert len(problem) > 30

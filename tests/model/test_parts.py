@@ -1,0 +1,259 @@
+"""The parts around a stack, against formulas, the reference and plain recursions.
+
+And each as FMU 2 and 3 and in Modelica, by Python and by name.
+"""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from typer.testing import CliRunner
+
+from psa_casadi import reference
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.model.compose import Model
+from psa_casadi.model.nanopositioner import nanopositioner
+from psa_casadi.model.parts import PARTS, compensator_for, part_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.model.system import connect
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import nominal_value
+from tests.export.modelica_runs import simulated
+from tests.studies.benchmarks.nonlinearity import Controller, simulate_positioner
+from tests.tiers import slow
+
+FloatArray = NDArray[np.float64]
+
+STACK = "P-885.51"
+VALUES = {name: figure.value for name, figure in STACKS[STACK].values.items()}
+
+
+def _driven(model: Model, t: FloatArray, **inputs: FloatArray) -> dict[str, FloatArray]:
+    """Return outputs and states of a run from rest."""
+    u = np.column_stack([np.broadcast_to(inputs.get(n, 0.0), t.shape) for n in model.input_names])
+    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
+    states = dict(zip(model.state_names, steps.x.T, strict=True))
+    return states | dict(zip(model.output_names, steps.y.T, strict=True))
+
+
+def _smooth(t: FloatArray, values: FloatArray) -> Callable[[float], float]:
+    """Return a smooth curve through samples."""
+    spline = CubicSpline(t, values)
+    return lambda time: float(spline(time))
+
+
+def _line_deviation(x: FloatArray, y: FloatArray) -> float:
+    """Return the largest distance from the best line, over the range."""
+    basis = np.column_stack([x, np.ones_like(x)])
+    left = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+    return float(np.abs(left).max() / np.ptp(y))
+
+
+def _two_periods(frequency: float) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return times, a sine from 0 to 1 that starts at rest, and which samples are the second."""
+    t = np.linspace(0.0, 2.0 / frequency, 801)
+    return t, 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * t)), t >= 1.0 / frequency
+
+
+def test_the_compensator_makes_the_reference_linear() -> None:
+    """At 0.2 Hz, where lags do not count: below 0.02 % of the range, from more than 3 %."""
+    t, wave, last = _two_periods(0.2)
+    compensator = compensator_for(stack_model(STACK))
+    compensated = _driven(compensator, t, command=80.0 * wave)["compensated_command"]
+    deviations = []
+    for voltage in (80.0 * wave, compensated):
+        plant = reference.simulate(VALUES, _smooth(t, voltage), t, rtol=1e-7)
+        deviations.append(_line_deviation(wave[last], plant.displacement[last]))
+    assert deviations[0] > 0.03
+    assert deviations[1] < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("effect", "gain"),
+    [
+        pytest.param("hysteresis_memory", 2.5, marks=slow),
+        ("field_dependent_gain", 0.1),
+        pytest.param("saturation_of_strain", 0.3, marks=slow),
+    ],
+)
+def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gain: float) -> None:
+    """The force behind the lag follows the command; without the effect it does not."""
+    component = EFFECTS[effect]
+    plain = stack_model(STACK).plant()
+    stack = plain.with_effect(component, {str(component.gain): gain})
+    t, wave, last = _two_periods(20.0)
+    errors = []
+    for known in (stack, plain):
+        wires = (("compensator.compensated_command", "stack.voltage"),)
+        model = connect({"compensator": compensator_for(known), "stack": stack}, wires, name="m")
+        found = _driven(model, t, compensator_command=80.0 * wave)
+        lag = stack.values["tau"] + stack.values["R_s"] * stack.values["C_p"]
+        late = 40.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * (t - lag)))
+        ideal = stack.values["k_L"] * late
+        errors.append(np.abs(found["stack_f_out"] - ideal)[last].max() / np.ptp(ideal))
+    assert errors[0] < 1e-3
+    assert errors[1] > 1e-2
+
+
+def test_the_voltage_amplifier_has_bandwidth_range_and_slew_rate() -> None:
+    amplifier = part_model("voltage_amplifier", bandwidth=1e3)
+    t = np.linspace(0.0, 2e-3, 401)
+    small = _driven(amplifier, t, command=np.full_like(t, 1e-3))["output_voltage"]
+    np.testing.assert_allclose(small, 1e-2 * (1.0 - np.exp(-2e3 * np.pi * t)), atol=1e-8)
+    beyond = _driven(amplifier, t, command=np.full_like(t, 30.0))["output_voltage"]
+    assert beyond.max() <= 120.0 + 1e-6
+    assert beyond[-1] == pytest.approx(120.0, abs=1e-3)
+    slow = part_model("voltage_amplifier", bandwidth=1e5, current_limit=0.05)
+    found = _driven(slow, t, command=np.full_like(t, 10.0))
+    slew = 0.05 / 1.5e-6
+    assert found["load_current"].max() <= 0.05
+    middle = (found["output_voltage"] > 10.0) & (found["output_voltage"] < 80.0)
+    rate = np.polyfit(t[middle], found["output_voltage"][middle], 1)[0]
+    assert rate == pytest.approx(slew, rel=1e-3)
+
+
+def _charge_drive(**values: float) -> Model:
+    wires = (
+        ("amplifier.output_voltage", "stack.voltage"),
+        ("stack.charge", "amplifier.load_charge"),
+    )
+    parts = {"amplifier": part_model("charge_amplifier", **values),
+             "stack": stack_model(STACK).plant()}  # fmt: skip
+    return connect(parts, wires, name="charge_drive")
+
+
+def test_the_charge_amplifier_sets_voltage_below_its_corner_and_charge_above() -> None:
+    """Gain and phase of v over the command, against the circuit's transfer function."""
+    C_s, C, tau, ratio, bandwidth = 12e-6, 1.5e-6, 0.1, 10.0, 3e3
+    model = _charge_drive(sense_capacitance=C_s, leak_time=tau, gain=ratio)
+    for frequency in (0.2, 1.6, 30.0):
+        t = np.linspace(0.0, 4.0 / frequency + 1.0, 8001)
+        s = 2j * np.pi * frequency
+        wave = 1e-3 * np.sin(2.0 * np.pi * frequency * t)
+        v = _driven(model, t, amplifier_command=wave)["amplifier_output_voltage"]
+        late = t >= t[-1] - 1.0 / frequency
+        basis = np.column_stack([np.sin(abs(s) * t), np.cos(abs(s) * t)])[late]
+        in_phase, quadrature = np.linalg.lstsq(basis, v[late], rcond=None)[0]
+        # q_s = (s q + C_s v / (ratio tau)) / (s + 1/tau), q = C v / (1 + s R_s C)
+        q = C / (1.0 + s * VALUES["R_s"] * C)
+        sensed = (s * q + C_s / (ratio * tau)) / (s + 1.0 / tau)
+        loop = 2.0 * np.pi * bandwidth * (C_s / C) / s
+        expected = loop / (1.0 + loop * sensed / C_s)
+        assert abs(1e3 * (in_phase + 1j * quadrature) - expected) < 2e-3 * abs(expected)
+
+
+def _closed_on(model: Model, reference_m: Callable[[float], float], count: int) -> FloatArray:
+    """Return the commands of a controller whose plant is a fixed gain of 1 um/V, by the model."""
+    names = model.state_names, model.sampled_names
+    T, z = model.values["sample_time"], np.zeros(len(names[1]))
+    commands = []
+    position = 0.0
+    for k in range(count):
+        p = model.parameter_vector()
+        inputs = [reference_m(k * T), 0.0]
+        z = np.array(model.structure.g(k * T, [position], inputs, p, z)).ravel()
+        commands.append(z[names[1].index("held_command")])
+        position = 1e-6 * commands[-1]
+    return np.array(commands)
+
+
+def test_the_controller_is_the_recursion_of_a_textbook() -> None:
+    """Notch, PI, feed-forward, saturation and anti-windup against a plain recursion."""
+    model = part_model(
+        "position_controller", proportional_gain=2e5, integral_gain=4e8, feed_forward=1e5,
+        notch_floor=0.1, notch_width=0.7,
+    )  # fmt: skip
+
+    def wanted(t: float) -> float:
+        return 20e-6 if t < 3e-3 else -15e-6 * math.sin(3e3 * t)
+
+    plain, position, expected = Controller(model.values), 0.0, []
+    for k in range(200):
+        expected.append(plain(wanted(k * 5e-5), position))
+        position = 1e-6 * expected[-1]
+    found = _closed_on(model, wanted, 200)
+    assert found.max() == 12.0
+    assert found.min() == -2.0
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_the_plain_loop_has_the_reference_s_stack() -> None:
+    """With a stage that does not push back, the benchmark's stack moves as the reference's does."""
+    system = nanopositioner(compensated=False)
+    values = {n: dict(m.values) for n, m in system.parts.items()}
+    values["flexure"] |= {"k_c": 1e-3, "c_c": 0.0}
+    values["amplifier"]["bandwidth"] = 2e3
+    values["controller"] |= {"proportional_gain": 0.0, "integral_gain": 0.0, "feed_forward": 1e6}
+    found = simulate_positioner(
+        values, lambda t: 3e-6 * (1.0 - math.cos(400.0 * math.pi * t)), 0.005, 1e-5
+    )
+    voltage = _smooth(found.time, found.voltage)
+    plant = reference.simulate(VALUES, voltage, found.time, rtol=1e-8)
+    assert np.ptp(plant.displacement) > 5e-6
+    np.testing.assert_allclose(found.tip, plant.displacement, atol=1e-4 * np.ptp(found.tip))
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: part_model("voltage"), "voltage_amplifier"),
+        (lambda: part_model("voltage_amplifier", speed=1.0), "no parameter 'speed'"),
+        (lambda: compensator_for(part_model("flexure_stage")), "no drive, linear_force, bouc_wen"),
+    ],
+)
+def test_what_is_no_part_of_a_stack_is_refused(made: Callable[[], Model], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        made()
+
+
+@slow
+@pytest.mark.usefixtures("code_runs_here")
+@pytest.mark.parametrize(("name", "fmi"), [(n, 2 + k % 2) for k, n in enumerate(PARTS)])
+def test_a_part_passes_the_check_as_an_fmu(name: str, fmi: int, tmp_path: Path) -> None:
+    path = export_fmu(part_model(name), tmp_path / f"{name}.fmu", fmi=fmi)
+    report = check_fmu(path, part_model(name))
+    assert report.passed, report
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_is_the_same_in_modelica(name: str) -> None:
+    """The first input is a sine of half its usual size, the others rest; all outputs."""
+    model = part_model(name)
+    text = modelica_text(model, name="Part")
+    first, *others = model.structure.inputs
+    peak = 0.5 * nominal_value(first.nominal, model.values)
+    span, omega = 2e-3, 2.0 * math.pi * 1e3
+    rest = "".join(f", {i.name}={i.start!r}" for i in others)
+    harness = (
+        f"model Harness Part.Signal part({first.name}={peak!r}*(1 - cos({omega!r}*time)){rest});"
+        " end Harness;"
+    )
+    got = simulated(text + harness, "Harness", span)
+    t = np.linspace(0.0, span, 4001)
+    u = np.tile([i.start for i in model.structure.inputs], (len(t), 1))
+    u[:, 0] = peak * (1.0 - np.cos(omega * t))
+    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
+    names = (*model.state_names, *model.output_names)
+    between = slice(40, None, 100)  # between two sample instants, where rumoca has points
+    for variable, wanted in zip(names, np.hstack([steps.x, steps.y]).T, strict=True):
+        at = np.interp(t[between], got["time"], got[f"part.{variable}"])
+        error = np.abs(at - wanted[between]).max()
+        assert error < 1e-4 * max(np.ptp(wanted), 1e-12), variable
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_is_exported_by_its_name(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "part.mo"
+    result = CliRunner().invoke(app, ["export", "modelica", "--part", name, "-o", str(path)])
+    assert result.exit_code == 0, result.stderr
+    assert path.read_text(encoding="utf-8") == modelica_text(part_model(name))
+    assert f"inside: {', '.join(PARTS[name].components)}" in result.stdout

@@ -1,0 +1,167 @@
+"""The reference against solutions that need no integrator: matrix exponentials and closed forms."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from psa_casadi.errors import InputError
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.reference import Trajectory, from_samples, simulate
+from tests.model.stack_models import PAPER_STACKS
+
+FloatArray = NDArray[np.float64]
+
+LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
+SINGLE = {"m": 7e-3, "c": 90.0, "k": 9.6e7}
+
+
+def values(name: str = "PTBS200", **changes: float) -> dict[str, float]:
+    return {key: figure.value for key, figure in STACKS[name].values.items()} | changes
+
+
+def linear_step(
+    p: dict[str, float], v: float, load: float, times: FloatArray, start: FloatArray
+) -> FloatArray:
+    """Return (u, f_out, y, y', x, x') at `times` without hysteresis, for constant v and load.
+
+    z' = a z + b has the solution z = z_e + e^(a t) (z_0 - z_e) with a z_e = -b.
+    """
+    rc, m_P, m_B = p["R_s"] * p["C_p"], p["m_P"], p["m_B"]
+    a = np.zeros((6, 6))
+    a[0, 0] = -1 / rc
+    a[1, :2] = p["k_L"] / p["tau"], -1 / p["tau"]
+    a[2, 3] = a[4, 5] = 1.0
+    a[3, 1:4] = 1 / m_P, -p["k_P"] / m_P, -p["c_P"] / m_P
+    a[5, 2:] = (p["k_P"] + p["k_B"], p["c_P"] + p["c_B"], -p["k_B"], -p["c_B"])
+    a[5] /= m_B
+    b = np.array([p["G"] * v / rc, 0.0, 0.0, 0.0, 0.0, load / m_B])
+    end = -np.linalg.solve(a, b)
+    return np.stack([end + expm(a * t) @ (start - end) for t in times])
+
+
+def triangle(low: float, high: float, period: float) -> Callable[[float], float]:
+    """Return a triangle that starts at `low`, with kinks at every half period."""
+    return lambda t: low + (high - low) * (1.0 - abs(2.0 * ((t / period) % 1.0) - 1.0))
+
+
+def loop_width(trajectory: Trajectory, period: float) -> float:
+    """Return falling minus rising f_H at mid voltage in the last full period [N]."""
+    end = trajectory.times[-1]
+    turn = trajectory.times > end - period / 2
+    last = trajectory.times > end - period
+    u, f_H = trajectory.states["u"], trajectory.states["f_H"]
+    rising, falling = last & ~turn, turn
+    middle = float(np.mean([u.min(), u.max()]))
+    up = np.interp(middle, u[rising], f_H[rising])
+    down = np.interp(-middle, -u[falling], f_H[falling])
+    return float(down - up)
+
+
+@pytest.mark.parametrize("stack", sorted(STACKS))
+def test_linear_step_response_is_the_matrix_exponential(stack: str) -> None:
+    p = values(stack) | LINEAR
+    times = np.linspace(0.0, 3e-3, 601)
+    response = simulate(p, lambda _: 100.0, times)
+    truth = linear_step(p, 100.0, 0.0, times, np.zeros(6))
+    for column, name in enumerate(("u", "f_out", "y", "v_y", "x", "v_x")):
+        size = np.abs(truth[:, column]).max()
+        np.testing.assert_allclose(
+            response.states[name], truth[:, column], rtol=0, atol=6e-8 * size, err_msg=name
+        )
+    assert not response.states["f_H"].any()
+
+
+def test_jumps_and_load_enter_between_breakpoints() -> None:
+    p = values() | LINEAR
+    times = np.linspace(0.0, 4e-3, 801)
+    response = simulate(
+        p,
+        lambda t: 100.0 if t < 1e-3 else -30.0,
+        times,
+        load_force=lambda t: 0.0 if t < 2e-3 else 200.0,
+        breakpoints=(1e-3, 2e-3),
+    )
+    state = np.zeros(6)
+    for begin, v, load in ((0, 100.0, 0.0), (200, -30.0, 0.0), (400, -30.0, 200.0)):
+        stretch = times[begin : begin + 201] - times[begin]
+        truth = linear_step(p, v, load, stretch, state)
+        state = truth[-1]
+        np.testing.assert_allclose(
+            response.displacement[begin : begin + 201], truth[:, 4], rtol=0, atol=3e-13
+        )
+
+
+def test_single_mass_rings_as_its_closed_form() -> None:
+    """A light stack let go from x_0: x = x_0 e^(-s t) (cos w t + s/w sin w t)."""
+    p = values() | LINEAR | SINGLE
+    times = np.linspace(0.0, 2e-3, 401)
+    response = simulate(
+        p, lambda _: 0.0, times, initial={"x": 1e-5}, mechanics="single_mass", rtol=1e-11
+    )
+    decay = p["c"] / (2 * p["m"])
+    w = np.sqrt(p["k"] / p["m"] - decay**2)
+    truth = 1e-5 * np.exp(-decay * times) * (np.cos(w * times) + decay / w * np.sin(w * times))
+    np.testing.assert_allclose(response.displacement, truth, rtol=0, atol=1e-13)
+    assert not response.blocked_force.any()
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_monotonic_ramp_with_n_1_is_an_exponential_in_voltage(sense: float) -> None:
+    """From rest upward, f_H = h_ref A/b (1 - e^(-b u/h_ref)) with b = beta - gamma."""
+    p = values(n=1.0, delta=0.0, hold_rate=1e-6)
+    times = np.linspace(0.0, 1.0, 201)
+    response = simulate(p, lambda t: sense * 150.0 * t, times)
+    u, slope = response.states["u"], p["beta"] - p["gamma"]
+    assert abs(u[-1]) > 149.0
+    truth = -sense * p["h_ref"] * p["A"] / slope * np.expm1(-slope * np.abs(u) / p["h_ref"])
+    np.testing.assert_allclose(response.states["f_H"], truth, rtol=0, atol=1e-7 * p["h_ref"])
+
+
+def test_hold_leaves_the_hysteresis_force_at_rest() -> None:
+    p = values()
+    times = np.array([0.0, 0.099, 0.11, 0.5, 5.0])
+    ramp = from_samples(np.array([0.0, 0.1]), np.array([0.0, 150.0]))
+    f_H = simulate(p, ramp, times, breakpoints=(0.1,)).states["f_H"]
+    assert abs(f_H[2]) > 0.3 * p["h_ref"]
+    np.testing.assert_allclose(f_H[3:], f_H[2], rtol=0, atol=1e-8 * p["h_ref"])
+
+
+@pytest.mark.parametrize("stack", PAPER_STACKS)
+@pytest.mark.parametrize("share", [0.0, -0.2])
+def test_the_papers_stacks_have_their_stroke_and_loop(stack: str, share: float) -> None:
+    p = values(stack)
+    rated, period = p["u_rated"], 1.0
+    times = np.linspace(0.0, 2.0, 1001)
+    drive = triangle(share * rated, rated, period)
+    start = {"u": share * rated}
+    kinks = (0.5, 1.0, 1.5)
+    response = simulate(p, drive, times, initial=start, breakpoints=kinks, rtol=1e-7)
+    stroke = np.ptp(response.displacement[500:])
+    assert stroke == pytest.approx(18e-6 * (1.0 - share * 1.1), rel=0.03)
+    compliance = 1 / p["k_P"] + 1 / p["k_B"]
+    assert 0.08 < loop_width(response, period) * compliance / stroke < 0.15
+    assert np.abs(response.states["f_H"]).max() < 1.5 * p["h_ref"]
+
+
+def test_every_mistake_is_named_at_once() -> None:
+    p = values(C_p=-1e-6)
+    del p["beta"]
+    with pytest.raises(InputError) as caught:
+        simulate(p, lambda _: 0.0, np.array([0.0, 0.0]), initial={"z": 1.0}, rtol=1.0)
+    text = str(caught.value)
+    for word in ("beta", "C_p is -1e-06", "state 'z'", "do not increase", "rtol = 1"):
+        assert word in text
+
+
+def test_runaway_hysteresis_is_an_error_not_a_curve() -> None:
+    p = values(A=-5.0, beta=-40.0, gamma=0.0, n=2.0)
+    with pytest.raises(RuntimeError, match="check these parameters"):
+        simulate(p, lambda t: 2000.0 * t, np.array([0.0, 1.0]))
+
+
+def test_a_jump_that_is_no_breakpoint_is_an_error() -> None:
+    with pytest.raises(RuntimeError, match="name the jump as a breakpoint"):
+        simulate(values(), lambda t: 100.0 if t < 1e-3 else -30.0, np.array([0.0, 4e-3]))

@@ -1,0 +1,226 @@
+"""Columns that a person sees at once: told by their units, and never against what a name says."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from psa_casadi.records import Record, read_record
+from psa_casadi.records.read.columns import (
+    parse_columns,
+    stated_unit,
+    understood,
+)
+from tests.records.record_files import T, V, X, assert_is, offered, refused
+
+
+def table(
+    path: Path, *head: str, columns: Sequence[Any] = (T, V, X), mark: str = ",", point: str = "."
+) -> Path:
+    """Write a table; `columns` beyond the three are those that a record has no use for."""
+    rows = zip(*columns, strict=True)
+    lines = [mark.join(f"{v:.6g}".replace(".", point) for v in row) for row in rows]
+    path.write_text("\n".join([*head, *lines, ""]))
+    return path
+
+
+def is_read(record: Record, t: float = 1.0, v: float = 1.0, x: float = 1e-6) -> None:
+    """Demand the record that was written, its columns in units of these sizes."""
+    assert_is(record, t * T, v * V, x * X, 1e-5)
+
+
+def suggestion(path: Path) -> str:
+    """Return what is suggested for the file, once for all that is open; it can be parsed."""
+    line: str = offered(refused(path))["columns"]
+    assert parse_columns(line)
+    return line
+
+
+@pytest.mark.parametrize(
+    ("head", "sizes"),
+    [
+        (["Elapsed (us),PZT cmd (V),Probe (mm)"], (1e-6, 1.0, 1e-3)),
+        (["Clock (ms),U_amp (V),s (nm)"], (1e-3, 1.0, 1e-9)),
+        (["t/s,U/V,s/um"], (1.0, 1.0, 1e-6)),
+        (["Clock_ms,Drive_mV,Probe_nm"], (1e-3, 1e-3, 1e-9)),
+        (["Clock [ms],Drive [mV],Probe [nm]"], (1e-3, 1e-3, 1e-9)),
+        (["ms,mV,nm"], (1e-3, 1e-3, 1e-9)),
+        (["Seconds,Millivolts,Microns"], (1.0, 1e-3, 1e-6)),
+        (["Time,Command,Disp.", "s,V,um"], (1.0, 1.0, 1e-6)),
+        (["Time (s),Command,Disp.", "(s),(V),(um)"], (1.0, 1.0, 1e-6)),
+        (["of 12 March", "", "Clock (s),Bridge (V),Stage (um)"], (1.0, 1.0, 1e-6)),
+        (["# Clock (s),Bridge (V),Stage (um)"], (1.0, 1.0, 1e-6)),
+        (["T (s),U (V),x (um)"], (1.0, 1.0, 1e-6)),
+    ],
+)
+def test_units_tell_what_is_what(
+    head: list[str], sizes: tuple[float, float, float], tmp_path: Path
+) -> None:
+    is_read(read_record(table(tmp_path / "a.csv", *head)), *sizes)
+
+
+@pytest.mark.parametrize(
+    ("head", "monitor"),
+    [
+        ("Time (s),HV out (V),s (um),Drive Monitor/mV", 1e-3),
+        ("Time (s),PZT cmd (V),Probe (um),PZT mon (V)", None),
+        ("Time (s),Bridge (V),Probe (um),Position sensor (V)", None),
+        ("Time (s),Bridge (V),Probe (um),Setpoint (um)", None),
+        ("Time (s),Bridge (V),Probe (um),Velocity (um/s)", None),
+        ("Time (s),Bridge (V),Probe (um),T (degC)", None),
+        ("Time (s),U (V),x (um),V_min", None),
+    ],
+)
+def test_what_a_name_speaks_against_is_left_alone(
+    head: str, monitor: float | None, tmp_path: Path
+) -> None:
+    record = read_record(table(tmp_path / "a.csv", head, columns=(T, V, X, 9.0 + X)))
+    is_read(record)
+    if monitor is None:
+        assert record.monitor_voltage is None
+    else:
+        np.testing.assert_allclose(np.asarray(record.monitor_voltage), monitor * (9.0 + X))
+
+
+@pytest.mark.parametrize(
+    ("head", "line"),
+    [
+        ("t,mV,nm", "time=t:s"),
+        ("Elapsed (us),CH1,CH2", "voltage=CH1:V,displacement=CH2:um"),
+        ("CH1,Elapsed,nm", "time=Elapsed:s,voltage=CH1:V"),
+        ("t (s),U1 (V),U2 (V),Probe (um)", "voltage=U1 (V):V"),
+        ("t (s),LV (V),HV (V),Probe (um)", "voltage=HV (V):V"),
+        ("t (s),U (V),Command (V),Probe (um)", "voltage=U (V):V"),
+        ("t (s),Drive,CH2 (V),Probe (um)", "voltage=CH2 (V):V"),
+        ("t (s),HV out,Drive Monitor/mV,s (nm)", "voltage=HV out:V"),
+        ("t (s),Probe (mV),Drive (mV)", "displacement=Probe (mV):1um"),
+        ("t (s),CH1 (mV),CH2 (mV)", "voltage=CH1 (mV):mV,displacement=CH2 (mV):1um"),
+        ("t (s),CH1_V,CH2_V", "voltage=CH1_V:V,displacement=CH2_V:1um"),
+        ("t (s),U (V),Probe (um),Stage (nm)", "displacement=Probe (um):um"),
+        ("Zeit,Kanal A,Kanal B", "time=Zeit:s,voltage=Kanal A:V,displacement=Kanal B:um"),
+        ("t,U_amp,x", "time=t:s,voltage=U_amp:V,displacement=x:um"),
+    ],
+)
+def test_what_is_open_is_asked_and_never_suggested_against_a_unit(
+    head: str, line: str, tmp_path: Path
+) -> None:
+    columns = (T, V, X, X)[: head.count(",") + 1]
+    columns = (V, T, X) if head == "CH1,Elapsed,nm" else columns
+    assert suggestion(table(tmp_path / "a.csv", head, columns=columns)) == line
+
+
+@pytest.mark.parametrize(
+    ("head", "told"),
+    [
+        ("t (s),Drive Monitor (V),Probe (um)", "column 'voltage' is missing"),
+        ("t (s),Position sensor (V),Probe (um)", "column 'voltage' is missing"),
+        ("t (s),U (V),Setpoint (um)", "column 'displacement' is missing"),
+        ("t (s),U (V),um/s", "column 'displacement' is missing"),
+        ("V/um,t/s,x/um", "column 'voltage' is missing"),
+    ],
+)
+def test_nothing_is_suggested_that_is_not_meant(head: str, told: str, tmp_path: Path) -> None:
+    said = refused(table(tmp_path / "a.csv", head))
+    assert told in said
+    assert "--columns" not in said
+
+
+def test_columns_without_a_unit_have_that_of_the_name(tmp_path: Path) -> None:
+    path = table(tmp_path / "a.csv", "Elapsed (us),A_mV,B (V),C/nm,D (nm)", columns=(T, V, V, X, X))
+    is_read(read_record(path, columns="voltage=A_mV,displacement=C/nm"), 1e-6, 1e-3, 1e-9)
+    said = refused(path, columns="time=Elapsed (us):s,voltage=A_mV,displacement=C/nm")
+    assert "the header gives the unit 'us', --columns gives 's'" in said
+    archive = tmp_path / "a.npz"
+    np.savez(archive, a=T, b_mV=V, c_mV=V, x=X)
+    is_read(read_record(archive, columns="time=a,voltage=b_mV,displacement=x:um"), 1.0, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("head", "mark", "point"),
+    [
+        (["sep=;", "Clock (s);Bridge (V);Stage (um)"], ";", ","),
+        (['"sep=;"', "Time, s;Voltage, V;Stage, um"], ";", "."),
+        (["sep=|", "t [s]|u [V]|x [um]"], "|", "."),
+        (["SEP=\t", "ch0\tch1\tch2", "s\tV\tum"], "\t", ","),
+        (["sep=,", "t [s],u [V],x [um]"], ",", "."),
+    ],
+)
+def test_excels_first_line_says_what_separates_the_cells(
+    head: list[str], mark: str, point: str, tmp_path: Path
+) -> None:
+    path = table(tmp_path / "a.csv", *head, mark=mark, point=point)
+    is_read(read_record(path))
+    path.write_text(path.read_text().replace(f"{5 * 1e-3:.6g}".replace(".", point), "oops"))
+    assert f"line {len(head) + 6}, column 'time': found 'oops'" in refused(path)
+
+
+def structures(*items: Mapping[str, Any]) -> Any:
+    """Return several MATLAB structures of the same fields, as SciPy writes them."""
+    found = np.empty((1, len(items)), dtype=[(key, object) for key in items[0]])
+    for k, item in enumerate(items):
+        found[0, k] = tuple(item.values())
+    return found
+
+
+def recorded(path: Path, *signals: Mapping[str, Any], clocks: int = 1, packed: bool = True) -> Path:
+    """Write what dSPACE ControlDesk records: `X` with the time, `Y` with the signals."""
+    times = structures(*[{"Type": "double", "Data": T}] * clocks)
+    content = {"X": times, "Y": structures(*signals), "Description": {"General": {"Version": "5"}}}
+    savemat(path, {"exp001": content}, do_compression=packed)
+    return path
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_recording_of_control_desk_is_read(tmp_path: Path, *, packed: bool) -> None:
+    named = [{"Name": "Model Root/U_amp [V]", "Data": V}, {"Name": "Probe (um)", "Data": X}]
+    is_read(read_record(recorded(tmp_path / "a.mat", *named, packed=packed)))
+    stated = [
+        {"Name": "Model Root/DAC/cmd", "Data": V, "Unit": "V", "XIndex": 1.0},
+        {"Name": "Model Root/ADC/monitor", "Data": V, "Unit": "V", "XIndex": 1.0},
+        {"Name": "Weg µ", "Data": X, "Unit": "um", "XIndex": 1.0},
+    ]
+    path = recorded(tmp_path / "b.mat", *stated, packed=packed)
+    is_read(read_record(path))
+    columns = "voltage=exp001.Model Root/ADC/monitor,displacement=exp001.Weg µ:nm"
+    is_read(read_record(path, columns=columns), x=1e-9)
+
+
+def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
+    names = [{"Name": "Model Root/cmd", "Data": V}, {"Name": "Model Root/Out1", "Data": X}]
+    line = "voltage=exp001.Model Root/cmd:V,displacement=exp001.Model Root/Out1:um"
+    assert suggestion(recorded(tmp_path / "a.mat", *names)) == line
+    is_read(read_record(tmp_path / "a.mat", columns=line))
+    alike = [{"Name": "Out1", "Data": V}, {"Name": "Out1", "Data": X}]
+    line = "voltage=exp001.Y.1:V,displacement=exp001.Y.2:um"
+    assert suggestion(recorded(tmp_path / "b.mat", *alike)) == line
+    is_read(read_record(tmp_path / "b.mat", columns=line))
+    path = recorded(tmp_path / "c.mat", *names, clocks=2)
+    both = "voltage=exp001.Model Root/cmd:V,displacement=exp001.Model Root/Out1:um"
+    assert suggestion(path) == both  # the two clocks are the same
+
+
+@pytest.mark.parametrize(
+    ("cell", "column", "unit"),
+    [
+        ("U_amp", None, None),
+        ("V_min", None, None),
+        ("t_ms", "time", "ms"),
+        ("pos_mV", "displacement", "mV"),
+        ("V/um", None, "V/um"),
+        ("s/um", "displacement", "um"),
+        ("um/s", None, "um/s"),
+        ("s", None, None),
+        ("mV", None, "mV"),
+        ("Channel A", None, None),
+        ("Drive volts", None, None),
+        ("Drive [mV]", None, "mV"),
+        ("Untitled 1", None, None),
+    ],
+)
+def test_the_unit_of_a_cell(cell: str, column: str | None, unit: str | None) -> None:
+    found = understood(cell)
+    assert (None if found is None else found.column) == column
+    assert stated_unit(cell) == unit

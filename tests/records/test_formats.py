@@ -1,0 +1,232 @@
+"""Records in other formats and spellings than a plain CSV file."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow
+import pytest
+from numpy.typing import NDArray
+from pyarrow import parquet
+from scipy.io import savemat
+
+from psa_casadi.errors import InputError
+from psa_casadi.records import read_record, read_records
+from psa_casadi.records.read import apart
+from psa_casadi.records.read.columns import parse_columns
+from tests.records.record_files import HEADER, ROWS, assert_is, problems_of, write
+
+N = 24
+T = np.arange(N) / 8.0
+U = np.sin(T)
+Y = np.cos(T)
+COLUMNS = "time=t:ms,voltage=u:mV,displacement=y:nm"
+
+
+def mat(path: Path, content: Mapping[str, object], version: str = "5") -> Path:
+    """Write a MATLAB file as MATLAB does: vectors upright, v7.3 as transposed HDF5."""
+    if version != "7.3":
+        savemat(path, dict(content), format="5", do_compression=version == "7", oned_as="column")
+        return path
+    with h5py.File(path, "w", userblock_size=512) as file:
+        _fill(file, content)
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+    return path
+
+
+def _fill(group: Any, content: Mapping[str, object]) -> None:
+    for name, value in content.items():
+        if isinstance(value, dict):
+            _fill(group.create_group(name), value)
+        else:
+            group[name] = np.atleast_2d(np.asarray(value))
+
+
+def table(path: Path, columns: Mapping[str, object]) -> Path:
+    parquet.write_table(pyarrow.table(dict(columns)), path)
+    return path
+
+
+@pytest.mark.parametrize("version", ["5", "7", "7.3"])
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16])
+def test_matlab_arrays_of_every_version_and_kind(
+    tmp_path: Path, version: str, kind: type[np.generic]
+) -> None:
+    arrays: dict[str, NDArray[np.generic]] = {
+        "t": np.arange(N).astype(kind),
+        "u": (100 * U).astype(kind),
+        "y": (1000 * Y).astype(kind),
+    }
+    path = mat(tmp_path / "rig.mat", arrays, version)
+    record = read_record(path, columns=COLUMNS)
+    t, u, y = (arrays[name].astype(float) for name in "tuy")
+    assert_is(record, t / 1e3, u / 1e3, y / 1e9)
+    assert record.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert (record.name, record.source) == ("rig", str(path))
+
+
+@pytest.mark.parametrize("version", ["5", "7.3"])
+def test_structures_matrices_lying_vectors_and_names_with_units(
+    tmp_path: Path, version: str
+) -> None:
+    content = {
+        "log": {"t": T, "deep": {"u": U}},
+        "m": np.column_stack([T, U, Y]) if version == "5" else np.vstack([T, U, Y]),
+        "lying": Y[None, :],
+        "note": "rig 3",
+    }
+    if version == "7.3":
+        del content["note"]
+    path = mat(tmp_path / "a.mat", content, version)
+    record = read_record(path, columns="time=log.t,voltage=log.deep.u,displacement=lying:um")
+    assert_is(record, T, U, Y / 1e6)
+    record = read_record(path, columns="time=m.1:ms,voltage=m.2,displacement=m.3[mm]")
+    assert_is(record, T / 1e3, U, Y / 1e3)
+    named = {"time_ms": T, "voltage": U, "displacement_um": Y, "temperature_degC": 20 + Y}
+    record = read_record(mat(tmp_path / "b.mat", named, version))
+    assert_is(record, T / 1e3, U, Y / 1e6)
+    np.testing.assert_allclose(np.asarray(record.temperature), 293.15 + Y)
+
+
+def test_parquet_columns_are_named_as_in_a_csv_header(tmp_path: Path) -> None:
+    columns = {
+        "remark": ["ok"] * N,
+        "displacement [counts]": np.arange(N, dtype=np.int32),
+        "Time [ms]": T.astype(np.float32),
+        "voltage [kV]": U,
+        "Load Force [N]": Y,
+    }
+    path = table(tmp_path / "a.parquet", columns)
+    record = read_record(path)
+    assert_is(record, T / 1e3, U * 1e3, np.arange(N))
+    assert record.displacement_unit == "counts"
+    assert record.load_force is not None
+    assert record.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    other = table(tmp_path / "b.pq", {"t [ms]": T, "Piezo": U, "x": Y, "voltage [V]": Y})
+    record = read_record(other, columns="time=t,voltage=piezo:mV,displacement=x:um")
+    assert_is(record, T / 1e3, U / 1e3, Y / 1e6)
+
+
+def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "a.csv", "t [ms],amp out,LVDT [um],voltage [V]", *(f"{r},9" for r in ROWS)
+    )
+    record = read_record(path, columns="time=t,voltage=amp out:mV,displacement=lvdt:µm")
+    plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
+    assert plain.displacement is not None
+    assert_is(record, plain.time / 1e3, plain.voltage / 1e3, plain.displacement)
+    (problem,) = problems_of(path, columns="time=t,voltage=amp out,displacement=LVDT:mm")
+    assert "line 1, column 'LVDT': the header gives the unit 'um', --columns gives 'mm'" in problem
+    (problem,) = problems_of(path, columns="time=t,displacement=LVTD")
+    assert "'LVTD', which --columns names for 'displacement', is not in the header" in problem
+    assert "(found: time, voltage, amp out, LVDT)" in problem
+    (problem,) = problems_of(
+        write(tmp_path / "c.csv", "time [s],voltage [V],y", *ROWS), columns="displacement=y"
+    )
+    assert "line 1, column 'y': has no unit" in problem
+
+
+def test_what_is_said_of_one_file_stands_for_what_is_said_of_all(tmp_path: Path) -> None:
+    said = "time=t:s,voltage=U:V,displacement=y:um"
+    mine = ",".join(f"b.csv@{part}" for part in ("time=t:ms", "voltage=CH1:V", "displacement=y:um"))
+    first = write(tmp_path / "a.csv", "t,U,y", *ROWS)
+    second = write(tmp_path / "b.csv", "t,CH1,y", *ROWS)
+    a, b = read_records([first, second], columns=f"{said},{mine}")
+    assert a.displacement is not None
+    assert_is(b, a.time / 1e3, a.voltage, a.displacement)
+    (problem,) = problems_of(first, columns=mine)
+    assert "line 1" in problem
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("voltage", "'voltage': is not understood; write NAME=ARRAY:UNIT"),
+        ("voltage=", "'voltage=': is not understood"),
+        ("voltag=u", "'voltag' is no column of a record; is 'voltage' meant?"),
+        ("torque=u", "'torque' is no column of a record; there are time, voltage"),
+        ("voltage=u,voltage=v", "'voltage=v': 'voltage' is given twice"),
+        ("a.csv@voltage=u,a.csv@voltage=v", "'a.csv@voltage' is given twice"),
+        ("voltage=u:um", "the unit 'um' does not measure voltage"),
+        ("voltage=u:vlots", "the unit 'vlots' is unknown"),
+        ("voltage=u:", "has no unit"),
+    ],
+)
+def test_mistakes_of_the_columns_option(text: str, expected: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_columns(text)
+    (problem,) = caught.value.problems
+    assert problem.startswith("--columns, '")
+    assert expected in problem
+
+
+def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
+    t, y = T.copy(), Y.copy()
+    t[5], y[9] = t[3], np.inf
+    path = mat(tmp_path / "a.mat", {"t": t, "u": np.r_[U[:4], np.nan, U[5:]], "y": y, "z": Y[:7]})
+    problems = problems_of(path, columns="time=t,voltage=u,displacement=y:um")
+    assert len(problems) == 3
+    assert "sample 6, column 'time': time goes back (from 0.5 in sample 5 to 0.375)" in problems[0]
+    assert "in every sample; remove repeated samples" in problems[0]
+    assert "sample 5, column 'voltage': found no value" in problems[1]
+    assert "fill the cell or remove the sample" in problems[1]
+    assert "sample 10, column 'displacement': found inf" in problems[2]
+    problems = problems_of(path)
+    assert "array names: 'time' has no unit (t), 'voltage' has no unit (u)" in problems[0]
+    assert "--columns" not in "".join(problems)  # what would not read the file is not offered
+    problems = problems_of(path, columns="time=t,voltage=w,displacement=y")
+    assert "'w', which --columns names for 'voltage', is not in the header" in "".join(problems)
+    assert "column 'y': has no unit; write it in brackets" in "".join(problems)
+    (problem,) = problems_of(path, columns="time=t,voltage=u,displacement=z:um")
+    assert "array 'z' (displacement) has 7 values, 'time' has 24" in problem
+
+
+def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
+    text = write(tmp_path / "text.mat", HEADER, *ROWS)
+    (problem,) = problems_of(text)
+    assert "is no readable MATLAB file" in problem
+    (problem,) = problems_of(write(tmp_path / "text.parquet", HEADER, *ROWS))
+    assert "is no readable Parquet file" in problem
+    (tmp_path / "broken.mat").write_bytes(
+        b"MATLAB 7.3".ljust(512) + b"\x89HDF\r\n\x1a\n" + b"x" * 50
+    )
+    (problem,) = problems_of(tmp_path / "broken.mat")
+    assert "is no readable MATLAB file" in problem
+    (problem,) = problems_of(tmp_path / "absent.mat")
+    assert "there is no such file" in problem
+    (problem,) = problems_of(tmp_path / "absent.parquet")
+    assert "there is no such file" in problem
+    empty = mat(tmp_path / "empty.mat", {"note": "nothing"})
+    assert "the column 'time' is missing (found: nothing)" in problems_of(empty)[0]
+
+
+def test_a_missing_optional_package_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = table(tmp_path / "a.parquet", {"time [s]": T, "voltage [V]": U, "displacement [um]": Y})
+    monkeypatch.setattr(apart, "find_spec", lambda name: None)
+    (problem,) = problems_of(path)
+    assert "reading it needs pyarrow, which is not installed; run `pip install pyarrow`" in problem
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_decimal_commas_are_read(tmp_path: Path, delimiter: str, encoding: str) -> None:
+    rows = [row.replace(",", delimiter).replace(".", ",") for row in ROWS]
+    rows[3] = delimiter.join(["0,003", "-1,5e-1", ""])
+    rows = [f"{row}{delimiter}12.03.2024 10:00" for row in rows]
+    header = delimiter.join(["time [s]", "voltage [V]", "displacement [µm]", "stamp"])
+    path = write(tmp_path / "a.csv", "# Prüfstand 3", "", header, *rows, encoding=encoding)
+    record = read_record(path)
+    plain = ROWS.copy()
+    plain[3] = "0.003,-0.15,"
+    expected = read_record(write(tmp_path / "b.csv", HEADER, *plain))
+    assert expected.displacement is not None
+    assert_is(record, expected.time, expected.voltage, expected.displacement)
+    quoted = [row.replace(";", '";"').replace("\t", '"\t"') for row in rows]
+    again = read_record(write(tmp_path / "c.csv", header, *(f'"{row}"' for row in quoted)))
+    assert_is(again, expected.time, expected.voltage, expected.displacement)

@@ -1,0 +1,62 @@
+"""No page keeps people out who cannot see it well or have no mouse: axe finds no serious fault.
+
+The pages of the site are looked at where PSA_CASADI_SITE says they were built, as
+`build_scripts/check docs` does.
+"""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from psa_casadi.report.page.results import write_fit_report, write_report
+from tests.report.browser import DARK, MOUSE, Browser, find_browser
+from tests.report.report_cases import diagnosis, identification
+from tests.tiers import slow
+
+pytestmark = pytest.mark.xdist_group("browser")
+
+#: One page of every kind: text and tables, code, a gallery, a notebook, what is made from code.
+SITE = (
+    "index.html",
+    "ablation/index.html",
+    "evidence/index.html",
+    "howto/simulink/index.html",
+    "effects/index.html",
+    "tutorials/laboratory_to_fmu/index.html",
+    "commands/index.html",
+    "python/index.html",
+    "json/index.html",
+)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
+    return find_browser(tmp_path_factory.mktemp("browser"))
+
+
+@slow
+@pytest.mark.parametrize("name", ["fit", "diagnosis"])
+def test_a_report_has_no_serious_fault(name: str, browser: Browser, tmp_path: Path) -> None:
+    page = tmp_path / f"{name}.html"
+    if name == "fit":
+        write_fit_report(identification(), page)
+    else:
+        write_report(diagnosis("cause_named", ("rig_a", "rig_b")), page)
+    assert browser.serious_faults(page, *([DARK] if name == "fit" else [])) == []
+
+
+@pytest.mark.skipif("PSA_CASADI_SITE" not in os.environ, reason="PSA_CASADI_SITE names no site")
+@pytest.mark.parametrize("name", SITE)
+def test_a_page_of_the_site_has_no_serious_fault(name: str, browser: Browser) -> None:
+    page = Path(os.environ["PSA_CASADI_SITE"]) / name
+    assert browser.serious_faults(page, MOUSE) == []
+
+
+@slow
+def test_a_fault_is_found(browser: Browser, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    picture = "<html lang=en><title>t</title><body><main><h1>t</h1><img src=x.png></main></body>"
+    page.write_text(f"<!DOCTYPE html>{picture}</html>", encoding="utf-8")
+    (fault,) = browser.serious_faults(page)
+    assert fault.startswith("image-alt: <img src=")

@@ -1,0 +1,283 @@
+"""A page whose model is alive: moved as people move it, and still what Python simulates."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psa_casadi.component import Component, Equations
+from psa_casadi.design.tracking.targets import respond
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.model.model_file import loads
+from psa_casadi.model.stacks import stack_model
+from psa_casadi.report.page import live
+from psa_casadi.report.page.designs import write_design_page
+from psa_casadi.report.page.live import live_data, live_design, thinned
+from psa_casadi.report.page.results import write_report
+from psa_casadi.simulation.simulate import simulate_record
+from psa_casadi.variables import Interval, Parameter, Provenance
+from tests.report.browser import DARK, Browser, driven, find_browser
+from tests.report.html_page import Page
+from tests.report.report_cases import diagnosis
+from tests.tiers import slow
+
+pytestmark = pytest.mark.xdist_group("browser")
+
+NASTY = "<img src=x onerror=alert(1)>"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
+    return find_browser(tmp_path_factory.mktemp("browser"))
+
+
+@pytest.fixture(scope="module")
+def shown() -> Diagnosis:
+    """A diagnosis of two records, of a name that is no HTML; an unnamed correction adds 20 nm."""
+    d = diagnosis("cause_named", ("rig_a", "rig_b"))
+    first = d.experiments[0]
+    named = replace(first, record=replace(first.record, name=NASTY))
+    return replace(d, experiments=(named, *d.experiments[1:]))
+
+
+@pytest.fixture(scope="module")
+def page(shown: Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("live") / "page.html"
+    write_report(shown, path)
+    return path
+
+
+def rms_of(d: Diagnosis, values: dict[str, float]) -> float:
+    """Return the held-out rms [nm] of the first record at other values, the offset found again."""
+    e, fit = d.experiments[0], d.extended_fit
+    model = d.model.with_values(values)
+    found = simulate_record(model, e.record, fit.unknowns.start(fit.theta, 0), as_exported=False)
+    residual = measured(e.record) - found.displacement
+    seen, center = np.isfinite(residual), (measured(e.record) - d.extended[0])
+    use = seen & ~e.held_out
+    residual += np.mean(center[use]) - np.mean(residual[use])
+    return 1e9 * float(np.sqrt(np.mean(residual[seen & e.held_out] ** 2)))
+
+
+MOVES = """
+var box = document.querySelector('.live'), found = {};
+function text() { return box.querySelector('output').textContent; }
+function drawn() { return JSON.stringify(box.querySelector('.plot').data.map(function (t) {
+  return Array.from(t.y); })); }
+function row() { return Array.prototype.map.call(box.querySelectorAll('.budget td'), function (c) {
+  return c.textContent; }); }
+function knob(name) { return Array.prototype.find.call(box.querySelectorAll('.knob'), function (k) {
+  return k.querySelector('label').textContent === name; }); }
+found.first = text(); found.picture = drawn();
+found.fitted = row();
+var apart = document.createElement('div');
+psaLive.budget(apart, [['worse', 1e-9], ['better', 2e-6]], 1e-6, 0, String);
+found.cut = Array.prototype.map.call(apart.querySelectorAll('tr td:last-child'), function (c) {
+  return c.textContent; });
+var range = knob('k_L').querySelector('input[type=range]');
+range.value = '620'; range.dispatchEvent(new Event('input'));
+setTimeout(function () {
+  found.moved = text(); found.changed = drawn() !== found.picture;
+  found.values = box.psa.values.slice(); found.file = box.psa.file();
+  var number = knob('tau').querySelector('input[type=number]');
+  number.value = '0.25'; number.dispatchEvent(new Event('change'));
+  box.querySelector('.switch input').click();
+  setTimeout(function () {
+    found.budget = row(); found.switched = text(); found.then = box.psa.values.slice();
+    Array.prototype.find.call(box.querySelectorAll('button'), function (b) {
+      return b.textContent === 'Reset'; }).click();
+    setTimeout(function () {
+      found.reset = text(); found.again = drawn() === found.picture;
+      var plot = box.querySelector('.plot');
+      plot.dispatchEvent(new KeyboardEvent('keydown', {key: '+'}));
+      setTimeout(function () {
+        found.reach = plot.layout.xaxis.range;
+        found.images = document.querySelectorAll('img:not(.still)').length;
+        found.options = Array.prototype.map.call(box.querySelectorAll('option'), function (o) {
+          return o.textContent; });
+        found.spent = box.psa.last();
+        tell(found);
+      }, 300);
+    }, 300);
+  }, 600);
+}, 300);
+"""
+
+
+@pytest.fixture(scope="module")
+def moved(browser: Browser, page: Path) -> dict[str, Any]:
+    found: dict[str, Any] = driven(browser, page, MOVES, DARK)
+    return found
+
+
+def told_rms(text: str) -> float:
+    found = re.search(r"held-out samples: ([\d.e+-]+) (nm|µm) rms", text)
+    assert found is not None, text
+    return float(found[1]) * (1e3 if found[2] == "µm" else 1.0)
+
+
+@slow
+def test_a_moved_slider_shows_what_python_simulates(
+    moved: dict[str, Any], shown: Diagnosis
+) -> None:
+    names = shown.model.parameter_names
+    at = dict(zip(names, moved["values"], strict=True))
+    changed = {n: v for n, v in at.items() if v != shown.model.values[n]}
+    assert list(changed) == ["k_L"]
+    assert changed["k_L"] == pytest.approx(100.0**0.62, rel=1e-9)  # from 1 to 100
+    assert told_rms(moved["moved"]) == pytest.approx(rms_of(shown, changed), rel=6e-3)
+    assert told_rms(moved["first"]) == pytest.approx(rms_of(shown, {}), rel=6e-3)
+    assert moved["changed"]
+    assert "% is removed" in moved["first"]
+    assert "more than the base model leaves" in moved["moved"]
+
+
+@slow
+def test_the_error_budget_follows(moved: dict[str, Any], shown: Diagnosis) -> None:
+    assert moved["fitted"] == []  # no effect is on
+    at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
+    values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
+    noise = 1e9 * shown.noise_floor_rms_m  # the levels of both records are the same
+    now, without = (
+        rms_of(shown, {**values, **off}) ** 2 - noise**2 for off in ({}, {"creep_gain": 0.0})
+    )
+    name, size, share = moved["budget"]
+    number, unit = size.split()
+    assert name == "slow creep"
+    assert float(number) * (1e3 if unit == "µm" else 1.0) == pytest.approx(without**0.5, rel=6e-3)
+    removes = max(0.0, 100 * (1 - now / without))  # cut: at these values it adds error
+    assert float(share.split("\u00a0")[0]) == pytest.approx(removes, abs=0.6)
+    assert moved["cut"] == ["0\u00a0%", "75\u00a0%"]  # an effect that adds error removes nothing
+
+
+@slow
+def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: Diagnosis) -> None:
+    at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
+    assert at["tau"] == pytest.approx(2.5e-4, rel=1e-12)
+    assert at["creep_gain"] > 0.0
+    values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
+    assert told_rms(moved["switched"]) == pytest.approx(rms_of(shown, values), rel=6e-3)
+    assert moved["reset"] == moved["first"]
+    assert moved["again"]
+    low, high = moved["reach"]
+    assert high - low == pytest.approx(0.5 * 1.499, rel=1e-3)
+
+
+@slow
+def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
+    browser: Browser, shown: Diagnosis, tmp_path: Path
+) -> None:
+    model = shown.model.with_values({"creep_gain": 0.02})
+    write_report(replace(shown, model=model), tmp_path / "on.html")
+    said = driven(browser, tmp_path / "on.html", """
+      var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
+      box.psa.set('creep_gain', 0);
+      tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
+    assert "nothing is fitted again" not in said[0]
+    assert "With slow creep off nothing is fitted again: all other values were" in said[1]
+    e = shown.experiments[0]
+    miss = (measured(e.record) - shown.base[0])[e.held_out & np.isfinite(measured(e.record))]
+    base = 1e9 * float(np.sqrt(np.mean(miss**2)))
+    assert f"The base model, fitted without any effect, leaves {base:.3g} nm." in said[1]
+
+
+@slow
+def test_the_model_file_of_a_page_is_read(moved: dict[str, Any], shown: Diagnosis) -> None:
+    model = loads(moved["file"])
+    assert model.parameter_vector().tolist() == moved["values"]
+    assert "k_L" not in model.provenance.intervals
+    assert model.provenance.intervals["tau"] == shown.model.provenance.intervals["tau"]
+    assert "by hand" in model.provenance.notes[-1]
+
+
+@slow
+def test_names_are_text_and_no_foreign_script_runs(
+    moved: dict[str, Any], page: Path, browser: Browser, tmp_path: Path
+) -> None:
+    assert moved["images"] == 0
+    assert NASTY in moved["options"]
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r"(?:src|href)=\"(?!data:image/png|#)", text) == []
+    foreign = tmp_path / "foreign.html"
+    script = "<script>document.title = 'taken'</script></body>"
+    foreign.write_text(script.join(text.rsplit("</body>", 1)), encoding="utf-8")
+    document, console = browser.document(foreign)
+    assert "<title>taken" not in document
+    assert len(console) == 1
+    assert "Content Security Policy" in console[0]
+    assert 'class="knob' in document  # the page's own scripts did
+
+
+@slow
+def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -> None:
+    model = stack_model("P-885.51").plant()
+    t = np.linspace(0.0, 0.02, 400)
+    played = respond(model, t, 60.0 - 50.0 * np.cos(2.0 * np.pi * 100.0 * t))
+    record = (t, played.voltage, played.displacement)
+    path = played.displacement + 50e-9
+    played_again = live_design(model, record, path, rest=True)
+    write_design_page(
+        tmp_path / "d.html", title="A design", summary=["It moves."], live=played_again
+    )
+    said = driven(browser, tmp_path / "d.html", """
+      var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
+      box.psa.set('k_L', 8);
+      tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
+    assert said[0].startswith("Off the path by 50 nm rms")
+    changed = respond(model.with_values({"k_L": 8.0}), t, played.voltage).displacement
+    off = 1e9 * float(np.sqrt(np.mean((path - changed) ** 2)))
+    found = re.search(r"by ([\d.]+) (nm|µm) rms", said[1])
+    assert found is not None
+    assert float(found[1]) * (1e3 if found[2] == "µm" else 1.0) == pytest.approx(off, rel=6e-3)
+
+
+@slow
+def test_the_page_with_its_model_is_small(page: Path) -> None:
+    assert page.stat().st_size < 3e6
+
+
+@slow
+def test_without_compiler_a_page_says_so(
+    shown: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("psa_casadi.export.web.has_zig", lambda: False)
+    monkeypatch.setattr(live, "has_zig", lambda: False)
+    write_report(shown, tmp_path / "page.html")
+    text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
+    assert "the model does not run. It takes a compiler" in text
+
+
+def test_what_json_cannot_hold_stays_out_of_a_page() -> None:
+    free = Component(
+        name="free_gain", description="a test", source="none", gain="g",
+        equations=lambda _: Equations(),
+        parameters=(Parameter("g", 0.0, "1", (-math.inf, math.inf), "any", scale=2.0),),
+    )  # fmt: skip
+    sure = Provenance(intervals={"k_L": Interval(1.0, math.inf), "tau": Interval(1e-5, 1e-3)})
+    model = stack_model("P-885.51").with_effect(free).with_values({}, provenance=sure)
+    told = {p["name"]: p for p in live_data(model, b"")["parameters"]}
+    json.dumps(told, allow_nan=False)
+    assert told["k_L"]["interval"] is None
+    assert told["tau"]["interval"] == [1e-5, 1e-3]
+    assert told["g"]["ends"] == [-8.0, 8.0]
+    low, high = told["k_L"]["ends"]
+    assert low < model.values["k_L"] < high
+
+
+def test_a_long_record_is_thinned_only_where_the_voltage_stays_the_same() -> None:
+    t = np.linspace(0.0, 1.0, 10_001)
+    slow_voltage, quick_voltage = np.sin(2 * np.pi * t), np.sin(2 * np.pi * 900 * t)
+    part, note = thinned(t, slow_voltage, 1000)
+    assert len(part) <= 1000
+    assert part[1] == 11
+    assert "each 11th" in note
+    part, note = thinned(t, quick_voltage, 1000)
+    assert part.tolist() == list(range(1000))
+    assert "the first 1000" in note
+    assert thinned(t, quick_voltage, 20_000)[1] == ""

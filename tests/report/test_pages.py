@@ -1,0 +1,106 @@
+"""What every page says of its making, its one unit for errors, and the page that is small."""
+
+import base64
+import gzip
+import hashlib
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from plotly.offline import get_plotlyjs
+
+import psa_casadi as psa
+from psa_casadi.command_line import typed
+from psa_casadi.diagnosis.held_out import Errors
+from psa_casadi.report.page.designs import write_design_page
+from psa_casadi.report.page.results import write_fit_report
+from psa_casadi.report.words.phrases import (
+    handy_scale,
+    length_scale,
+    one_unit,
+    quantity,
+)
+from tests.report.html_page import Page
+from tests.report.report_cases import diagnosis, identification
+
+
+def test_every_page_tells_date_version_command_and_the_records_hashes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
+    token = typed.set("psa diagnose 'my record.csv'")
+    try:
+        d, found = diagnosis("cause_named"), identification()
+        paths = [tmp_path / f"{k}.html" for k in range(3)]
+        psa.write_report(d, paths[0], still=True)
+        write_fit_report(found, paths[1], still=True)
+        write_design_page(paths[2], title="A design", summary=["It moves."])
+    finally:
+        typed.reset(token)
+    for path in paths:
+        text = Page(path.read_text(encoding="utf-8")).text
+        assert f"Written 2026-09-21 14:13 UTC by psa_casadi {psa.__version__}." in text
+        assert "Command: psa diagnose 'my record.csv'" in text
+    for path, experiments in zip(paths, (d.experiments, found.experiments), strict=False):
+        for e in experiments:
+            assert e.record.sha256 in path.read_text(encoding="utf-8")
+
+
+def test_a_page_without_a_command_tells_none(tmp_path: Path) -> None:
+    write_design_page(tmp_path / "a.html", title="A design", summary=["It moves."])
+    assert "Command" not in Page((tmp_path / "a.html").read_text(encoding="utf-8")).text
+
+
+def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
+    diagnosis("cause_named").report(tmp_path / "a.html", still=True)
+    text = (tmp_path / "a.html").read_text("utf-8")
+    held = re.findall(r'<script type="application/gzip" id="(\w+)">(.*?)</script>', text)
+    assert [name for name, _ in held] == ["arrays", "library"]
+    arrays, library = (gzip.decompress(base64.b64decode(data)).decode() for _, data in held)
+    assert library == get_plotlyjs()  # speaks what the installed plotly writes
+    rows = arrays.split(" ")
+    assert len(rows) == len(set(rows))
+    long = [row for row in rows if len(row) == 1500 * 4 * 4 // 3]
+    assert len(long) == 7  # time, voltage, measured, two models and their residuals
+    digest = base64.b64encode(hashlib.sha256(library.encode()).digest()).decode()
+    assert f"'sha256-{digest}'" in text.split("Content-Security-Policy", 1)[1].split(">", 1)[0]
+    assert text.count("Displacement, and residual") == 0
+    assert "at the top of the page" in text
+
+
+def test_the_errors_of_a_page_have_one_unit(tmp_path: Path) -> None:
+    d = replace(
+        diagnosis("cause_named"),
+        base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
+        extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
+    )
+    d.report(tmp_path / "a.html", still=True)
+    text = Page((tmp_path / "a.html").read_text("utf-8")).text.replace("\u00a0", " ")
+    start = text.index("Error on held-out samples")
+    bars = text[start : text.index("Dashed: the noise")]
+    assert "base model 2.50 µm extended model 0.0500 µm noise 0.00500 µm" in bars
+    assert " nm" not in bars
+
+
+def test_a_unit_of_a_page_ends_with_it() -> None:
+    with one_unit(handy_scale(2e-6)):
+        assert length_scale(3e-9).unit == "µm"
+        assert length_scale(3e-9, counts=True).unit == "counts"
+    assert length_scale(3e-9).unit == "nm"
+
+
+def test_a_quantity_in_a_sentence_has_the_unit_of_its_page() -> None:
+    values = [(-0.29e-6, "m"), (0.17, "s"), (6e-8, "m"), (1.2e-5, "m"), (3e-3, "m"), (3.0, "V")]
+
+    def shown() -> list[str]:
+        return [quantity(*value) for value in values]
+
+    handy = ["-0.29 µm", "0.17 s", "60 nm", "12 µm", "3 mm", "3 V"]
+    assert shown() == handy
+    with one_unit(handy_scale(2e-9)):
+        assert shown() == ["-290 nm", *handy[1:]]
+    with one_unit(handy_scale(2e-6)):
+        assert shown() == [*handy[:2], "0.06 µm", *handy[3:]]
+    with one_unit(length_scale(1.0, counts=True)):
+        assert shown() == handy

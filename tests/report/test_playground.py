@@ -1,0 +1,242 @@
+"""The playground: every effect on one page, any voltage, and what it tells is what Python says."""
+
+import base64
+import csv
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.model.model_file import loads, save_model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.report.page.playground import playground
+from psa_casadi.simulation.compiler import run_compiler
+from psa_casadi.simulation.simulate import simulate
+from tests.model.sampled_models import controller
+from tests.report.browser import Browser, driven, find_browser, on_a_phone
+from tests.report.test_report_browser import told_of
+from tests.tiers import slow
+
+pytestmark = pytest.mark.xdist_group("browser")
+
+PLAY = """
+var box = document.querySelector('.live'), found = {};
+function pick(select, text) {
+  var list = Array.prototype.slice.call(select.options);
+  select.value = list.find(function (o) { return o.textContent === text; }).value;
+  select.dispatchEvent(new Event('change'));
+}
+var selects = box.querySelectorAll('select');
+var numbers = box.querySelectorAll('.bar input[type=number]');
+found.stacks = Array.prototype.map.call(selects[0].options, function (o) {
+  return o.textContent; });
+found.switches = Array.prototype.map.call(box.querySelectorAll('.switch'), function (s) {
+  return s.childNodes[1].textContent; });
+found.plain = box.querySelector('output').textContent;
+pick(selects[1], 'sine');
+numbers[4].value = '300'; numbers[4].dispatchEvent(new Event('input'));
+box.querySelector('.switch input').click();
+setTimeout(function () {
+  found.effect = box.querySelector('output').textContent;
+  found.values = box.psa.values.slice();
+  found.csv = box.psa.csv();
+  numbers[1].value = '900'; numbers[1].dispatchEvent(new Event('input'));
+  box.psa.csv();
+  found.beyond = box.querySelector('.warnings').textContent;
+  numbers[1].value = '-120'; numbers[1].dispatchEvent(new Event('input'));
+  box.psa.csv();
+  found.within = box.querySelector('.warnings').hidden;
+  numbers[1].value = '120'; numbers[1].dispatchEvent(new Event('input'));
+  found.file = box.psa.file();
+  found.knobs = Array.prototype.filter.call(box.querySelectorAll('.knob'), function (k) {
+    return !k.hidden && !k.closest('details'); }).length;
+  pick(selects[0], 'PTBS200');
+  setTimeout(function () {
+    found.other = box.querySelector('output').textContent;
+    var plot = box.querySelector('.plot'), area = plot.getBoundingClientRect();
+    [['pointerdown', 0.3], ['pointermove', 0.6]].forEach(function (row) {
+      plot.dispatchEvent(new PointerEvent(row[0], {pointerId: 1, button: 0,
+        clientX: area.left + row[1] * area.width, clientY: area.top + 0.5 * area.height}));
+    });
+    setTimeout(function () {
+      found.drawn = box.querySelector('output').textContent;
+      found.corners = psaLive.voltages.corners('0 0, 0.1 100; 0.2:50', 5).v;
+      found.read = psaLive.voltages.read(
+        'Zeit;t (ms);U [kV]\\n1;0,0;0,1\\n2;1,0;0,2\\n3;2,0;0,3\\n4;3,5;0,1\\n');
+      found.even = psaLive.voltages.read('t,v\\n' + Array.from({length: 20}, function (_, k) {
+        var t = k % 2 ? 1.01 * k : k;
+        return t + ',' + 2 * t; }).join('\\n'));
+      found.none = [psaLive.voltages.corners('1 0, 0 5', 5), psaLive.voltages.read('a,b\\n1,2\\n')];
+      found.spent = box.psa.last();
+      var knob = Array.prototype.find.call(box.querySelectorAll('.knob'), function (k) {
+        return k.querySelector('label').textContent === 'tau'; }).querySelector('[type=range]');
+      knob.value = '650'; knob.dispatchEvent(new Event('input'));
+      found.chosen = box.psa.file();
+      var create = URL.createObjectURL;
+      URL.createObjectURL = function (blob) {
+        var reader = new FileReader();
+        reader.onload = function () { found.fmu = reader.result.split(',')[1]; tell(found); };
+        reader.readAsDataURL(blob);
+        return create.call(URL, blob);
+      };
+      Array.prototype.find.call(box.querySelectorAll('button'), function (b) {
+        return b.textContent === 'Download FMU'; }).click();
+    }, 400);
+  }, 400);
+}, 400);
+"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
+    return find_browser(tmp_path_factory.mktemp("browser"))
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("playground") / "page.html"
+    path.write_text(playground(), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def played(browser: Browser, page: Path) -> dict[str, Any]:
+    found: dict[str, Any] = driven(browser, page, PLAY, "--window-size=1200,2000")
+    return found
+
+
+@slow
+def test_it_has_every_stack_and_effect(played: dict[str, Any], page: Path) -> None:
+    assert set(played["stacks"]) == set(STACKS)
+    assert played["switches"] == [n.replace("_", " ") for n in EFFECTS]
+    assert page.stat().st_size < 3e6
+
+
+@slow
+def test_what_it_downloads_is_what_python_simulates(played: dict[str, Any]) -> None:
+    head, *rows = csv.reader(played["csv"].splitlines())
+    table = np.array(rows, dtype=float)
+    assert len(table) == 300
+    t, v = table[:, 0], table[:, head.index("voltage [V]")]
+    assert np.ptp(v) == pytest.approx(120.0, rel=1e-3)
+    model = stack_model("P-885.51").with_effect(EFFECTS["slow_creep"])
+    gain = model.parameter("creep_gain").typical(model.values)
+    model = model.with_values({"creep_gain": gain})
+    wanted = simulate(model, t, v).displacement
+    shown = table[:, head.index("measured_displacement [m]")]
+    assert np.max(np.abs(shown - wanted)) < 2e-6 * np.ptp(wanted)
+
+
+@slow
+def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
+    played: dict[str, Any], tmp_path: Path
+) -> None:
+    path, folder = tmp_path / "page.fmu", tmp_path / "fmu"
+    path.write_bytes(base64.b64decode(played["fmu"]))
+    assert validate_fmu(str(path)) == []
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(folder)
+    equations = (folder / "documentation" / "index.html").read_text(encoding="utf-8")
+    assert "<h1>PTBS200</h1>" in equations
+    assert "creep_gain" in equations
+    model, stack = loads(played["chosen"]), stack_model("PTBS200")
+    assert model.name == "PTBS200"
+    assert {n for n, v in stack.values.items() if model.values[n] != v} == {"tau"}
+    assert model.values["creep_gain"] > 0.0
+    described = {v.name: v for v in fmpy.read_model_description(folder).modelVariables}
+    assert {n: float(described[n].start) for n in model.values} == model.values
+    told = {v.name: v.nominal for v in variable_table(model)}
+    assert [float(described[n].nominal) for n in model.state_names] == [
+        told[n] for n in model.state_names
+    ]
+    others = {c.gain for c in EFFECTS.values()} - {"creep_gain"}
+    assert {float(described[gain].start) for gain in others if gain} == {0.0}
+
+    if not shutil.which("gcc"):
+        pytest.skip("gcc is not installed")
+    lines = (folder / "sources" / "README.txt").read_text(encoding="utf-8").splitlines()
+    line = next(t for t in lines if " cc " in t).replace("-O2", "-O0").split()
+    run_compiler(["gcc", *line[1:]], folder / "sources")
+    binaries = folder / "binaries" / fmpy.platform_tuple
+    binaries.mkdir(parents=True)
+    shutil.move(folder / "sources" / line[-1], binaries)
+    t = np.linspace(0.0, 4e-3, 401)
+    v = 100.0 * np.where((t > 2e-4) & (t < 3.5e-3), 1.0 - np.cos(2.0 * np.pi * t / 2e-3), 0.0)
+    found = fmpy.simulate_fmu(
+        folder, fmi_type="CoSimulation", stop_time=t[-1], output_interval=t[1],
+        relative_tolerance=1e-8,
+        input=np.array(list(zip(t, v, strict=True)), [("time", float), ("voltage", float)]),
+    )  # fmt: skip
+    wanted = simulate(model, t, v, rtol=1e-9, hold="zero").displacement
+    assert np.max(np.abs(found["measured_displacement"] - wanted)) < 1e-7 * np.ptp(wanted)
+
+
+@slow
+def test_its_model_file_has_what_is_switched_on(played: dict[str, Any]) -> None:
+    model = loads(played["file"])
+    base = stack_model("P-885.51")
+    assert [c.name for c in model.effects] == ["slow_creep"]
+    assert {n: model.values[n] for n in base.values} == base.values
+    assert (model.name, model.description) == (base.name, base.description)
+
+
+@slow
+def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) -> None:
+    assert "add up to 0 nm" in played["plain"]
+    said = [played[k] for k in ("plain", "effect", "other", "drawn")]
+    assert len(set(said)) == 4
+    assert all(s.startswith("Stroke ") for s in said)
+    assert played["knobs"] == len(EFFECTS["slow_creep"].parameters)
+    assert list(played["corners"].values()) == [0.0, 50.0, 100.0, 75.0, 50.0]
+    assert list(played["read"]["t"].values()) == pytest.approx([0.0, 1e-3, 2e-3, 3.5e-3])
+    assert list(played["read"]["v"].values()) == pytest.approx([100.0, 200.0, 300.0, 100.0])
+    assert played["none"] == [None, None]
+
+
+@slow
+def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_said(played: dict[str, Any]) -> None:
+    said = "The voltage reaches 900 V; P-885.51 is rated for 120 V."
+    assert played["beyond"].startswith(said)
+    assert played["within"]
+    even = {k: list(played["even"][k].values()) for k in ("t", "v")}
+    assert even["t"] == pytest.approx(np.linspace(0.0, 19.19, 20))
+    assert even["v"] == pytest.approx(2.0 * np.array(even["t"]))
+    assert "even grid" in played["even"]["note"]
+
+
+@slow
+def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> None:
+    document, console = browser.document(on_a_phone(page))
+    assert console == []
+    found = told_of(document)
+    assert found["outside"] == []
+    assert found["needed"] == found["width"]
+    assert found["smallest"] >= 9
+    assert browser.serious_faults(page) == []
+
+
+@slow
+def test_the_command_plays_a_model_of_ones_own(tmp_path: Path) -> None:
+    model = stack_model("PTBS200").with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02})
+    save_model(model, tmp_path / "m.json")
+    words = ["web", str(tmp_path / "m.json"), "-o", str(tmp_path / "p.html"), "--quiet"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "p.html").read_text(encoding="utf-8")
+    assert "Play with PTBS200" in text
+    assert "0.02" in text
+
+
+def test_what_is_no_stack_is_refused() -> None:
+    with pytest.raises(InputError, match="no stack"):
+        playground(controller())

@@ -1,0 +1,165 @@
+"""The pages in a real browser: drawn, without complaint, on a desk, on a phone, at night."""
+
+import json
+import re
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from psa_casadi.identification.advice import Advice
+from psa_casadi.report.page.results import write_fit_report, write_report
+from tests.report.browser import DARK, PHONE, Browser, find_browser, on_a_phone
+from tests.report.report_cases import diagnosis, identification
+from tests.tiers import slow, slow_but
+
+pytestmark = pytest.mark.xdist_group("browser")
+
+PAGES = ("fit", "diagnosis")
+BLUE = np.array([0x00, 0x72, 0xB2]) / 255.0
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
+    return find_browser(tmp_path_factory.mktemp("browser"))
+
+
+@pytest.fixture(scope="module", params=slow_but(["diagnosis"], PAGES))
+def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _written(request.param, tmp_path_factory.mktemp("pages"))
+
+
+@pytest.fixture(scope="module")
+def of_diagnosis(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The longer page, for what both have by the same style sheet and scripts."""
+    return _written("diagnosis", tmp_path_factory.mktemp("page"))
+
+
+def _written(kind: str, folder: Path) -> Path:
+    path = folder / f"{kind}.html"
+    if kind == "fit":
+        found = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))
+        write_fit_report(found, path, origin="synthetic")
+    else:
+        write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")
+    return path
+
+
+def pixels(path: Path) -> np.ndarray[tuple[int, int, int], np.dtype[np.float64]]:
+    return np.asarray(imread(path), dtype=np.float64)[:, :, :3]
+
+
+def colours(image: np.ndarray[tuple[int, int, int], np.dtype[np.float64]]) -> int:
+    levels = np.rint(15 * image).astype(np.int64) @ np.array([256, 16, 1])
+    return len(np.unique(levels))
+
+
+@slow
+def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: Path) -> None:
+    document, console = browser.document(page, "--window-size=1280,900")
+    assert console == []
+    assert '<html lang="en" class="scripted">' in document  # no still picture is seen
+    boxes = document.split('class="drawing')[1:]
+    assert len(boxes) == len(re.findall('class="drawing', page.read_text(encoding="utf-8")))
+    assert len(boxes) >= 14
+    for box in boxes:
+        assert '<svg class="main-svg"' in box
+        assert re.search(r'class="(js-line|point|hm|trace)', box), "axes without any curve"
+
+
+@slow
+def test_a_still_picture_is_seen_where_scripts_are_off(
+    browser: Browser, of_diagnosis: Path
+) -> None:
+    off = of_diagnosis.with_name("off.html")
+    none = """<head><meta http-equiv="Content-Security-Policy" content="script-src 'none'">"""
+    off.write_text(of_diagnosis.read_text("utf-8").replace("<head>", none, 1), encoding="utf-8")
+    image = pixels(browser.screenshot(off, 1280, 900))
+    assert np.sum(np.all(np.abs(image - BLUE) < 0.06, axis=2)) > 2000  # the model's curves
+    assert 30_000 < len("".join(re.findall('base64,([^"]+)', off.read_text("utf-8")))) < 150_000
+
+
+def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.html"
+    wide = '<div class="drawing" style="width: 500px"><svg class="main-svg"></svg>wide</div>'
+    tiny = '<p style="font-size: 8px">tiny</p>'
+    script = "<script>console.error('by hand'); absent.name = 1;</script>"
+    broken.write_text(f"<html><body>{wide}{tiny}{script}</body></html>", encoding="utf-8")
+    document, console = browser.document(on_a_phone(broken))
+    assert "by hand" in console[0]
+    assert "Uncaught ReferenceError" in console[1]
+    found = told_of(document)
+    assert found["needed"] > PHONE
+    assert found["outside"] == ["DIV.drawing"]
+    assert found["small"] == ["tiny"]
+
+
+def told_of(document: str) -> dict[str, Any]:
+    found = re.search(r'<pre id="told">(.*?)</pre>', document, re.DOTALL)
+    assert found is not None
+    assert found.group(1), "the page in the frame did not report"
+    report: dict[str, Any] = json.loads(unescape(found.group(1)))
+    return report
+
+
+@pytest.fixture(scope="module")
+def told(browser: Browser, page: Path) -> dict[str, Any]:
+    """What the page says of itself on a phone."""
+    document, console = browser.document(on_a_phone(page))
+    assert console == []
+    return told_of(document)
+
+
+@slow
+def test_a_phone_shows_it_without_scrolling_sideways(told: dict[str, Any]) -> None:
+    assert told["width"] == PHONE
+    assert told["needed"] == PHONE
+    assert told["outside"] == []
+    assert told["drawn"] == told["plots"] >= 14
+    assert told["narrowest"] > 0.9 * PHONE
+
+
+@slow
+def test_text_is_legible_on_a_phone(told: dict[str, Any]) -> None:
+    assert told["small"] == []
+    assert told["smallest"] >= 9
+
+
+@slow
+def test_it_is_bright_by_day_and_dark_at_night(browser: Browser, of_diagnosis: Path) -> None:
+    day = pixels(browser.screenshot(of_diagnosis, 1280, 1800))
+    night = pixels(browser.screenshot(of_diagnosis, 1280, 1800, DARK))
+    for image in (day, night):
+        assert image.shape == (1800, 1280, 3)
+        assert colours(image) > 40
+    assert np.median(day) > 0.95
+    assert np.median(night) < 0.15
+    ink = [float(np.mean(np.abs(i - np.median(i)) > 0.2)) for i in (day, night)]
+    assert min(ink) > 0.02
+    assert ink[1] == pytest.approx(ink[0], rel=0.6)
+    assert np.sum(np.all(np.abs(day - BLUE) < 0.02, axis=2)) > 2000
+
+
+@slow
+def test_a_screenshot_of_a_phone_is_filled(browser: Browser, of_diagnosis: Path) -> None:
+    image = pixels(browser.screenshot(on_a_phone(of_diagnosis, 1800), 500, 1800))[:, :PHONE]
+    assert colours(image) > 40
+    rows = np.any(np.abs(image - np.median(image)) > 0.2, axis=(1, 2))
+    # text and curves begin near the top, go on to the end, and no screenful is empty
+    gaps = np.diff(np.flatnonzero(np.concatenate([[True], rows, [True]])))
+    assert int(np.max(gaps)) < 200
+    assert not np.any(np.abs(image[:, -4:] - np.median(image)) > 0.2)
+
+
+@slow
+def test_a_page_prints_on_few_sheets(browser: Browser, of_diagnosis: Path) -> None:
+    path = of_diagnosis.with_suffix(".pdf")
+    browser.document(of_diagnosis, DARK, f"--print-to-pdf={path}")
+    data = path.read_bytes()
+    assert data.startswith(b"%PDF")
+    assert len(data) > 60_000
+    assert 4 <= len(re.findall(rb"/Type\s*/Page\b", data)) <= 16

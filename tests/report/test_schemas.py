@@ -1,0 +1,108 @@
+"""The JSON schemas that the package ships, against their records and against what is written."""
+
+import json
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from psa_casadi.diagnosis.patch import Patch
+from psa_casadi.diagnosis.result import Alternative
+from psa_casadi.effects import EFFECTS
+from psa_casadi.export.check.check import CheckReport
+from psa_casadi.export.check.rows import CheckRow, stopped
+from psa_casadi.identification.profile import Profile
+from psa_casadi.model.model_file import dumps
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.report.documents.files import check_file, identification_file
+from psa_casadi.report.documents.schemas import FILES, schema_texts
+from psa_casadi.strict_json import json_text
+from psa_casadi.variables import Publication
+from tests.model.evidence_models import evident_model
+from tests.report.report_cases import diagnosis, identification, with_periodic
+
+
+def shipped(name: str) -> dict[str, Any]:
+    text = (files("psa_casadi") / "data" / "schemas" / f"{name}.schema.json").read_text("utf-8")
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def valid(name: str, text: str) -> dict[str, Any]:
+    """Return what a JSON text holds, which must be as its shipped schema says."""
+    content: dict[str, Any] = json.loads(text)
+    jsonschema.Draft202012Validator(shipped(name)).validate(content)
+    return content
+
+
+def test_what_is_shipped_is_what_the_records_say() -> None:
+    folder = files("psa_casadi") / "data" / "schemas"
+    kept = {entry.name: entry.read_text("utf-8") for entry in folder.iterdir()}
+    assert kept == schema_texts(), "accept with: python -m build_scripts.schemas"
+    for name in FILES:
+        jsonschema.Draft202012Validator.check_schema(shipped(name))
+
+
+@pytest.mark.parametrize("name", STACKS)
+def test_model_files_are_as_their_schema_says(name: str) -> None:
+    model = stack_model(name).with_effect(EFFECTS["slow_creep"])
+    valid("model", dumps(model))
+    published = replace(model, publication=Publication(author="A", version="1"))
+    valid("model", dumps(published.with_starts({"z_c1": 1e-7})))
+
+
+def test_the_evidence_of_a_model_is_as_its_schema_says() -> None:
+    assert "evidence" in valid("model", dumps(evident_model()))
+
+
+@pytest.mark.parametrize("verdict", ["adequate", "cause_named", "ambiguous", "unexplained"])
+def test_diagnoses_are_as_their_schema_says(verdict: Any) -> None:
+    d = with_periodic(diagnosis(verdict))
+    content = valid("diagnosis", d.to_json())
+    assert content["misfit"][0]["views"]
+    none = np.zeros(1)
+    patch = Patch("curve", "reading", 9.0, ("lag at the drive",), (), (), none, none)
+    other = Alternative("slow_creep", "offset_drift", d.model, 1.01, 1e-9, 0.1)
+    assert valid("diagnosis", replace(d, patch=patch, alternatives=(other,)).to_json())["patch"]
+
+
+def test_identifications_are_as_their_schema_says() -> None:
+    found = identification()
+    k = found.determinacy.names[0]
+    profile = Profile(k, "N/m", "N/um", True, (0, 1), 1.0, 0.1, np.ones(2), np.ones(2), 0.9, None)
+    content = valid("identification", json_text(identification_file(found, [profile])))
+    interval = found.model.provenance.intervals[k]
+    assert content["parameters"][k]["interval"] == [interval.low, interval.high]
+    assert content["profiles"][k] == {"unit": "N/m", "estimate": 1.0, "low": 0.9, "high": None}
+    (e, *_) = found.experiments
+    assert content["records"][0]["sha256"] == e.record.sha256
+    assert content["records"][0]["rms_m"] == pytest.approx(content["rms_m"], rel=0.5)
+    assert valid("identification", json_text(identification_file(found)))["profiles"] == {}
+
+
+def test_checks_are_as_their_schema_says() -> None:
+    rows = (CheckRow("trajectory", 1e-8, 1e-6, True, ""), stopped("calls", "it hung"))
+    content = valid(
+        "check", json_text(check_file(CheckReport(Path("a.fmu"), rows, compared=False)))
+    )
+    assert [r["found"] for r in content["rows"]] == [1e-8, None]
+    assert (content["passed"], content["fmu"]) == (False, "a.fmu")
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        {"format": "psa_casadi.check/2"},
+        {"passed": "yes"},
+        {"more": 1},
+        {"rows": [{"name": "a"}]},
+    ],
+)
+def test_what_is_otherwise_is_refused(spoil: dict[str, Any]) -> None:
+    content = {**check_file(CheckReport(Path("a.fmu"), (), compared=True)), **spoil}
+    with pytest.raises(jsonschema.ValidationError):
+        valid("check", json_text(content))

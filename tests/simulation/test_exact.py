@@ -1,0 +1,483 @@
+"""exp and log of exact steps: their tables correctly rounded, their values to the last place."""
+
+import ctypes
+import re
+import struct
+from collections.abc import Iterator
+from decimal import Decimal, localcontext
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi import reference
+from psa_casadi.component import Component, Equations
+from psa_casadi.components import BASE, SIMPLIFIED
+from psa_casadi.effects import EFFECTS
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.model.structure import structure_of
+from psa_casadi.reference import Mechanics
+from psa_casadi.simulation import stepper
+from psa_casadi.simulation.compiler import (
+    FLAGS_VARIABLE,
+    shared_library,
+    sources_directory,
+    vector_flags,
+    zig_command,
+)
+from psa_casadi.simulation.exact import run as exact
+from psa_casadi.simulation.exact.run import run_exact, why_not
+from psa_casadi.simulation.exact.split import Split, split_of
+from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, simulate
+from psa_casadi.simulation.start import start_on
+from tests.export.c_host.build import tool
+from tests.model.sampled_models import loop
+from tests.model.stack_models import stack
+from tests.model.test_agreement import stack_values
+from tests.simulation.exact_cases import (
+    BEAT,
+    CUBIC,
+    FEEDBACK,
+    JUMP,
+    KINK,
+    LAG,
+    OUTPUT,
+    VOLTAGES,
+    composite,
+    error,
+    inputs,
+    stepped,
+    times,
+    voltage,
+    with_effect,
+)
+from tests.studies.benchmarks.fits import demonstration
+from tests.tiers import slow
+
+FloatArray = NDArray[np.float64]
+
+RTOL = 1e-6
+SAMPLES = 1500
+#: A few of the stack's lags in a sample, and many of them.
+SAMPLE_TIMES = (2e-5, 1e-3)
+NAMES = ("base", *EFFECTS)
+
+
+def compare(
+    model: Model, t: FloatArray, relative: FloatArray, rtol: float = RTOL, hold: str = "linear"
+) -> tuple[float, str]:
+    """Return the error of a run over the range, by a stepper that is far finer, and the way."""
+    u = inputs(model, t, relative)
+    x0 = start_on(model, t, u).x
+    steps, way = accurate(model, t, u, x0, rtol=rtol, hold=hold)
+    shown = steps.y[:, model.output_names.index(OUTPUT)]
+    fine = max(1e-4 * rtol, 1e-12)
+    return error(shown, stepped(model, t, u, x0, rtol=fine, hold=hold)), way
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_composite_record_agrees_with_the_stepper(name: str) -> None:
+    """A sine, a ramp, a hold and a step; the stepper takes its 1500 steps and more."""
+    found, way = compare(with_effect(name), times(SAMPLES, 1e-4), composite(SAMPLES))
+    assert found <= RTOL
+    # thresholds that follow the rate fall within a microsecond at a reversal: no step is so short
+    assert way == EXACT or name == "rate_dependent_hysteresis"
+
+
+@slow
+@pytest.mark.parametrize("turn", range(len(NAMES)), ids=NAMES)
+def test_every_stack_and_voltage_agrees_with_the_stepper(turn: int) -> None:
+    """Every effect with three stacks in turn, and any two of stack, voltage and sample time.
+
+    Voltage and sample time go round with effect and stack. One of the runs of an effect may be
+    stepped: play behind a light resonance turns at every swing. Two where the loop follows the
+    rate, whose notch at a turn is seen only by the finest steps.
+    """
+    ways = []
+    names = sorted(STACKS)
+    for k, stack_name in ((k, names[(turn + k) % len(names)]) for k in range(3)):
+        kind = VOLTAGES[(turn + k) % len(VOLTAGES)]
+        step = SAMPLE_TIMES[(turn // len(VOLTAGES) + k) % len(SAMPLE_TIMES)]
+        share = np.linspace(0.0, 1.0, SAMPLES)
+        model = with_effect(NAMES[turn], stack_name)
+        found, way = compare(model, times(SAMPLES, step), voltage(kind, share))
+        # where the stepper was taken it may err by what its own 0.0005 rtol a step adds up to
+        assert found <= (RTOL if way == EXACT else 3 * RTOL), (stack_name, kind, step)
+        ways.append(way)
+    stepped_ones = 2 if NAMES[turn] == "rate_dependent_hysteresis" else 1
+    assert ways.count(EXACT) >= len(ways) - stepped_ones
+
+
+@pytest.mark.parametrize("rtol", [1e-5, *(pytest.param(r, marks=slow) for r in (1e-7, 1e-8))])
+@pytest.mark.parametrize("name", ["base", "hysteresis_memory", "load_stiffness", "drive_lag"])
+def test_the_error_keeps_to_other_tolerances(name: str, rtol: float) -> None:
+    """Exact steps do not know their error to less than 1e-6: then the stepper is taken."""
+    relative = np.concatenate([composite(300), voltage("triangle", np.linspace(0.0, 1.0, 300))])
+    found, way = compare(with_effect(name), times(600, 1e-4), relative, rtol)
+    assert found <= rtol
+    assert way == (EXACT if rtol >= 1e-6 else STEPPER)
+
+
+@pytest.mark.parametrize("name", ["base", "backlash", "voltage_saturation"])
+def test_held_inputs_agree(name: str) -> None:
+    """Every sample begins with a jump."""
+    relative = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
+    found, way = compare(with_effect(name), times(600, 1e-4), relative, hold="zero")
+    assert found <= RTOL
+    assert way == EXACT or name == "voltage_saturation"  # a corner of the clip at every jump
+
+
+@pytest.mark.parametrize("name", ["base", "backlash"])
+def test_a_few_time_steps_in_one_record(name: str) -> None:
+    t = np.cumsum(np.repeat([1e-4, 1e-3, 2.5e-5], 200))
+    relative = voltage("sine", t / t[-1])
+    found, way = compare(with_effect(name), t, relative)
+    assert found <= RTOL
+    assert way == EXACT
+
+
+def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
+    model, rng = stack("P-885.51"), np.random.default_rng(3)
+    t = 1e-3 * (np.arange(300) + 0.01 * rng.standard_normal(300))
+    v = 60.0 * (1.0 - np.cos(20.0 * t))
+    found = simulate(model, t, v)
+    assert found.way == STEPPER
+    regular = simulate(model, times(300, 1e-3), v)
+    assert regular.way == EXACT
+    # clocks tell times to a few digits only: that is no other step
+    rounded = np.round(times(300, 1e-3), 9) + 1.0e-3 * 2e-7 * rng.standard_normal(300)
+    assert simulate(model, rounded, v).way == EXACT
+
+
+@pytest.mark.parametrize("name", ["base", "slow_creep", "sensor_delay"])
+@pytest.mark.parametrize("shift", [np.pi / 2, np.pi], ids=["in motion", "at the top"])
+def test_a_record_may_start_anywhere(name: str, shift: float) -> None:
+    t = times(600, 1e-4)
+    found, way = compare(with_effect(name), t, 0.4 * (1.0 - np.cos(300.0 * t + shift)))
+    assert found <= RTOL
+    assert way == EXACT
+
+
+@pytest.mark.parametrize(
+    ("component", "expected"),
+    [(LAG, EXACT), (CUBIC, EXACT), (JUMP, STEPPER)],
+    ids=["lag", "spring", "jump"],
+)
+def test_a_component_of_one_s_own_agrees_or_is_stepped(component: Component, expected: str) -> None:
+    model = compose((*BASE, component), stack("P-885.51").values)
+    t = times(200, 1e-3)
+    found, way = compare(model, t, voltage("sine", t / t[-1]))
+    assert found <= 2 * RTOL  # the stepper does not look for the jump
+    assert way == expected
+
+
+TONES = [2.5e-4, *(pytest.param(q, marks=slow) for q in (3.1e-4, 1.25e-4, 6.25e-5))]
+
+
+@pytest.mark.parametrize("period", TONES)
+def test_a_tone_whose_period_divides_a_sample_is_seen(period: float) -> None:
+    """It looks constant at start, quarter, half and end of a sample."""
+    values = {**stack("P-885.51").values, "beat_period": period}
+    t = times(200, 1e-3)
+    found, _ = compare(compose((*BASE, BEAT), values), t, voltage("sine", t / t[-1]))
+    assert found <= RTOL
+
+
+#: The quick tier has one stack with both mechanics, the full one every stack, in turn with either.
+RAMPED = [
+    ("P-885.51", "cascade"), ("P-885.51", "single_mass"),
+    *(pytest.param(n, m, marks=slow) for n, m in (
+        ("PTBS200", "cascade"), ("WYDS0808020", "single_mass"), ("demo", "single_mass"),
+        ("micromanipulator", "cascade"),
+    )),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("stack_name", "mechanics"), RAMPED)
+def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Mechanics) -> None:
+    """Corners at samples, given to the reference as breakpoints; by exact steps and the stepper.
+
+    The stepper is given the corners and every tenth sample only.
+    """
+    p = stack_values(stack_name, mechanics)
+    corners = np.array([0.0, 0.05, 0.1, 0.101, 0.15, 0.35, 0.4])
+    levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
+    t = times(401, 1e-3)
+    model = compose(BASE if mechanics == "cascade" else SIMPLIFIED, p)
+    found = simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True)
+    # its asymmetry goes on while the voltage comes to rest, which only the finest steps see
+    assert found.way == EXACT or stack_name == "micromanipulator"
+    path = reference.from_samples(corners, levels)
+    every = slice(None, None, 10)
+    true = reference.simulate(
+        p, path, t[every], mechanics=mechanics, breakpoints=list(corners), rtol=1e-9
+    )
+    assert error(found.outputs["displacement"][every], true.displacement) <= RTOL
+    few = np.union1d(t[every], corners)
+    path_at_corners = np.interp(few, corners, levels)
+    own = simulate(model, few, path_at_corners, from_rest_at_zero=True, rtol=1e-10)
+    assert own.way == STEPPER
+    shown = own.outputs["displacement"][np.isin(few, t[every])]
+    assert error(shown, true.displacement) <= RTOL
+
+
+def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
+    """At the demonstration's kinks steps that were halved once where they err by far missed it."""
+    task = demonstration()
+    x0, _ = task.start(task.model)
+    rough, fine = (
+        run_exact(task.model, task.time, task.inputs, x0, tolerance=q, output=OUTPUT).shown
+        for q in (1e-5, 1e-8)
+    )
+    assert np.max(np.abs(rough - fine)) <= 1e-5 * np.ptp(fine)
+
+
+#: Force that the hysteresis softens: what it multiplies lies in a loop.
+SOFTER = Component(
+    name="softer",
+    description="a spring that the hysteresis softens",
+    source="test",
+    equations=lambda s: Equations(add={"tip_force": -1e3 * s.f_H * s.x}),
+)
+
+
+@pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
+def test_every_effect_splits(base: tuple[Component, ...]) -> None:
+    present = {c.name for c in base}
+    whole = [e for e in EFFECTS.values() if set(e.needs) <= present]
+    assert len(whole) >= len(EFFECTS) - 1
+    for components in (base, *((*base, e) for e in whole), (*base, *whole)):
+        split = split_of(structure_of(components))
+        assert isinstance(split, Split), split
+        assert sorted((*split.linear, *split.along)) == list(range(len(split.structure.states)))
+
+
+@pytest.mark.parametrize(
+    ("component", "reason"),
+    [
+        (KINK, r"kink of their own \(contact\)"),
+        (FEEDBACK, r"kink of their own \(voltage_reversal\)"),  # u' is a driver's rate no more
+        (SOFTER, "a hysteresis lies in a loop"),
+        (JUMP, "jump"),  # its derivative is 0 wherever there is one
+    ],
+    ids=lambda c: getattr(c, "name", ""),
+)
+def test_what_does_not_split_says_why(component: Component, reason: str) -> None:
+    structure = compose((*BASE, component)).structure
+    found = split_of(structure)
+    assert isinstance(found, str)
+    assert re.search(reason, found)
+    assert why_not(structure, OUTPUT) == found
+
+
+def test_sampled_states_do_not_split() -> None:
+    assert split_of(loop().structure) == "it has sampled states"
+
+
+def test_a_function_that_the_c_code_does_not_have_is_told() -> None:
+    """The text is printed only where there is no library yet, so that it fails there."""
+    bent = Component(
+        name="bent",
+        description="a force by the inverse of a hyperbolic sine",
+        source="test",
+        equations=lambda s: Equations(add={"free_force": ca.asinh(s.u / 10.0)}),
+    )
+    reason = why_not(compose((*BASE, bent)).structure, OUTPUT)
+    assert reason is not None
+    assert reason.startswith("operation")
+
+
+def _clear() -> None:
+    """Forget the libraries that are loaded."""
+    exact._compiled.cache_clear()
+    exact._library.cache_clear()
+    stepper._library.cache_clear()
+
+
+@pytest.fixture
+def _plain_vectors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Compile without this processor's vectors, in libraries of their own."""
+    _clear()
+    monkeypatch.setattr(exact, "vector_flags", lambda: ())
+    yield
+    _clear()
+
+
+def results(name: str) -> list[FloatArray]:
+    """Return displacement, derivatives, states and outputs of a run."""
+    model = with_effect(name)
+    t = times(400, 1e-4)
+    u = inputs(model, t, composite(400))
+    unknowns: list[str | int] = ["k_L", "A", "R_s", "tau", "k_P"]
+    found = exact.run_exact(
+        model, t, u, start_on(model, t, u).x, tolerance=1e-7, unknowns=unknowns, everything=True
+    )
+    arrays = (found.shown, found.sensitivity, found.x, found.y)
+    return [np.asarray(a) for a in arrays if a is not None]
+
+
+@pytest.mark.skipif(not vector_flags(), reason="this processor has no wide vectors")
+def test_wide_vectors_do_not_change_a_bit(
+    request: pytest.FixtureRequest,
+) -> None:
+    wide = results("backlash")
+    request.getfixturevalue("_plain_vectors")
+    for ours, theirs in zip(wide, results("backlash"), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@slow
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_every_compiler_gives_the_same_bits(
+    compiler: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """Where `ziglang` is not installed, the system's compiler takes its place."""
+    request.addfinalizer(_clear)
+    monkeypatch.delenv(FLAGS_VARIABLE, raising=False)
+    found = []
+    for command in ([tool(compiler)], zig_command()):
+        _clear()
+        monkeypatch.setenv("CC", " ".join(command))
+        found.append(results("backlash"))
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@slow
+def test_what_the_tests_compile_with_gives_the_bits_of_what_users_have(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    """Exact steps of one set and of four side by side, and the stepper: -Og, -O1 or -O3, -O2."""
+    request.addfinalizer(_clear)
+    monkeypatch.setenv("CC", tool("gcc"))
+    found = []
+    for flags in ("-Og", ""):
+        _clear()
+        monkeypatch.setenv(FLAGS_VARIABLE, flags)
+        found.append([*results("backlash"), *_side_by_side("backlash"), *_stepped("backlash")])
+    assert len(found[0]) == 7
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+        assert np.ptp(ours) > 0.0
+
+
+def _side_by_side(name: str) -> list[FloatArray]:
+    """Return the displacement (n, 4) of four sets of parameters in lanes."""
+    model = with_effect(name)
+    t = times(400, 1e-4)
+    u = inputs(model, t, composite(400))
+    sets = [model.with_values({"k_L": share * model.values["k_L"]}) for share in (1, 1.1, 1.2, 1.3)]
+    p = np.array([[m.values[n] for m in sets] for n in model.parameter_names])
+    x0, nominal = (
+        np.column_stack(columns)
+        for columns in zip(*((start_on(m, t, u).x, m.state_nominals()) for m in sets), strict=True)
+    )
+    return [exact.run_sets(model.structure, t, u, p=p, x0=x0, nominal=nominal, tolerance=1e-7)]
+
+
+def _stepped(name: str) -> list[FloatArray]:
+    """Return outputs and derivatives of the stepper."""
+    model = with_effect(name)
+    t = times(400, 1e-4)
+    u = inputs(model, t, composite(400))
+    found = stepper.run(model, t, u, start_on(model, t, u).x, unknowns=["k_L", "A"])
+    return [found.y, np.asarray(found.sensitivity)]
+
+
+ENTRIES = 128
+LAST_PLACE = 2.0**-52
+CODE = """
+#include "exact_math.h"
+#define EACH(name)                                                                                \\
+    __attribute__((visibility("default"))) void each_##name(long n, const double *x, double *y) { \\
+        for (long i = 0; i < n; ++i) {                                                            \\
+            const real z = x[i] + REAL(0.0);                                                      \\
+            const real found = name(z);                                                           \\
+            y[i] = LANE(found, PSA_LANES - 1);                                                    \\
+        }                                                                                         \\
+    }
+EACH(v_exp)
+EACH(v_log)
+EACH(v_log_of_base)
+"""
+
+
+@cache
+def library(lanes: int) -> ctypes.CDLL:
+    flags = ("-std=gnu99", f"-DPSA_LANES={lanes}")
+    return ctypes.CDLL(str(shared_library({"math.c": CODE}, (), flags)))
+
+
+def each(name: str, x: FloatArray, lanes: int = 1) -> FloatArray:
+    y = np.empty_like(x)
+    doubles = ctypes.POINTER(ctypes.c_double)
+    call = getattr(library(lanes), f"each_{name}")
+    call(ctypes.c_long(x.size), x.ctypes.data_as(doubles), y.ctypes.data_as(doubles))
+    return y
+
+
+def arguments(name: str) -> FloatArray:
+    if name == "v_exp":
+        return np.concatenate([np.linspace(-708.0, 709.0, 100_003), np.linspace(-1, 1, 10_001)])
+    return np.concatenate([np.geomspace(1e-300, 1e300, 100_003), np.linspace(0.7, 1.5, 10_001)])
+
+
+def numbers(table: str) -> list[float]:
+    text = (sources_directory() / "exact_tables.h").read_text()
+    body = text[text.index(table) :].split("= {", 1)[1].split("};", 1)[0]
+    return [float.fromhex(q) for q in re.findall(r"-?0x1\.[0-9a-f]+p[+-]\d+|0x0\.0p\+0", body)]
+
+
+def from_bits(bits: int) -> float:
+    return float(struct.unpack("<d", struct.pack("<Q", bits))[0])
+
+
+def test_powers_in_the_table_are_rounded_correctly() -> None:
+    with localcontext() as context:
+        context.prec = 60
+        exact = [float(Decimal(2) ** (Decimal(i) / ENTRIES)) for i in range(ENTRIES)]
+    assert numbers("EXP_TABLE") == exact
+
+
+def test_logarithms_in_the_table_are_rounded_correctly() -> None:
+    found = numbers("LOG_TABLE")
+    assert len(found) == 2 * ENTRIES
+    first = struct.unpack("<Q", struct.pack("<d", float(np.sqrt(0.5))))[0]
+    for i, (inverse, log) in enumerate(zip(found[::2], found[1::2], strict=True)):
+        with localcontext() as context:
+            context.prec = 60
+            assert log == float(-Decimal(inverse).ln())
+        assert inverse * 2.0**12 == round(inverse * 2.0**12)  # 13 bits: m / c is nearly exact
+        for edge in (i, i + 1):
+            assert abs(from_bits(first + (edge << 45)) * inverse - 1.0) < 0.0041
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+@pytest.mark.parametrize("name", ["v_exp", "v_log"])
+def test_relative_error_is_a_last_place(name: str, lanes: int) -> None:
+    x = arguments(name)
+    exact = (np.exp if name == "v_exp" else np.log)(x.astype(np.longdouble))
+    error = np.abs(each(name, x, lanes) - exact)
+    assert np.max(error / np.maximum(np.abs(exact), 1e-320)) <= LAST_PLACE
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_logarithm_of_a_base_is_good_enough_for_powers(lanes: int) -> None:
+    x = arguments("v_log_of_base")
+    exact = np.log(x.astype(np.longdouble))
+    error = np.abs(each("v_log_of_base", x, lanes) - exact)
+    assert np.max(error / np.maximum(1.0, np.abs(exact))) <= 2.0 * LAST_PLACE
+
+
+def test_ends() -> None:
+    assert each("v_exp", np.array([-1e4, 0.0, 1e4])).tolist() == [
+        pytest.approx(np.exp(-708.0)),
+        1.0,
+        pytest.approx(np.exp(709.0)),
+    ]
+    for name in ("v_log", "v_log_of_base"):
+        assert each(name, np.array([1.0])).tolist() == [0.0]
+        assert np.isnan(each(name, np.array([0.0, -1.0]))).all()

@@ -1,0 +1,281 @@
+"""Many sets of parameters at once: the bits of each alone, whatever stands beside it."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from psa_casadi.component import Component
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError, MachineError
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.records.record import Record
+from psa_casadi.simulation import device
+from psa_casadi.simulation.many import simulate_many
+from psa_casadi.simulation.simulate import record_inputs, simulate_record
+from psa_casadi.simulation.start import start_on, starts_on
+from tests.model.stack_models import stack
+from tests.simulation.cuda_host import HostCuda, lend
+from tests.simulation.exact_cases import KINK
+from tests.tiers import slow
+
+FloatArray = NDArray[np.float64]
+
+
+def record(uneven: bool = False) -> Record:
+    """Return two cycles, a ramp and a hold; with other time steps throughout if `uneven`."""
+    t: FloatArray = np.arange(600, dtype=np.float64) * 2e-4
+    if uneven:
+        t = t + 1e-5 * np.random.default_rng(1).standard_normal(600)
+    s = np.arange(600) / 600
+    v = np.where(s < 0.6, 40.0 * (1.0 - np.cos(2 * np.pi * s / 0.3)), np.minimum(400 * s - 240, 80))
+    return Record(name="sets", time=t, voltage=np.asarray(v, dtype=np.float64))
+
+
+def sets(model: Model, count: int) -> list[dict[str, float]]:
+    rng = np.random.default_rng(3)
+    return [
+        {
+            "k_L": model.values["k_L"] * (1 + 0.2 * rng.random()),
+            "n": 1.0 + rng.random(),
+            "delta": 20.0 * rng.standard_normal(),
+            "R_s": model.values["R_s"] * 10.0 ** rng.uniform(-1, 1),
+        }
+        for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize("effect", ["", "load_stiffness", "rate_dependent_hysteresis"])
+def test_a_set_has_the_same_bits_alone_and_beside_others(effect: str) -> None:
+    """Nine sets fill two groups of four lanes and begin a third; loops and turns differ by set."""
+    model = stack("P-885.51")
+    if effect:
+        gains = {"load_stiffness": "load_gain", "rate_dependent_hysteresis": "rate_gain"}
+        model = model.with_effect(_effect(effect), {gains[effect]: 0.02})
+    given = sets(model, 9)
+    together = simulate_many(model, given, record())
+    assert together.shape == (9, 600)
+    for k in (0, 3, 4, 8):
+        assert np.array_equal(simulate_many(model, [given[k]], record())[0], together[k])
+    assert np.array_equal(simulate_many(model, given[::-1], record()), together[::-1])
+
+
+def test_each_set_is_what_simulate_gives() -> None:
+    model = stack("P-885.51")
+    given = sets(model, 4)
+    for row, values in zip(simulate_many(model, given, record()), given, strict=True):
+        alone = simulate_record(model.with_values(values), record())
+        assert np.max(np.abs(row - alone.displacement)) < 2e-5 * np.ptp(row)
+
+
+def test_a_set_that_cannot_be_simulated_leaves_the_others_alone() -> None:
+    model = stack("PTBS200")
+    lost = {"A": -5.0, "beta": -4000.0, "gamma": 0.0, "n": 3.0}
+    given = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
+    found = simulate_many(model, given, record())
+    assert np.isnan(found[1, -1])
+    assert np.isfinite(found[[0, 2]]).all()
+    assert np.array_equal(found[[0, 2]], simulate_many(model, [given[0], given[2]], record()))
+
+
+def test_what_is_kept_of_each_set() -> None:
+    """Whole rows, a number and an array of each set; groups of four lanes and the stepper alike."""
+    model = stack("P-885.51")
+    given = sets(model, 5)
+    for one in (record(), record(uneven=True)):
+        rows = simulate_many(model, given, one)
+        ranges = simulate_many(model, given, one, reduce=np.ptp)
+        thinned = simulate_many(model, given, one, reduce=lambda row: row[::100])
+        assert np.array_equal(ranges, np.ptp(rows, axis=1))
+        assert np.array_equal(thinned, rows[:, ::100])
+
+
+def test_sets_by_the_names_of_parameters() -> None:
+    model = stack("P-885.51")
+    given = sets(model, 5)
+    columns = {name: [values[name] for values in given] for name in given[0]}
+    rows = simulate_many(model, given, record())
+    assert np.array_equal(simulate_many(model, columns, record()), rows)
+    with pytest.raises(InputError, match=r"in arrays of one length; .*k_L \(5,\), n \(1,\)"):
+        simulate_many(model, {"k_L": columns["k_L"], "n": 1.5}, record())
+    with pytest.raises(InputError, match="there are: none"):
+        simulate_many(model, {}, record())
+    with pytest.raises(InputError, match="no parameter 'stiffness'"):
+        simulate_many(model, {"stiffness": [1.0]}, record())
+    with pytest.raises(InputError, match="outside its bounds"):
+        simulate_many(model, {"n": [1.5, -1.0]}, record())
+
+
+def test_uneven_records_run_in_the_stepper() -> None:
+    model = stack("P-885.51")
+    found = simulate_many(model, [{}, {"k_L": 1.1 * model.values["k_L"]}], record(uneven=True))
+    even = simulate_many(model, [{}], record())
+    assert np.isfinite(found).all()
+    assert np.max(np.abs(found[0] - even[0])) < 0.05 * np.ptp(even)
+
+
+def test_mistakes_are_told() -> None:
+    model = stack("P-885.51")
+    assert simulate_many(model, [], record()).shape == (0, 600)
+    with pytest.raises(InputError, match="no parameter 'stiffness'"):
+        simulate_many(model, [{"stiffness": 1.0}], record())
+    with pytest.raises(InputError, match="outside its bounds"):
+        simulate_many(model, [{"n": -1.0}], record())
+
+
+def _effect(name: str) -> Component:
+    return EFFECTS[name]
+
+
+#: Memory in which some of nine sets' displacements fit at a time.
+SMALL = 100_000
+
+
+@pytest.fixture
+def host(monkeypatch: pytest.MonkeyPatch) -> HostCuda:
+    """Put this processor in the place of a GPU with little memory."""
+    return lend(monkeypatch, SMALL)
+
+
+def test_the_kernel_has_the_bits_of_the_lanes(host: HostCuda) -> None:
+    """Nine sets in batches, whole rows and what is kept of them; squares are summed otherwise.
+
+    The matrices' ladder is a thread's own.
+    """
+    model, one = stack("P-885.51"), record()
+    given = sets(model, 9)
+    rows = simulate_many(model, given, one)
+    np.testing.assert_array_equal(simulate_many(model, given, one, device="cuda"), rows)
+    assert host.launches[1:] == [128, 128]  # behind the question for the size of a room
+    for name in ("range", "peak", "last"):
+        ours = simulate_many(model, given, one, reduce=name, device="cuda")
+        np.testing.assert_array_equal(ours, simulate_many(model, given, one, reduce=name))
+    ours = simulate_many(model, given, one, reduce=lambda row: row[::100], device="cuda")
+    np.testing.assert_array_equal(ours, rows[:, ::100])
+    measured = replace(one, displacement=rows[3])
+    apart = simulate_many(model, given, measured, reduce="misfit", device="cuda")
+    np.testing.assert_allclose(apart, np.sqrt(np.mean((rows - rows[3]) ** 2, axis=1)), rtol=1e-13)
+    np.testing.assert_allclose(
+        apart, simulate_many(model, given, measured, reduce="misfit"), rtol=1e-13
+    )
+    assert apart[3] == 0.0
+
+
+def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
+    model = stack("PTBS200")
+    lost = {"A": -5.0, "beta": -4000.0, "gamma": 0.0, "n": 3.0}
+    given: list[dict[str, float]] = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
+    rows = simulate_many(model, given, record())
+    assert np.isnan(rows[1, -1])
+    np.testing.assert_array_equal(simulate_many(model, given, record(), device="cuda"), rows)
+    ranges = simulate_many(model, given, record(), reduce="range", device="cuda")
+    np.testing.assert_array_equal(ranges, np.ptp(rows, axis=1))
+    assert host.launches
+
+
+@slow
+def test_ports_that_feed_back_are_solved_alike(host: HostCuda) -> None:
+    """The matrices' ladder is too large for a thread's own memory."""
+    model = stack("P-885.51").with_effect(EFFECTS["load_stiffness"], {"load_gain": 0.02})
+    given = sets(model, 3)
+    rows = simulate_many(model, given, record())
+    np.testing.assert_array_equal(simulate_many(model, given, record(), device="cuda"), rows)
+    assert host.launches[1:] == [128, 128, 128]  # one fits in the memory
+
+
+@pytest.mark.parametrize("effect", ["slow_creep", "structural_mode"])
+def test_starts_of_many_sets_have_the_bits_of_each(effect: str) -> None:
+    """Creep has a memory that settles; a gain of zero is not taken out before."""
+    gain = EFFECTS[effect].gain
+    assert gain is not None
+    model = stack("P-885.51").with_effect(EFFECTS[effect], {gain: 0.01})
+    given = [{**values, gain: 0.0 if k == 3 else 0.01} for k, values in enumerate(sets(model, 9))]
+    models = [model.with_values(values) for values in given]
+    t, u = record().time, record_inputs(model, record(), 600)
+    p, nominal = (
+        np.array(rows).T
+        for rows in ([m.parameter_vector() for m in models], [m.state_nominals() for m in models])
+    )
+    alone = np.column_stack([start_on(m, t, u).x for m in models])
+    np.testing.assert_array_equal(starts_on(model, p, nominal, t, u), alone)
+    assert np.ptp(alone, axis=1).any()
+
+
+def test_what_a_gpu_cannot_do_is_told(host: HostCuda) -> None:
+    model = stack("P-885.51")
+    with pytest.raises(InputError, match="exact steps fit: the record has 595 different time"):
+        simulate_many(model, [{}], record(uneven=True), device="cuda")
+    with pytest.raises(InputError, match=r"exact steps fit: .* kink of their own"):
+        simulate_many(compose((*BASE, KINK)), [{}], record(), device="cuda")
+    with pytest.raises(InputError, match=r"no device 'tpu'; choose one of \('cpu', 'cuda'\)"):
+        simulate_many(model, [{}], record(), device="tpu")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"no reduction 'mean'; choose one of .*'misfit'"):
+        simulate_many(model, [{}], record(), reduce="mean")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="'misfit' needs the displacement of the record 'sets'"):
+        simulate_many(model, [{}], record(), reduce="misfit")
+    assert not host.launches
+    assert simulate_many(model, [], record(), device="cuda").shape == (0, 600)
+
+
+def test_a_gpu_that_fails_is_told(host: HostCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(shape: object, dtype: object = None) -> None:
+        raise MemoryError("out of memory allocating 512 bytes")
+
+    monkeypatch.setattr(host, "empty", full)
+    with pytest.raises(MachineError, match=r"GPU failed \(out of memory .*nvidia-smi"):
+        simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
+
+
+class _NoDriver:
+    """The module cupy where it finds `count` devices, or no driver."""
+
+    def __init__(self, count: int | None) -> None:
+        self.cuda = SimpleNamespace(runtime=SimpleNamespace(getDeviceCount=self.devices))
+        self._count = count
+
+    def devices(self) -> int:
+        """Return how many there are."""
+        if self._count is None:
+            raise RuntimeError("cudaErrorInsufficientDriver")
+        return self._count
+
+
+@pytest.mark.parametrize(
+    ("count", "said"),
+    [(None, r"no GPU \(cudaErrorInsufficientDriver\); .*nvidia-smi"), (0, "CUDA_VISIBLE_DEVICES")],
+)
+def test_a_missing_gpu_is_told(
+    monkeypatch: pytest.MonkeyPatch, count: int | None, said: str
+) -> None:
+    monkeypatch.setattr(device, "import_module", lambda _: _NoDriver(count))
+    with pytest.raises(InputError, match=said):
+        simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
+
+
+def test_a_missing_cupy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> Any:
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    monkeypatch.setattr(device, "import_module", absent)
+    with pytest.raises(InputError, match=r"No module named 'cupy'.*psa-casadi\[gpu\]"):
+        simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
+
+
+def test_a_gpu_gives_what_the_processor_gives() -> None:
+    """Where there is a GPU: the same equations in double precision, rounded one by one."""
+    try:
+        device.device_module()
+    except InputError as error:
+        pytest.skip(str(error))
+    model = stack("P-885.51")
+    given = sets(model, 300)
+    rows = simulate_many(model, given, record())
+    size = np.ptp(rows, axis=1)
+    found = simulate_many(model, given, record(), device="cuda")
+    assert np.max(np.abs(found - rows) / size[:, None]) < 1e-9
+    ranges = simulate_many(model, given, record(), reduce="range", device="cuda")
+    np.testing.assert_array_equal(ranges, np.ptp(found, axis=1))

@@ -1,0 +1,219 @@
+"""The stages of long work: what each took, and the simulations of all its threads."""
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier, Event
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+from typer.testing import CliRunner
+
+from psa_casadi.cli.app import app
+from psa_casadi.component import Component
+from psa_casadi.components import BASE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import MachineError
+from psa_casadi.model.compose import Model, Structure, compose
+from psa_casadi.records import write_record
+from psa_casadi.records.excitation import time_grid, triangle
+from psa_casadi.report.words.tables import timings_table
+from psa_casadi.simulation import side_by_side as module
+from psa_casadi.simulation.side_by_side import (
+    VARIABLE,
+    compiled,
+    compiled_ahead,
+    one_thread_of_algebra,
+    side_by_side,
+)
+from psa_casadi.simulation.simulate import simulate
+from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.timings import REST, Stage, stage, timed
+from tests.model.stack_models import stack
+
+PATIENCE = 10.0
+
+
+@pytest.fixture(autouse=True)
+def _two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PSA_CASADI_THREADS", "2")
+
+
+@pytest.fixture
+def base() -> Model:
+    return stack("P-885.51")
+
+
+def _with_effects(base: Model, *names: str) -> list[Model]:
+    return [base.with_effect(EFFECTS[n]) for n in names]
+
+
+def _effects_of(structure: Structure) -> tuple[Component, ...]:
+    return tuple(c for c in structure.components if c.gain is not None)
+
+
+def test_models_are_compiled_while_the_block_runs(
+    monkeypatch: pytest.MonkeyPatch, base: Model
+) -> None:
+    done, all_done = [], Event()
+
+    def why_not(structure: Structure, output: str) -> None:
+        done.append((*(e.name for e in _effects_of(structure)), output))
+        if len(done) == 3:
+            all_done.set()
+
+    monkeypatch.setattr(module, "why_not", why_not)
+    models = _with_effects(base, "slow_creep", "sensor_lag")
+    with compiled_ahead(models, first=[lambda: done.append(("first",))]):
+        assert all_done.wait(PATIENCE)
+    shown = "measured_displacement"
+    assert done == [("first",), ("slow_creep", shown), ("sensor_lag", shown)]
+
+
+def test_what_has_not_begun_at_the_end_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, base: Model
+) -> None:
+    begun, over, compiled_models = Event(), Event(), []
+
+    def long() -> None:
+        begun.set()
+        assert over.wait(PATIENCE)
+
+    monkeypatch.setattr(module, "why_not", lambda *given: compiled_models.append(given))
+    shutdown = ThreadPoolExecutor.shutdown
+
+    def ended(pool: ThreadPoolExecutor, **how: bool) -> None:
+        shutdown(pool, **how)
+        over.set()
+
+    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", ended)
+    with compiled_ahead([base], first=[long]):
+        assert begun.wait(PATIENCE)
+    assert over.is_set()
+    assert not compiled_models
+
+
+def test_a_failure_ahead_is_left_to_who_needs_the_model(
+    monkeypatch: pytest.MonkeyPatch, base: Model
+) -> None:
+    tried = []
+
+    def why_not(structure: Structure, output: str) -> None:
+        tried.append(output)
+        raise MachineError("no compiler")
+
+    monkeypatch.setattr(module, "why_not", why_not)
+    compiled([base, *_with_effects(base, "slow_creep")])
+    assert len(tried) == 2
+
+
+def test_models_of_a_screening_are_compiled_at_the_same_time(
+    monkeypatch: pytest.MonkeyPatch, base: Model
+) -> None:
+    both = Barrier(2)
+    monkeypatch.setattr(module, "why_not", lambda *given: both.wait(PATIENCE))
+    compiled(_with_effects(base, "slow_creep", "sensor_lag"))
+    assert not both.broken
+
+
+def _threads() -> set[int]:
+    np.eye(2) @ np.eye(2)  # there is a library to ask
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+@one_thread_of_algebra()
+def _within() -> set[int]:
+    return _threads()
+
+
+def test_the_number_of_threads_is_restored() -> None:
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = _threads()
+        with one_thread_of_algebra():
+            assert _threads() == {1}
+            assert _within() == {1}
+            assert _threads() == {1}
+        assert _threads() == before
+
+
+@pytest.mark.parametrize(("wanted", "own"), [("1", True), ("2", False), ("many", False)])
+def test_work_has_the_threads_that_are_wanted(
+    wanted: str, own: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is no number counts as nothing said: a thread for each core."""
+    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    monkeypatch.setenv(VARIABLE, wanted)
+    found = side_by_side(lambda _: threading.get_ident(), range(3))
+    assert (set(found) == {threading.get_ident()}) == own
+
+
+MODEL = compose(BASE)
+
+
+def _simulate(unknowns: list[str]) -> None:
+    with stage("told by a worker"):
+        t = np.linspace(0.0, 1e-3, 5)
+        x0 = np.zeros(len(MODEL.state_names))
+        run(MODEL, t, np.zeros((5, len(MODEL.input_names))), x0, unknowns=unknowns)
+
+
+@stage("outer")
+def _work() -> None:
+    side_by_side(_simulate, [["tau"], ["tau"], []])
+    with stage("inner"):
+        time.sleep(0.05)
+        _simulate([])
+
+
+def test_stages_count_for_themselves_and_simulations_of_all_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(VARIABLE, "2")
+    _work()  # compiled before
+    with timed() as spent:
+        _simulate([])
+        _work()
+        _work()
+    found = {s.name: s for s in spent.stages}
+    assert list(found) == ["told by a worker", "outer", "inner", REST]
+    assert (found["outer"].runs, found["outer"].differentiated) == (6, 4)
+    assert found["told by a worker"].runs == 3
+    assert found["inner"].wall > 0.09 > found["outer"].wall
+    assert found["inner"].processor < 0.09
+
+
+def test_a_stage_ends_with_an_error() -> None:
+    with timed() as spent:
+        with pytest.raises(ZeroDivisionError), stage("failing"):
+            _ = 1 / 0
+        with stage("next"):
+            time.sleep(0.01)
+    assert [s.name for s in spent.stages] == ["failing", "next", REST]
+    assert spent.stages[1].wall > 0.009 > spent.stages[0].wall
+
+
+def test_the_table_adds_up() -> None:
+    stages = (Stage("fits", 2.0, 3.0, 10, 8), Stage(REST, 1.0, 1.0))
+    assert timings_table(stages).rows == (
+        ("fits", "2.00 s", "3.00 s", "75 %", "10", "8"),
+        (REST, "1.00 s", "1.00 s", "25 %", "", ""),
+        ("total", "3.00 s", "4.00 s", "100 %", "10", "8"),
+    )
+
+
+def test_a_diagnosis_tells_its_stages(tmp_path: Path) -> None:
+    grid = time_grid(1.0, 4e-3)
+    voltage = triangle(grid, 0.0, 100.0, 4.0)
+    noise = 1e-8 * np.random.default_rng(5).standard_normal(grid.size)
+    moved = simulate(MODEL, grid, voltage).displacement + noise
+    path = tmp_path / "a.csv"
+    write_record(path, {"time [s]": grid, "voltage [V]": voltage, "displacement [m]": moved})
+    result = CliRunner().invoke(app, ["diagnose", str(path), "--timings"])
+    assert result.exit_code == 0, result.output
+    table = result.stdout[result.stdout.index("stage ") :].splitlines()
+    names = [line.split("  ")[0] for line in table]
+    assert {"loading", "reading", "base fit", "screening", "judging", "writing"} <= set(names)
+    assert int(next(line for line in table if line.startswith("base fit ")).split()[-2]) > 10
+    assert table[-1].startswith("processor time with the start of Python:")

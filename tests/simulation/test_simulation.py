@@ -1,0 +1,240 @@
+"""The stepper: accuracy, order, stability, cost, independence of the samples; starts and errors."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from psa_casadi.components import BASE
+from psa_casadi.components.stack import DRIVE
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.model.structure import structure_of
+from psa_casadi.simulation import compiler
+from psa_casadi.simulation.compiler import fingerprint, generate_c
+from psa_casadi.simulation.simulate import input_samples, simulate
+from psa_casadi.simulation.start import start_state
+from psa_casadi.simulation.stepper import SOURCES, SimulationError, run
+from tests.model.stack_models import LINEAR, jacobian, sine, stack
+
+FloatArray = NDArray[np.float64]
+
+
+@pytest.mark.parametrize(
+    ("model", "factor"),
+    [
+        (stack("P-885.51", **LINEAR), 10.0),
+        (stack("P-885.51"), 30.0),  # a step over a reversal costs more than its estimate says
+        (stack("PTBS200"), 150.0),  # a light resonance adds up the errors of its many periods
+    ],
+    ids=["linear", "hysteresis", "ringing"],
+)
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6])
+def test_result_does_not_depend_on_how_the_time_is_cut(
+    model: Model, factor: float, rtol: float
+) -> None:
+    t = np.linspace(0.0, 2e-2, 41)
+    v = sine(t, 100.0)
+    whole = simulate(model, t, v, rtol=rtol)
+    for seed in range(3):
+        cuts = np.random.default_rng(seed).uniform(0.0, t[-1], 300)
+        cut = np.union1d(t, cuts)
+        pieces = simulate(model, cut, np.interp(cut, t, v), rtol=rtol)
+        difference = pieces.displacement[np.isin(cut, t)] - whole.displacement
+        assert pieces.steps > whole.steps + 100
+        assert np.abs(difference).max() < factor * rtol * np.ptp(whole.displacement)
+
+
+def stepped(model: Model, t: FloatArray, voltage: FloatArray) -> int:
+    """Steps of the stepper at 1e-6 from rest at zero."""
+    u = input_samples(model, t.size, {"voltage": voltage})
+    start = start_state(model, [0.0, 0.0]).x
+    return run(model, t, u, start, rtol=1e-6).steps
+
+
+@pytest.mark.parametrize("form", ["sine 1 Hz", "sine 5 Hz", "triangle", "steps"])
+def test_a_fast_resonance_costs_no_more_steps_than_a_slow_stack(form: str) -> None:
+    """200 Hz for 10 s: 21 kHz, damping 0.03, against a lag of 20 ms on overdamped mechanics."""
+    t = np.arange(2000) / 200.0
+    voltage = {
+        "sine 1 Hz": sine(t, 1.0),
+        "sine 5 Hz": sine(t, 5.0),
+        "triangle": 120.0 * (1.0 - np.abs(2.0 * (t % 1.0) - 1.0)),
+        "steps": np.where((2 * t).astype(int) % 2, 80.0, 20.0),
+    }[form]
+    ringing, slow = stack("PTBS200"), stack("WYDS0808020", tau=2e-2)
+    poles = np.linalg.eigvals(jacobian(ringing))
+    light = max(poles, key=lambda pole: abs(pole.imag) / max(abs(pole), 1.0))
+    assert 2 * np.pi * 19e3 < np.abs(light) < 2 * np.pi * 23e3
+    assert -light.real / np.abs(light) < 0.04
+    steps = [stepped(model, t, voltage) for model in (ringing, slow)]
+    assert steps[0] < 1.2 * steps[1]
+    assert steps[0] < 3.3 * len(t)  # a step ends at every reversal, two in 40 samples at 5 Hz
+    if form in ("sine 1 Hz", "triangle"):
+        assert steps[0] > 0.8 * steps[1]
+
+
+@pytest.mark.parametrize(
+    ("rtol", "counts", "order"), [(4e-6, (32, 64, 128), 4), (1e6, (64, 128, 256), 2)]
+)
+def test_order_of_the_method_at_its_tolerances(
+    rtol: float, counts: tuple[int, ...], order: int
+) -> None:
+    """A linear stack on a ramp, equal steps: the error against the matrix exponential."""
+    model = stack("P-885.51", **LINEAR)
+    a = jacobian(model)
+    p, end, rate = model.parameter_vector(), 1e-3, 1e5
+    nx = len(a)
+    b = np.array(model.structure.f(0.0, np.zeros(nx), [rate, 0.0], p)[0]).ravel()
+    whole = np.zeros((nx + 2, nx + 2))  # x' = a x + b s, s' = 1
+    whole[:nx, :nx], whole[:nx, nx], whole[nx, nx + 1] = a, b, 1.0
+    truth = (expm(whole * end) @ np.eye(nx + 2)[-1])[:nx]
+    t, u = np.array([0.0, end]), np.array([[0.0, 0.0], [rate * end, 0.0]])
+    errors = []
+    for count in counts:
+        steps = run(model, t, u, np.zeros(nx), rtol=rtol, max_step=end / count * (1 + 1e-9))
+        assert count <= steps.steps <= 1.1 * count
+        errors.append(np.abs(steps.x[-1] - truth)[5] / truth[5])
+    assert errors[0] < 1e-3
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all((orders > order - 0.4) & (orders < order + 0.6)), orders
+
+
+@pytest.mark.parametrize("name", sorted(STACKS))
+def test_error_falls_with_the_tolerance(name: str) -> None:
+    model = stack(name)
+    t = np.linspace(0.0, 2e-2, 41)
+    v = sine(t, 100.0)
+    best = simulate(model, t, v, rtol=1e-12).displacement
+    errors = []
+    for rtol in (1e-3, 1e-5, 1e-7, 1e-9):  # two with the method for loose tolerances, two without
+        found = simulate(model, t, v, rtol=rtol).displacement
+        errors.append(np.abs(found - best).max() / np.ptp(best))
+    assert errors[0] < 3e-3
+    assert errors[1] < 1e-4
+    assert errors[-1] < 1e-6
+    assert errors[1] < 0.5 * errors[0]
+    assert errors[3] < 0.5 * errors[2]
+
+
+def test_a_step_far_longer_than_the_drive_does_not_ring() -> None:
+    """One step of 10^5 R_s C_p: L-stable methods forget the start, a trapezoid flips its sign."""
+    model = compose((DRIVE,), {"R_s": 10.0, "C_p": 1e-6})
+    t = np.arange(4.0)
+    steps = run(model, t, np.zeros((4, 1)), np.array([100.0]), rtol=1e9)
+    assert steps.steps == 3
+    assert np.all(np.abs(steps.x[1:]) < 1e-2)
+    rising = run(model, t, np.full((4, 1), 70.0), np.array([0.0]), rtol=1e9)
+    np.testing.assert_allclose(rising.x[1:, 0], 70.0, rtol=0, atol=1e-2)
+
+
+def test_zero_order_hold_is_the_drive_s_exponential() -> None:
+    model = stack("PTBS200")
+    t = np.arange(31) * 1e-5
+    v = np.where(t < 1e-4, 50.0, -20.0)
+    found = simulate(model, t, v, hold="zero", from_rest_at_zero=True, rtol=1e-9).states["u"]
+    rc = model.values["R_s"] * model.values["C_p"]
+    u = [0.0]
+    for level in v[:-1]:
+        u.append(level + (u[-1] - level) * np.exp(-1e-5 / rc))
+    np.testing.assert_allclose(found, u, rtol=0, atol=1e-6)
+
+
+def test_load_force_meets_the_bonding_layers() -> None:
+    model = stack("PTBS200")
+    t = np.linspace(0.0, 0.1, 11)
+    held = simulate(model, t, np.zeros(11), load_force=np.full(11, 300.0))
+    np.testing.assert_allclose(held.displacement, 300.0 / model.values["k_B"], rtol=1e-9)
+    assert not held.states["y"].any()
+    step = simulate(
+        model, t, np.zeros(11), load_force=np.full(11, 300.0), from_rest_at_zero=True, rtol=1e-9
+    )
+    assert step.displacement[0] == 0.0
+    assert step.displacement[-1] == pytest.approx(300.0 / model.values["k_B"], rel=1e-6)
+
+
+def test_a_failure_names_state_and_time() -> None:
+    model = stack("PTBS200", A=-5.0, beta=-40.0, gamma=0.0, n=2.0)
+    t = np.linspace(0.0, 1.0, 11)
+    where = r"t = 0\.0\d+ s in state 'f_(H|out)'.*loosen the tol"
+    with pytest.raises(SimulationError, match=where):
+        simulate(model, t, 2000.0 * t)
+
+
+def test_a_limit_of_steps_stops_a_costly_trial() -> None:
+    model = stack("PTBS200")
+    t = np.array([0.0, 1.0])
+    u = np.array([[0.0, 0.0], [100.0, 0.0]])
+    done = run(model, t, u, np.zeros(7))
+    assert done.steps > 5
+    with pytest.raises(SimulationError, match="too many steps"):
+        run(model, t, u, np.zeros(7), steps_limit=5)
+
+
+def test_the_steps_of_a_whole_run_are_bounded() -> None:
+    """As many as it takes are enough, one less is not."""
+    model = stack("P-885.51", **LINEAR)
+    t = np.linspace(0.0, 1e-2, 101)
+    u = np.column_stack([50.0 * np.sin(600.0 * t), np.zeros_like(t)])
+    x0 = np.zeros(len(model.state_names))
+    whole = run(model, t, u, x0)
+    taken = whole.steps + whole.rejected
+    assert run(model, t, u, x0, steps_most=taken).steps == whole.steps
+    with pytest.raises(SimulationError, match="too many steps"):
+        run(model, t, u, x0, steps_most=taken - 1)
+
+
+def test_bad_samples_are_named() -> None:
+    model, t = stack("PTBS200"), np.array([0.0, 0.1, 0.1])
+    with pytest.raises(InputError) as caught:
+        simulate(model, t, [0.0, np.nan, 1.0], load_force=[1.0])
+    for words in ("do not strictly increase", "voltage has samples", "load_force has 1 samples"):
+        assert words in str(caught.value)
+    with pytest.raises(InputError, match="no input 'load_force'"):
+        simulate(compose((DRIVE,)), [0.0, 1.0], [0.0, 1.0], load_force=[0.0, 0.0])
+    with pytest.raises(InputError) as caught:
+        run(model, np.array([0.0, 1.0]), np.zeros((2, 1)), np.zeros(3), hold="cubic")
+    for words in ("array u has the shape (2, 1)", "array x0", "hold 'cubic'"):
+        assert words in str(caught.value)
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Commands that the compiler is called with; the cache is empty."""
+    made, run_it = [], compiler.run_compiler
+
+    def counted(command: list[str], directory: Path) -> None:
+        made.append(command)
+        run_it(command, directory)
+
+    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiler, "run_compiler", counted)
+    return made
+
+
+def test_threads_that_want_one_model_compile_it_once(calls: list[list[str]]) -> None:
+    both, text = threading.Barrier(2), generate_c(compose(BASE).structure, sensitivities=True)
+
+    def wanted() -> Path:
+        both.wait()
+        return compiler.shared_library(text, SOURCES)
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = (job.result() for job in [pool.submit(wanted) for _ in range(2)])
+    assert first == second
+    assert len(calls) == 1
+
+
+def test_a_fingerprint_differs_where_the_generated_text_does() -> None:
+    structures = [structure_of(BASE), structure_of(BASE[:2])]
+    structures += [structure_of((*BASE, e)) for e in EFFECTS.values() if not e.needs]
+    prints = [fingerprint(s) for s in structures]
+    texts = [repr(generate_c(s, sensitivities=True)) for s in structures]
+    assert len(set(prints)) == len(set(texts)) == len(structures)
+    assert fingerprint(structure_of.__wrapped__(BASE)) == prints[0]

@@ -1,0 +1,1 @@
+"""The tables behind every figure the project states: `python -m tests.studies`."""

@@ -1,0 +1,306 @@
+"""`psa batch` on a population with hidden defects: what is found, what it costs, what is kept.
+
+All devices are worked on by four workers of Dask, one of which is killed after a third of them.
+"""
+
+import os
+import resource
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.devices.batch import BatchRun, batch
+from psa_casadi.devices.executors import LOCAL, dask_client
+from psa_casadi.population.population import Population, population
+from psa_casadi.report.words.phrases import number
+from psa_casadi.report.words.tables import Table
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share
+from tests.studies.plants.base import simulate_base
+from tests.studies.plants.make import write_csv
+from tests.studies.plants.stack import FloatArray, Stack, draw_stack
+
+
+@dataclass
+class Killer:
+    """Kills a worker, as a machine that is lost would be, when a share of the devices is there."""
+
+    workers: dict[str, int]
+    devices: int
+    share: float = 1.0 / 3.0
+    done: int = 0
+    killed: list[int] = field(default_factory=list)
+
+    def __call__(self, told: str, progress: Progress) -> None:
+        """Count the devices by what is told after each; kill the first worker when it is time."""
+        progress(told)
+        self.done += " devices" in told
+        if self.done >= self.share * self.devices and not self.killed:
+            pid = min(self.workers.values())
+            os.kill(pid, signal.SIGKILL)
+            self.killed.append(pid)
+
+
+def on_dask(
+    records: Path, output: Path, workers: int, progress: Progress, *, kill: bool = False
+) -> tuple[BatchRun, str]:
+    """Return a batch on a new cluster of so many workers, and what became of them."""
+    devices = len(list(records.glob("*.csv"))) - 1  # jobs.csv
+    with dask_client(LOCAL, workers) as client:
+        before = _worker_processes(client)
+        killer = Killer(before, devices)
+        say: Callable[[str], None] = (lambda t: killer(t, progress)) if kill else progress
+        found = batch(records, output, executor=client, progress=say)
+        after = set(_worker_processes(client).values())
+    gone = sorted(set(before.values()) - after)
+    if kill and gone != killer.killed:
+        raise RuntimeError(f"Workers {killer.killed} were killed, and {gone} are gone.")
+    new = len(after - set(before.values()))
+    return found, f"{len(gone)} worker killed, {new} new in its place" if kill else ""
+
+
+def _worker_processes(client: Any) -> dict[str, int]:
+    """Return the process of each worker by its address."""
+    found: dict[str, int] = client.run(os.getpid)
+    return found
+
+
+#: Samples of a record, time between them [s], noise over the stroke.
+SAMPLES, STEP, NOISE = 600, 5e-3, 2e-4
+#: Standard deviation of ln of a sound device's parameters.
+SPREAD = 0.02
+#: What is wrong with a device, and how large: a factor on what is named.
+DEFECTS: dict[str, Callable[[Stack], Stack]] = {
+    "weak (force per volt 0.94)": lambda s: replace(s, k_l=0.94 * s.k_l),
+    "wide loop (hysteresis 1.08)": lambda s: _hysteresis(s, 1.08),
+    "stiff (compliance 0.94)": lambda s: replace(
+        s, k_p=s.k_p / 0.94, k_b=s.k_b / 0.94, m_p=s.m_p / 0.94, m_b=s.m_b / 0.94
+    ),
+    "sharp bend (n 1.08)": lambda s: replace(s, n=1.08 * s.n),
+}
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device of the population and its defect, "" where it has none."""
+
+    name: str
+    defect: str
+
+
+def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> tuple[Device, ...]:
+    """Write a record for each device, and a table of jobs; the same seed gives the same bytes."""
+    rng = np.random.default_rng(seed)
+    usual = draw_stack(np.random.default_rng(7))
+    times: FloatArray = STEP * np.arange(SAMPLES, dtype=np.float64)
+    bad = set(rng.choice(count, defects, replace=False).tolist())
+    kinds = list(DEFECTS)
+    found, rows = [], ["device,batch,date,files"]
+    for k in range(count):
+        stack = _drawn(usual, rng)
+        defect = kinds[len([b for b in bad if b < k]) % len(kinds)] if k in bad else ""
+        stack = DEFECTS[defect](stack) if defect else stack
+        run = simulate_base(stack, times, _voltage(times, usual.u_rated))
+        noise = NOISE * usual.stroke * rng.standard_normal(SAMPLES)
+        name = f"S{k:04d}"
+        write_csv(folder / f"{name}.csv", times, run.command, run.displacement + noise)
+        rows.append(f"{name},B{k * 10 // count},2026-{k * 12 // count + 1:02d}-15,{name}.csv")
+        found.append(Device(name, defect))
+    (folder / "jobs.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return tuple(found)
+
+
+def _drawn(usual: Stack, rng: np.random.Generator) -> Stack:
+    """Return a sound device: its own force, hysteresis, asymmetry and bend."""
+    factors = np.exp(SPREAD * rng.standard_normal(4))
+    stack = _hysteresis(usual, float(factors[1]))
+    return replace(
+        stack,
+        k_l=usual.k_l * float(factors[0]),
+        delta=stack.delta * float(factors[2]),
+        n=usual.n * float(factors[3]) if usual.n > 1.1 else usual.n,
+    )
+
+
+def _hysteresis(s: Stack, factor: float) -> Stack:
+    """Scale the hysteresis force; its reference force too, so that the loop keeps its shape."""
+    a, b, g, h = (factor * x for x in (s.a, s.beta, s.gamma, s.h_ref))
+    return replace(s, a=a, beta=b, gamma=g, h_ref=h)
+
+
+def _voltage(times: FloatArray, span: float) -> FloatArray:
+    """Return loops that shrink: every one turns at voltages of its own."""
+    return np.asarray(0.5 * span * (1.0 - np.cos(4.0 * np.pi * times)) * np.exp(-0.25 * times))
+
+
+#: Devices, of which one in twenty has a defect; devices of the runs with one, two and four workers.
+DEVICES, QUICK, PART = 100, 24, 24
+#: Workers of Dask; without Dask all devices are worked on by this machine's processes.
+WORKERS = 4
+
+
+def run(progress: Progress, quick: bool) -> Outcome:
+    """Return the tables for the usual number of devices."""
+    return run_sized(progress, QUICK if quick else DEVICES)
+
+
+def run_sized(progress: Progress, count: int) -> Outcome:
+    """Return the tables for `count` devices."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        records = folder / "records"
+        records.mkdir()
+        progress("making the devices")
+        devices = write_devices(records, count, max(4, count // 20))
+        part = folder / "part"
+        part.mkdir()
+        write_devices(part, PART, 0, seed=21)
+        batch(part, folder / "warm", progress=progress)  # compiles
+        own = partial(_own, progress=progress)
+        costs = [
+            _measured(_processes(n), partial(own, part, folder / f"with{n}", n))
+            for n in (1, 2, WORKERS)
+        ]
+        results = folder / "results"
+        if find_spec("distributed") is None:
+            many = os.cpu_count() or 1
+            costs.append(_measured(_processes(many), partial(own, records, results, many)))
+        else:
+            by = f"{WORKERS} workers of Dask"
+            dask = partial(on_dask, workers=WORKERS, progress=progress)
+            costs.append(_measured(by, partial(dask, part, folder / "dask")))
+            costs.append(_measured(by, partial(dask, records, results, kill=True)))
+        whole = costs[-1].run
+        costs.append(_measured("all kept", partial(own, records, results, 1)))
+    found = population(whole.findings)
+    return Outcome((_roc(devices, found), _cost(costs)))
+
+
+@dataclass(frozen=True)
+class _Cost:
+    """A run with its wall and processor times [s] and the largest memory of processes [MiB].
+
+    `memory` is that of a worker, `own` that of the process that hands out the work. Each is the
+    largest so far.
+    """
+
+    what: str
+    run: BatchRun
+    wall: float
+    processor: float
+    memory: float
+    own: float
+
+
+def _own(records: Path, output: Path, workers: int, progress: Progress) -> tuple[BatchRun, str]:
+    return batch(records, output, workers=workers, progress=progress), ""
+
+
+def _processes(count: int) -> str:
+    return f"{count} process{'es' if count > 1 else ''}"
+
+
+def _measured(by: str, work: Callable[[], tuple[BatchRun, str]]) -> _Cost:
+    before, began = _processor(), time.perf_counter()
+    found, remark = work()
+    wall, spent = time.perf_counter() - began, _processor() - before
+    what = f"{len(found.devices)} devices, {by}{f', {remark}' if remark else ''}"
+    own, children = (
+        resource.getrusage(who).ru_maxrss / 1024.0
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    return _Cost(what, found, wall, spent, children, own)
+
+
+def _processor() -> float:
+    """Return the processor time of this process and of all that it has waited for [s]."""
+    rows = [resource.getrusage(r) for r in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(r.ru_utime + r.ru_stime for r in rows)
+
+
+def _cost(costs: Sequence[_Cost]) -> TitledTable:
+    one = costs[0]
+    rows = tuple(
+        (
+            c.what,
+            number(c.wall),
+            number(c.processor),
+            number(c.processor / len(c.run.devices), 2),
+            number(_per_device(c) / _per_device(one), 2),
+            ", ".join(f"{n} {status}" for status, n in c.run.counts.items()),
+            number(c.memory),
+            number(c.own),
+        )
+        for c in costs
+    )
+    note = (
+        "Processor times are of all processes, their start included, and do not depend on what else"
+        " the machine does, as wall times do. Over one process: what a device costs more with more"
+        " workers; its inverse bounds the parallel efficiency where every worker has a core of its"
+        f" own (here {os.cpu_count()} cores). Memory is the largest so far."
+    )
+    head = (
+        "run",
+        "wall [s]",
+        "processor [s]",
+        "for a device [s]",
+        "over one process",
+        "ended",
+        "largest worker [MiB]",
+        "own process [MiB]",
+    )
+    return TitledTable("Cost", Table(head, rows), note)
+
+
+def _per_device(c: _Cost) -> float:
+    return c.processor / len(c.run.devices)
+
+
+def _roc(devices: Sequence[Device], found: Population) -> TitledTable:
+    """Return how well the tests for outliers tell devices with defects from sound ones."""
+    smallest = dict.fromkeys((d.name for d in devices), 1.0)
+    for s in found.spreads:
+        for k, p in zip(s.estimates.places, s.far.p, strict=True):
+            name = found.findings[k].device
+            smallest[name] = min(smallest[name], float(p))
+    score = {name: -np.log(max(p, 1e-300)) for name, p in smallest.items()}
+    told = {o.device for o in found.outliers}
+    sound = [d.name for d in devices if not d.defect]
+    rows = []
+    for defect in ("", *DEFECTS):
+        those = [d.name for d in devices if d.defect and defect in ("", d.defect)]
+        auc, error = _auc([score[n] for n in those], [score[n] for n in sound])
+        rows.append(
+            (
+                defect or "any",
+                share(sum(n in told for n in those), len(those)),
+                f"{auc:.3f} ± {1.96 * error:.3f}",
+            )
+        )
+    false = sum(n in told for n in sound)
+    note = (
+        f"False alarms: {share(false, len(sound))} of the sound devices. Told: p below"
+        " 0.05, adjusted by Benjamini and Hochberg over all devices and parameters. The area under"
+        " the ROC curve is of the smallest p of a device (interval: Hanley and McNeil 1982)."
+    )
+    head = ("defect", "told", "area under the ROC curve")
+    return TitledTable(f"Defects among {len(devices)} devices", Table(head, tuple(rows)), note)
+
+
+def _auc(bad: Sequence[float], good: Sequence[float]) -> tuple[float, float]:
+    """Return the area under the ROC curve (Mann and Whitney) and its standard error."""
+    if not bad or not good:
+        return float("nan"), float("nan")
+    difference = np.subtract.outer(np.array(bad), np.array(good))
+    a = float(np.mean((difference > 0) + 0.5 * (difference == 0)))
+    q1, q2 = a / (2.0 - a), 2.0 * a**2 / (1.0 + a)
+    m, n = len(bad), len(good)
+    variance = (a * (1 - a) + (m - 1) * (q1 - a**2) + (n - 1) * (q2 - a**2)) / (m * n)
+    return a, float(np.sqrt(max(0.0, variance)))

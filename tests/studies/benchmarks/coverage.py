@@ -1,0 +1,295 @@
+"""Identification from scratch, many times: parameters and intervals against the truth.
+
+Records come from the independent reference with white noise of 0.1 % of the largest range: a step,
+loops at three amplitudes and two frequencies, a multisine. `identify` gets the records and the
+stiffness k_B, nothing else. What is compared is what voltage and displacement determine: forces
+over the stack's stiffness, lags, and masses over stiffnesses, each with the interval that the
+covariance of the fit gives it. Every stack has its own draws. Beside the share that is covered
+stands what these draws alone give (`coverage_control`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.diagnosis.colour import whiteness
+from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.model.compose import Model
+from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.records import Record
+from psa_casadi.records.split import whole
+from psa_casadi.report.words.tables import Table
+from tests.studies.benchmarks.records import Values, clean_set, with_noise
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
+
+FloatArray = npt.NDArray[np.float64]
+_STEP, _RTOL = 1e-5, 1e-8
+
+
+def drawn_scores(
+    model: Model,
+    clean: Sequence[Record],
+    noisy: Sequence[Record],
+    names: Sequence[str],
+    level: float,
+    quantities: Callable[[Values], Values],
+) -> dict[str, float]:
+    """Return by how many standard errors the draws move each quantity, at the truth.
+
+    `model` carries the truth, `names` are the parameters that are fitted, `level` [m] is the
+    noise's; `quantities` makes the compared quantities of parameter values.
+    """
+    experiments = [whole(r) for r in clean]
+    at = fit(model, experiments, names, sigma=[level] * len(clean), evaluations=1, rtol=_RTOL)
+    pairs = zip(noisy, clean, strict=True)
+    noise = np.concatenate([_displacement(n) - _displacement(c) for n, c in pairs])
+    scaled, count = at.jacobian / level, len(names)
+    covariance = np.linalg.pinv(
+        scaled.T @ scaled + np.diag(1.0 / at.unknowns.prior**2), hermitian=True
+    )
+    moved = covariance @ (scaled.T @ (noise / level))
+    slopes = gradients(model.values, names, quantities) @ at.unknowns.slopes(at.theta)
+    errors = np.sqrt(np.einsum("qk,kl,ql->q", slopes, covariance[:count, :count], slopes))
+    scores = slopes @ moved[:count] / errors
+    return dict(zip(quantities(model.values), scores.tolist(), strict=True))
+
+
+def gradients(
+    values: Values, names: Sequence[str], quantities: Callable[[Values], Values]
+) -> FloatArray:
+    """Return d quantity / d parameter (quantities, k), by central differences."""
+    columns = []
+    for name in names:
+        h = _STEP * max(abs(values[name]), 1e-300)
+        up, down = (quantities({**values, name: values[name] + s}) for s in (h, -h))
+        columns.append([(up[q] - down[q]) / (2.0 * h) for q in up])
+    return np.array(columns).T
+
+
+def _displacement(record: Record) -> FloatArray:
+    if record.displacement is None:
+        raise ValueError(f"record '{record.name}' has no displacement")
+    return record.displacement
+
+
+NOISE, SEEDS, QUICK_SEEDS = 1e-3, 50, 2
+QUICK_STACKS = ("P-885.51", "PTBS200")
+_NORMAL_95 = 1.96
+#: A quantity with a larger relative standard error counts as weakly determined, and is left out.
+_WEAK = 0.1
+#: Residuals with a smaller p-value of the portmanteau test do not count as white.
+_WHITE = 0.01
+
+
+@dataclass(frozen=True)
+class Found:
+    """One quantity of one run: its truth, estimate, standard error, and whether it is told.
+
+    `drawn` is by how many standard errors the draws of the noise move it in linear theory.
+    """
+
+    name: str
+    truth: float
+    value: float
+    error: float
+    determined: bool
+    drawn: float
+
+    @property
+    def covered(self) -> bool:
+        """Whether the truth lies in the 95 % interval."""
+        return abs(self.value - self.truth) <= _NORMAL_95 * self.error
+
+    @property
+    def covered_by_draws(self) -> bool:
+        """Whether it would lie there in linear theory at the truth."""
+        return abs(self.drawn) <= _NORMAL_95
+
+    @property
+    def relative(self) -> float:
+        """Relative error of the estimate."""
+        return abs(self.value / self.truth - 1.0)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One identification: what was found, rms over the noise put in, white records, warnings."""
+
+    stack: str
+    seed: int
+    found: tuple[Found, ...]
+    rms_ratio: float
+    white: tuple[bool, ...]
+    converged: bool
+
+
+def run(progress: Progress, quick: bool) -> Outcome:
+    """Identify every named stack from `SEEDS` sets of records, or two of them from two."""
+    return _over(QUICK_STACKS, QUICK_SEEDS, progress) if quick else run_sized(progress, SEEDS)
+
+
+def run_sized(progress: Progress, count: int) -> Outcome:
+    """Identify every named stack from `count` sets of records."""
+    return _over(tuple(STACKS), count, progress)
+
+
+def _over(names: Sequence[str], seeds: int, progress: Progress) -> Outcome:
+    """Identify the named stacks from `seeds` sets of records each, on all cores."""
+    jobs = [(name, seed) for name in names for seed in range(seeds)]
+    runs = on_all_cores(one_run, jobs, lambda run: run.stack, progress)
+    return Outcome((_quantities(runs), _residuals(runs)))
+
+
+def one_run(name: str, seed: int) -> Run:
+    """Identify one named stack from one set of noisy records, and compare with the truth."""
+    truth = {key: f.value for key, f in STACKS[name].values.items()}
+    clean = clean_set(truth)
+    level = NOISE * max(r.range_m for r in clean)
+    records = with_noise(clean, NOISE, (tuple(STACKS).index(name), seed))
+    found = identify(records, stiffness=truth["k_B"])
+    size = static_compliance(truth) * truth["h_ref"]
+    drawn = drawn_scores(
+        stack_model(name),
+        clean,
+        records,
+        found.determinacy.names,
+        level,
+        lambda p: quantities(p, size),
+    )
+    white = tuple(whiteness(r) > _WHITE for r in found.fit.residuals_of(found.experiments))
+    return Run(
+        stack=name,
+        seed=seed,
+        found=compared(found, truth, drawn),
+        rms_ratio=found.fit.rms / level,
+        white=white,
+        converged=found.fit.converged,
+    )
+
+
+def compared(found: Identification, truth: Values, drawn: Values) -> tuple[Found, ...]:
+    """Return every quantity with its truth and its standard error (delta method)."""
+    known, p = found.determinacy, found.model.values
+    size = static_compliance(truth) * truth["h_ref"]
+    true, value = quantities(truth, size), quantities(p, size)
+    slopes = gradients(p, known.names, lambda values: quantities(values, size))
+    errors = np.sqrt(np.einsum("qk,kl,ql->q", slopes, known.covariance, slopes))
+    open_ones = {*known.undetermined, *known.on_bound}
+    results = []
+    for key, error in zip(value, errors.tolist(), strict=True):
+        told = key in known.names and key not in open_ones and error < _WEAK * abs(value[key])
+        results.append(Found(key, true[key], value[key], error, told, drawn[key]))
+    return tuple(results)
+
+
+def quantities(p: Values, size: float) -> dict[str, float]:
+    """Return what voltage and displacement determine, by the parameter that it stands for.
+
+    k, A, beta, gamma [m/V] and delta [m/(V.s)] as in eqs. (25), (26), beta and gamma at a
+    hysteresis of `size` [m]; n; lags [s]; masses over stiffnesses [s^2].
+    """
+    c = static_compliance(p)
+    bend = c * (size / (c * p["h_ref"])) ** p["n"]
+    return {
+        "k_L": c * p["k_L"],
+        "A": c * p["A"],
+        "beta": bend * p["beta"],
+        "gamma": bend * p["gamma"],
+        "delta": c * p["delta"],
+        "n": p["n"],
+        "tau": p["tau"],
+        "R_s": p["R_s"] * p["C_p"],
+        "c_P": p["c_P"] / p["k_P"],
+        "m_P": p["m_P"] / p["k_P"],
+        "c_B": p["c_B"] / p["k_B"],
+        "m_B": p["m_B"] / p["k_B"],
+    }
+
+
+SHOWN: Mapping[str, str] = {
+    "k_L": "k", "A": "A", "beta": "beta", "gamma": "gamma", "delta": "delta", "n": "n",
+    "tau": "tau", "R_s": "R_s C_p", "c_P": "c_P/k_P", "m_P": "m_P/k_P", "c_B": "c_B/k_B",
+    "m_B": "m_B/k_B",
+}  # fmt: skip
+
+
+def _quantities(runs: Sequence[Run]) -> TitledTable:
+    rows = []
+    for stack in dict.fromkeys(r.stack for r in runs):
+        own = [r for r in runs if r.stack == stack]
+        for name, shown in SHOWN.items():
+            all_found = [f for r in own for f in r.found if f.name == name]
+            told = [f for f in all_found if f.determined]
+            if not told:
+                rows.append((stack, shown, f"0 of {len(all_found)}", *[""] * 5))
+                continue
+            errors = 100.0 * np.array([f.relative for f in told])
+            limit = 5.0 if name in ("n", "beta", "gamma") else 1.0
+            rows.append(
+                (
+                    stack,
+                    shown,
+                    f"{len(told)} of {len(all_found)}",
+                    f"{100.0 * np.mean([f.covered for f in told]):.0f} %",
+                    f"{100.0 * np.mean([f.covered_by_draws for f in told]):.0f} %",
+                    f"{np.median([100.0 * f.error / abs(f.value) for f in told]):.2g} %",
+                    f"{np.median(errors):.2g} %",
+                    f"{100.0 * np.mean(errors < limit):.0f} % within {limit:g} %",
+                )
+            )
+    head = (
+        "stack", "quantity", "determined in", "truth in its 95 % interval", "by the draws alone",
+        "standard error, median", "error, median", "close to the truth",
+    )  # fmt: skip
+    return TitledTable(
+        "Identified from scratch, against the truth", Table(head, tuple(rows)), share_sentence(runs)
+    )
+
+
+def share_sentence(runs: Sequence[Run]) -> str:
+    """Say how many intervals hold the truth, with the error of that share.
+
+    Quantities of one run depend on each other, so the error is that of a mean over runs.
+    """
+    each = [[f for f in r.found if f.determined] for r in runs]
+    told = [f for own in each for f in own]
+    share = float(np.mean([f.covered for f in told]))
+    drawn = float(np.mean([f.covered_by_draws for f in told]))
+    over = [sum(f.covered for f in own) - share * len(own) for own in each]
+    error = float(np.sqrt(np.sum(np.square(over)))) / len(told)
+    held = sum(f.covered for f in told)
+    return (
+        f"Of {len(told)} intervals {held} hold the truth, {100.0 * share:.1f} % (standard error"
+        f" {100.0 * error:.1f} %). By these draws alone it would be {100.0 * drawn:.1f} %."
+    )
+
+
+def _residuals(runs: Sequence[Run]) -> TitledTable:
+    rows = []
+    for stack in dict.fromkeys(r.stack for r in runs):
+        own = [r for r in runs if r.stack == stack]
+        ratios = np.array([r.rms_ratio for r in own])
+        white = [w for r in own for w in r.white]
+        rows.append(
+            (
+                stack,
+                f"{len(own)}",
+                f"{np.median(ratios):.3f}",
+                f"{ratios.min():.3f} to {ratios.max():.3f}",
+                f"{100.0 * np.mean(white):.1f} %",
+                f"{sum(r.converged for r in own)}",
+            )
+        )
+    head = (
+        "stack", "fits", "residual over noise, median", "least to most",
+        "records with white residual", "converged",
+    )  # fmt: skip
+    return TitledTable(
+        "What the fits leave",
+        Table(head, tuple(rows)),
+        "White: portmanteau test of 25 lags with p above 1 %, so that 99 % of pure noise pass.",
+    )

@@ -1,0 +1,345 @@
+"""The floor of records: the held-out error that a linear fit of many features reaches.
+
+What has no prior size (the history before a record, how many knots a curve has, how many modes
+there are) is chosen by the evidence of the fitted samples.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import median_filter
+from scipy.optimize import minimize
+
+from tests.studies.benchmarks.floor_features import (
+    Columns,
+    Mode,
+    apart,
+    fine_curve,
+    memory,
+    modal,
+    play,
+    relaxations,
+    ringing,
+    taps,
+)
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+#: Frequencies over the sampling rate and dampings that a mode is looked for at, and their limits:
+#: slower and less damped ones imitate loops of the voltage's own frequency.
+_FREQUENCIES, _DAMPINGS = np.linspace(0.02, 0.495, 96), (0.005, 0.02, 0.08)
+_SLOWEST, _FASTEST, _LEAST, _MOST = 0.02, 0.4999, 4e-3, 0.7
+#: A line is so many times larger than the median of so many neighbours in the spectrum; of noise
+#: alone the largest of 10,000 is 3.6 times as large.
+_STANDS_OUT, _NEIGHBOURS = 5.0, 101
+#: Relative size of a ridge that only keeps the projections regular; steps of a refinement.
+_REGULAR, _STEPS = 1e-9, 60
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What features (samples, count) leave of an output and of further columns."""
+
+    features: FloatArray
+    left: FloatArray
+    factor: tuple[FloatArray, bool]
+
+    def gain(self, columns: FloatArray) -> float:
+        """Return by how much more columns lessen the sum of squares that is left."""
+        own = columns - self.features @ cho_solve(self.factor, self.features.T @ columns)
+        gram = own.T @ own + _REGULAR * np.eye(columns.shape[1]) * float(np.sum(columns**2))
+        cross = own.T @ self.left
+        return float(cross @ np.linalg.solve(gram, cross))
+
+
+def beside(features: FloatArray, output: FloatArray) -> Beside:
+    """Return what is left of an output beside features."""
+    gram = features.T @ features
+    gram += np.diag(_REGULAR * np.diag(gram) + np.finfo(float).tiny)
+    factor = cho_factor(gram, lower=True)
+    return Beside(features, output - features @ cho_solve(factor, features.T @ output), factor)
+
+
+class Search:
+    """Looks for modes of voltages, one array for each record, judged at their used samples."""
+
+    def __init__(self, voltages: Sequence[FloatArray], used: BoolArray) -> None:
+        self._voltages, self._used = voltages, used
+        self._grid = [
+            (mode, self._answer(mode))
+            for mode in (Mode(float(f), d) for f in _FREQUENCIES for d in _DAMPINGS)
+        ]
+
+    def next(self, others: Beside) -> Mode:
+        """Return the mode or the line that explains most of what is left, refined."""
+        mode = max(self._grid, key=lambda pair: others.gain(pair[1]))[0]
+        found = [self.tuned(m, others) for m in (mode, *self._line(others))]
+        return max(found, key=lambda m: others.gain(self._answer(m)))
+
+    def tuned(self, mode: Mode, others: Beside) -> Mode:
+        """Return a mode with the frequency, and the damping unless it is 0, that explain most."""
+        line = mode.damping == 0.0
+        step = 0.3 / len(self._used) if line else 0.002
+
+        def made(x: FloatArray) -> Mode:
+            frequency = float(np.clip(x[0], _SLOWEST, _FASTEST))
+            if line:
+                return Mode(frequency, 0.0)
+            return Mode(frequency, float(np.exp(np.clip(x[1], np.log(_LEAST), np.log(_MOST)))))
+
+        def loss(x: FloatArray) -> float:
+            return -others.gain(self._answer(made(x)))
+
+        begin = np.array([mode.frequency] if line else [mode.frequency, np.log(mode.damping)])
+        moves = np.vstack([np.zeros(len(begin)), np.diag([step, 0.7][: len(begin)])])
+        options: Any = {"maxfev": _STEPS, "initial_simplex": begin + moves}
+        found: Any = minimize(loss, begin, method="Nelder-Mead", options=options)
+        return made(found.x)
+
+    def _line(self, others: Beside) -> list[Mode]:
+        """Return the largest line that stands out of the spectrum of what is left, if one does."""
+        left = np.zeros(len(self._used))
+        left[self._used] = others.left
+        size = np.abs(np.fft.rfft(left))
+        frequency = np.arange(len(size)) / len(left)
+        out = size > _STANDS_OUT * median_filter(size, _NEIGHBOURS)
+        out &= (frequency > _SLOWEST) & (frequency < _FASTEST)
+        return [Mode(float(frequency[np.argmax(size * out)]), 0.0)] if out.any() else []
+
+    def _answer(self, mode: Mode) -> FloatArray:
+        if mode.damping == 0.0:
+            return apart([ringing(len(v), mode).values for v in self._voltages])[self._used]
+        return np.vstack([modal(v, mode).values for v in self._voltages])[self._used]
+
+
+IntArray = npt.NDArray[np.int64]
+
+#: Rounds of the re-estimation of the prior sizes and the noise, and when they have settled.
+_ROUNDS_floor_ridge, _SETTLED = 60, 1e-3
+#: Precision of a weight without a prior, and the largest of any, in units of the output's rms.
+_FREE, _LARGEST = 1e-8, 1e10
+
+
+@dataclass(frozen=True, eq=False)
+class Ridge:
+    """Weights (features,), the standard deviation of what is left, and the log evidence."""
+
+    weights: FloatArray
+    sigma: float
+    evidence: float
+
+
+def ridge(features: FloatArray, kinds: IntArray, y: FloatArray) -> Ridge:
+    """Fit y = features @ weights; kind 0 has no prior, every other one a size found by evidence.
+
+    MacKay's re-estimation: each size from the weights and how well the data determine them.
+    """
+    size = np.sqrt(np.mean(features**2, axis=0))
+    size[size == 0.0] = 1.0
+    scale = float(np.sqrt(np.mean(y**2))) or 1.0
+    x, target = features / size, y / scale
+    gram, cross, power = x.T @ x, x.T @ target, float(target @ target)
+    n = len(y)
+    precision, beta = np.where(kinds == 0, _FREE, 1.0), 1e4
+    for _ in range(_ROUNDS_floor_ridge):
+        w, inverse, _ = _solved(gram, cross, precision, beta)
+        left = max(power - 2.0 * float(w @ cross) + float(w @ gram @ w), 1e-14 * power)
+        known = 1.0 - precision * np.diag(inverse)
+        before = precision
+        precision, beta = precision.copy(), (n - float(known.sum())) / left
+        for kind in set(kinds.tolist()) - {0}:
+            of = kinds == kind
+            precision[of] = min(float(known[of].sum()) / float(w[of] @ w[of]), _LARGEST)
+        if np.all(np.abs(np.log(precision / before)) < _SETTLED):
+            break
+    w, _, half_log_det = _solved(gram, cross, precision, beta)
+    left = power - 2.0 * float(w @ cross) + float(w @ gram @ w)
+    evidence = 0.5 * (
+        n * np.log(beta)
+        + float(np.sum(np.log(precision)))
+        - 2.0 * half_log_det
+        - beta * left
+        - float(precision @ w**2)
+    )
+    return Ridge(w * scale / size, scale / np.sqrt(beta), float(evidence))
+
+
+def _solved(
+    gram: FloatArray, cross: FloatArray, precision: FloatArray, beta: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the weights, their covariance, and half the log determinant of its inverse."""
+    factor = cho_factor(beta * gram + np.diag(precision), lower=True)
+    inverse: FloatArray = cho_solve(factor, np.eye(len(cross)))
+    return beta * (inverse @ cross), inverse, float(np.sum(np.log(np.diag(factor[0]))))
+
+
+History = tuple[float, ...]
+
+#: Where the voltage may have gone before a record, in half its range from its middle.
+HISTORIES: tuple[History, ...] = ((), (1.0,), (-1.0,), (1.0, -1.0), (-1.0, 1.0))
+#: Most modes; the log evidence that one has to add, the price of its frequency and damping.
+_MODES, _WORTH = 14, 25.0
+#: The play that relaxations follow beside the voltage; knots that a curve over the displacement may
+#: have (0: no curve), and its rounds.
+_FOLLOWED, _KNOTS, _ROUNDS = 0.3, (0, 6, 10, 20, 40, 80), 3
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A record: voltage [of half the range, from its middle], displacement, samples to fit."""
+
+    voltage: FloatArray
+    displacement: FloatArray
+    used: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """The fit of records: predicted displacements, modes and lines, histories, curve's knots."""
+
+    predicted: tuple[FloatArray, ...]
+    modes: tuple[Mode, ...]
+    histories: tuple[History, ...]
+    knots: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A fit: features (samples, count) of all parts, the displacement, the curve's columns."""
+
+    found: Ridge
+    features: FloatArray
+    shown: FloatArray
+    curves: Sequence[Sequence[Columns]]
+
+
+@dataclass(eq=False)
+class _Problem:
+    parts: Sequence[Part]
+    made: dict[tuple[int, History], list[Columns]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.used = np.concatenate([p.used for p in self.parts])
+        self.y = np.concatenate([p.displacement for p in self.parts])
+
+    def columns(self, histories: Sequence[History], modes: Sequence[Mode]) -> list[list[Columns]]:
+        """Return the columns of every part, an offset first."""
+        every = []
+        for k, (part, history) in enumerate(zip(self.parts, histories, strict=True)):
+            v = part.voltage
+            offset = Columns("offset of its start", np.ones((len(v), 1)))
+            driven = [modal(v, m) for m in modes if m.damping]
+            free = [ringing(len(v), m) for m in modes]
+            every.append([offset, *self._slow(k, history), *driven, *free])
+        return every
+
+    def _slow(self, k: int, history: History) -> list[Columns]:
+        if (k, history) not in self.made:
+            v = self.parts[k].voltage
+            longest = 3.0 * max(len(p.voltage) for p in self.parts)
+            lags = relaxations(v, play(v, _FOLLOWED, history), longest)
+            self.made[k, history] = [*memory(v, history), taps(v), *lags]
+        return self.made[k, history]
+
+    def fitted(
+        self, columns: Sequence[Sequence[Columns]], curves: Sequence[Sequence[Columns]] = ()
+    ) -> _Fitted:
+        """Fit the used samples with the columns, and with curves over the displacement."""
+        features, kinds = stacked(joined(columns, curves))
+        used = self.used
+        found = ridge(features[used], kinds, self.y[used])
+        return _Fitted(found, features, features @ found.weights, curves)
+
+    def with_curve(self, columns: Sequence[Sequence[Columns]], knots: int) -> _Fitted:
+        """Fit with a curve over what the other columns say that the displacement is."""
+        fitted = self.fitted(columns)
+        under = fitted.shown
+        for _ in range(_ROUNDS if knots else 0):
+            low, high = float(under.min()), float(under.max())
+            curves = [[fine_curve(y, low, high, knots)] for y in self.split(under)]
+            fitted = self.fitted(columns, curves)
+            hats = np.vstack([c.values for of in curves for c in of])
+            under = fitted.shown - hats @ fitted.found.weights[-knots:]
+        return fitted
+
+    def best_curve(self, columns: Sequence[Sequence[Columns]]) -> tuple[_Fitted, int]:
+        """Return the fit with the knots of most evidence, and their number."""
+        tried = [(self.with_curve(columns, knots), knots) for knots in _KNOTS]
+        return max(tried, key=lambda pair: pair[0].found.evidence)
+
+    def split(self, shown: FloatArray) -> list[FloatArray]:
+        """Return an array of all samples as one for each part."""
+        edges = np.cumsum([0, *(len(p.voltage) for p in self.parts)])
+        return [shown[a:b] for a, b in pairwise(edges)]
+
+
+def floor_of(parts: Sequence[Part], progress: Callable[[str], None] = lambda _: None) -> Floor:
+    """Fit the parts' used samples and predict all: history, curve, modes, and the curve again."""
+    problem = _Problem(parts)
+    progress("histories")
+    histories = _histories(problem)
+    fitted = problem.best_curve(problem.columns(histories, ()))[0]
+    modes = _modes(problem, histories, fitted, progress)
+    progress("fine curve")
+    fitted, knots = problem.best_curve(problem.columns(histories, modes))
+    return Floor(tuple(problem.split(fitted.shown)), modes, histories, knots)
+
+
+def stacked(every: Sequence[Sequence[Columns]]) -> tuple[FloatArray, IntArray]:
+    """Return the features of all parts, and the kind of each; the first columns have kind 0.
+
+    What is left of a start belongs to its own record alone.
+    """
+    blocks: dict[str, list[FloatArray]] = {}
+    for same in zip(*every, strict=True):
+        values = [c.values for c in same]
+        own = "start" in same[0].kind
+        blocks.setdefault(same[0].kind, []).append(apart(values) if own else np.vstack(values))
+    counts = [sum(b.shape[1] for b in of) for of in blocks.values()]
+    kinds = np.repeat(np.arange(len(counts)), counts)
+    return np.hstack([b for of in blocks.values() for b in of]), kinds
+
+
+def joined(
+    columns: Sequence[Sequence[Columns]], more: Sequence[Sequence[Columns]]
+) -> list[list[Columns]]:
+    """Return the columns of every part with more of them, if there are any."""
+    return [[*c, *m] for c, m in zip(columns, more or [()] * len(columns), strict=True)]
+
+
+def _histories(problem: _Problem) -> tuple[History, ...]:
+    """Return the history of most evidence for each record, one after the other."""
+    chosen: list[History] = [()] * len(problem.parts)
+    for k in range(len(chosen)):
+        tried = [[*chosen[:k], h, *chosen[k + 1 :]] for h in HISTORIES]
+        chosen = max(tried, key=lambda h: problem.fitted(problem.columns(h, ())).found.evidence)
+    return tuple(chosen)
+
+
+def _modes(
+    problem: _Problem,
+    histories: Sequence[History],
+    fitted: _Fitted,
+    progress: Callable[[str], None],
+) -> tuple[Mode, ...]:
+    """Return modes and lines found one by one, all tuned again, while the evidence grows."""
+    used, y, curves = problem.used, problem.y[problem.used], fitted.curves
+    search = Search([p.voltage for p in problem.parts], used)
+    modes: list[Mode] = []
+    while len(modes) < _MODES:
+        progress(f"mode {len(modes) + 1}")
+        tried = [*modes, search.next(beside(fitted.features[used], y))]
+        for k, mode in enumerate(tried[:-1]):
+            without = problem.columns(histories, [*tried[:k], *tried[k + 1 :]])
+            tried[k] = search.tuned(mode, beside(stacked(joined(without, curves))[0][used], y))
+        wider = problem.fitted(problem.columns(histories, tried), curves)
+        if wider.found.evidence < fitted.found.evidence + _WORTH:
+            break
+        modes, fitted = tried, wider
+    return tuple(modes)

@@ -1,0 +1,271 @@
+"""Records with hidden causes, and what a diagnosis makes of one of them.
+
+The plants that make the records (`tests/studies/plants`) share no code with the package and have
+other equations than its effects. The strength of an effect is rho: rms of what
+the base's parameters cannot absorb, over the rms of the noise.
+"""
+
+import itertools
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis, Verdict
+from psa_casadi.diagnosis.task import Method
+from psa_casadi.effects import EFFECTS
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
+from psa_casadi.report.words.tables import Table
+from tests.studies.benchmarks.table import TitledTable
+from tests.studies.plants.again import play_again
+from tests.studies.plants.designs import DesignKind
+from tests.studies.plants.excitations import ExcitationKind, PoorKind
+from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.noise import NoiseKind
+from tests.studies.plants.table import called
+
+Kind = Literal[
+    "known", "weak", "clean", "left out", "foreign", "two", "poor", "design", "ringing",
+    "three", "six",
+]  # fmt: skip
+
+#: Ranges of rho, from which a case's is drawn evenly in its logarithm.
+ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
+#: A hidden effect counts from this share of the smallest rho that was asked for.
+REACHED = 0.9
+#: Classes of voltages that show less than a rich one.
+POOR: tuple[PoorKind, ...] = ("sine", "triangle", "steps", "slow", "loops")
+#: Other designs of record; and those with resonances in their band or near it, all clean: there
+#: the static effects of the plants are no physics.
+DESIGNS: tuple[DesignKind, ...] = ("bipolar", "short", "long", "sines", "staircase", "small")
+RINGING: tuple[DesignKind, ...] = ("fast", "sweep", "short")
+#: Samples of each of several records of a device.
+_CUT = 2400
+#: Noises of the cases of one effect, in turn: most sensors' is white, many have a filter.
+NOISES: tuple[NoiseKind, ...] = ("white", "ar", "white", "quantised", "drop-outs")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Records of one device: what is hidden, with which noise and voltage, from which seed."""
+
+    kind: Kind
+    effect: str | None
+    seed: int
+    rho: tuple[float, float] = ORDINARY
+    more: tuple[str, ...] = ()
+    noise: NoiseKind = "white"
+    excitation: ExcitationKind = "rich"
+    records: int = 1
+
+    @property
+    def right(self) -> str | None:
+        """What the project's table calls the hidden effect."""
+        return None if self.effect is None else called(self.effect)
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """What it calls all that is hidden."""
+        return tuple(called(e) for e in (*((self.effect,) if self.effect else ()), *self.more))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a diagnosis said of a case.
+
+    `rho` was reached, of several causes the smallest, 0 where nothing is hidden; `named` are the
+    causes, `within` the named ones with what they cannot be told from; `blind` the effects that the
+    record is said not to show. `confidence` is that of the first cause; `probability` and
+    `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
+    the noise; `seconds` the processor time; `patch` the unnamed correction that is offered, which
+    would remove the share `patched` of the base's held-out excess (with what effects that are kept
+    in the model without a name remove).
+    """
+
+    case: Case
+    rho: float
+    verdict: Verdict
+    named: tuple[str, ...]
+    within: tuple[str, ...]
+    blind: tuple[str, ...]
+    confidence: float
+    probability: Mapping[str, float]
+    evidence: Mapping[str, float]
+    ratio: float
+    seconds: float
+    patch: str = ""
+    patched: float = 0.0
+
+    def __str__(self) -> str:
+        """Return case and answer in a line."""
+        hidden = " and ".join(self.case.hidden) or "nothing"
+        case = f"{self.case.kind}, {hidden} ({self.case.seed}), rho {self.rho:.2f}"
+        return f"{case}: {self.verdict} {', '.join(self.within)} [{self.seconds:.0f} s]"
+
+    @property
+    def reached(self) -> bool:
+        """Whether what is hidden is as visible as was asked for; true where nothing is hidden."""
+        return self.case.effect is None or self.rho >= REACHED * self.case.rho[0]
+
+    @property
+    def alone(self) -> str | None:
+        """The cause that was named alone and without a remainder, if there is one."""
+        one = self.verdict == "cause_named" and len(self.named) == 1
+        return self.named[0] if one else None
+
+    @property
+    def right_alone(self) -> bool:
+        """Whether the hidden effect is the one name, with no other as likely."""
+        return self.named == (self.case.right,) == self.within
+
+
+def records_of(case: Case, folder: Path) -> tuple[Truth, list[Record]]:
+    """Make the records of a case as files in a folder, and read them."""
+    path = folder / "record_0.csv"
+    truth = make_record(
+        case.effect,
+        case.seed,
+        path,
+        noise=case.noise,
+        excitation=case.excitation,
+        visible=case.rho if case.effect else None,
+        more=case.more,
+        more_visible=case.rho if case.more else None,
+    )
+    paths = [path]
+    for k in range(1, case.records):
+        paths.append(folder / f"record_{k}.csv")
+        play_again(truth, case.seed + 10_000 * k, paths[-1])
+    records = [read_record(p) for p in paths]
+    if case.records > 1:
+        records = [r.slice(0, min(_CUT, r.n)) for r in records]
+    return truth, records
+
+
+def run_case(case: Case, method: Method | None = None, only: bool = False) -> Found:
+    """Make the records of a case, diagnose the files, and compare.
+
+    With `only`, the right effect is the only one in the table.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        truth, records = records_of(case, Path(folder))
+    left_out = case.right if case.kind == "left out" else None
+    table = [e for n, e in EFFECTS.items() if (n == case.right if only else n != left_out)]
+    begin = time.process_time()
+    d = diagnose(records, effects=table, method=method)
+    return _found(case, d, truth, time.process_time() - begin)
+
+
+def names_of(d: Diagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the named causes, and these with what they cannot be told from."""
+    named = tuple(c.effect for c in d.causes)
+    alike = (n for c in d.causes for n in c.cannot_be_told_from)
+    return named, tuple(dict.fromkeys((*named, *alike)))
+
+
+def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
+    named, within = names_of(d)
+    return Found(
+        case=case,
+        rho=float(min([truth.visible, *(h.visible for h in truth.more)])),
+        verdict=d.verdict,
+        named=named,
+        within=within,
+        blind=tuple(b.effect for b in d.blind_to),
+        confidence=d.causes[0].confidence if d.causes else 0.0,
+        probability={c.effect: c.probability for c in d.candidates},
+        evidence={c.effect: c.evidence for c in d.candidates},
+        ratio=d.extended_errors.holdout_rms_m / _level(d, truth),
+        seconds=seconds,
+        patch="" if d.patch is None else d.patch.name,
+        patched=_patched(d),
+    )
+
+
+def _patched(d: Diagnosis) -> float:
+    """Return what is offered without a name: the effects that are kept, and the correction."""
+    b = d.budget
+    if b is None:
+        return 0.0
+    kept = b.together.share if d.kept and not d.causes else 0.0
+    return kept + (b.unnamed.share if b.unnamed is not None else 0.0)
+
+
+def _level(d: Diagnosis, truth: Truth) -> float:
+    """Return the rms of the noise that was added, of a first record in its held-out samples [m]."""
+    if len(d.experiments) > 1:
+        return truth.sigma
+    held = d.experiments[0].held_out
+    noise = np.asarray(d.experiments[0].record.displacement) - truth.displacement
+    return float(np.sqrt(np.mean(noise[held] ** 2)))
+
+
+def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: int) -> list[Case]:
+    """Return the cases of a study: every effect with `seeds` seeds, and others to match.
+
+    No two cases have a seed, and so stack, voltage and noise, in common.
+    """
+    seed, rng = itertools.count(first), np.random.default_rng(first)
+    few, half = range(max(1, seeds // 4)), range(max(1, seeds // 2))
+    cases = [
+        Case("known", e, next(seed), noise=NOISES[k % len(NOISES)])
+        for e in known
+        for k in range(seeds)
+    ]
+    cases += [
+        Case("weak", e, next(seed), WEAK, noise=NOISES[k % len(NOISES)])
+        for k, e in enumerate(e for e in known for _ in few)
+    ]
+    for noise in NOISES[:2]:
+        cases += [Case("clean", None, next(seed), noise=noise) for _ in range(10 * seeds)]
+    cases += [Case("left out", e, next(seed)) for e in known for _ in few]
+    cases += [Case("foreign", e, next(seed)) for e in foreign for _ in half]
+    for _ in range(3 * seeds):
+        one, other = rng.choice(known, 2, replace=False)
+        cases.append(Case("two", str(one), next(seed), STRONG, (str(other),)))
+    for k in range(4 * seeds):
+        poor = POOR[k % len(POOR)]
+        cases.append(Case("poor", str(rng.choice(known)), next(seed), excitation=poor))
+    for k in range(6 * seeds):
+        design = DESIGNS[k % len(DESIGNS)]
+        cases.append(Case("design", str(rng.choice(known)), next(seed), excitation=design))
+    for k in range(3 * seeds):
+        cases.append(Case("ringing", None, next(seed), excitation=RINGING[k % len(RINGING)]))
+    for _ in range(2 * seeds):
+        one, *others = (str(name) for name in rng.choice(known, 3, replace=False))
+        cases.append(Case("three", one, next(seed), STRONG, tuple(others)))
+    for _ in range(3 * seeds):
+        cases.append(Case("six", str(rng.choice(known)), next(seed), records=6))
+    return cases
+
+
+def limits_table(missed: Sequence[Found], known: Sequence[Found]) -> TitledTable:
+    """Return each case that was missed beside what is said where its effect is known."""
+    told = {f.case: f for f in known}
+    rows = tuple(limits_row(f, told[f.case]) for f in missed)
+    return TitledTable(
+        "What the missed records hold",
+        Table(("hidden", "seed", "rho", "said", "known beforehand", "rival"), rows),
+        "Known beforehand: what is said where the right effect is the only one in the table, and"
+        " its evidence [nats]; a cause has a price of 8. Rival: evidence of the strongest other"
+        " effect less that of the right one, in the first step with the whole table.",
+    )
+
+
+def limits_row(f: Found, told: Found) -> tuple[str, ...]:
+    """Return the row of a case that was `f`, and `told` with the right effect alone."""
+    right = str(f.case.right)
+    others = [e for name, e in f.evidence.items() if name != right]
+    known = f"{told.verdict}, {told.evidence.get(right, float('nan')):.1f}"
+    ahead = f"{max(others) - f.evidence[right]:+.1f}" if others and right in f.evidence else "-"
+    return (right, str(f.case.seed), f"{f.rho:.2f}", _said(f), known, ahead)
+
+
+def _said(f: Found) -> str:
+    return f"{f.verdict}: {', '.join(f.within)}" if f.within else f.verdict

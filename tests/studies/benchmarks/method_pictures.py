@@ -1,0 +1,104 @@
+"""The benchmark `method`: the two pictures of docs/method.md, from one record with two causes."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.search.best_first import best_first
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis
+from psa_casadi.diagnosis.search.known import Searched
+from psa_casadi.diagnosis.task import Task
+from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.search import fit_base
+from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.split import divided
+from psa_casadi.report.words.phrases import length_scale, plain
+from psa_casadi.report.words.tables import Table
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
+from tests.studies.plants.make import make_record
+
+#: What is hidden, how strongly, and the seed.
+HIDDEN, RHO, SEED = ("slow_creep", "hysteresis_memory"), (1.0, 3.0), 141592
+_SHOWN = 12
+_BLUE, _GREY, _ORANGE = "#0072b2", "#9aa1a8", "#d55e00"
+
+
+def run(progress: Progress, quick: bool) -> Outcome:
+    """Search one record, and say where its error goes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "record.csv"
+        make_record(HIDDEN[0], SEED, path, visible=RHO, more=HIDDEN[1:], more_visible=RHO)
+        record = read_record(path)
+    if quick:
+        record = record.slice(0, 3000)
+    experiments = divided([record], [])
+    base = fit_base(starting_model([record], None), experiments, progress=progress)
+    table = tuple(e for e in EFFECTS.values() if not e.inputs or record.temperature is not None)
+    table = tuple(e for e in table if set(e.needs) <= {c.name for c in base.model.components})
+    found = best_first(base, Task(experiments, table, progress=progress))
+    d = diagnose([record], progress=progress)
+    rows = [(_named(h), f"{found.scale.score(h):.0f}", "yes" if h.names in found.worth else "no")
+            for h in _best(found)]  # fmt: skip
+    head = ("hypothesis", "score", "may be the answer")
+    return Outcome(
+        (TitledTable(f"The search on a record with {' and '.join(map(plain, HIDDEN))}",
+                     Table(head, tuple(rows))),),
+        lambda: picture(found, d),
+    )  # fmt: skip
+
+
+def picture(found: Searched, d: Diagnosis) -> Figure:
+    """Return scores of the hypotheses, and the shares of the budget."""
+    figure = Figure(figsize=(12.0, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+    _scores(left, found)
+    _shares(right, d)
+    return figure
+
+
+def _scores(axes: Axes, found: Searched) -> None:
+    rows = _best(found)[::-1]
+    colours = [_BLUE if h is found.best else _ORANGE if h.names in found.worth else _GREY
+               for h in rows]  # fmt: skip
+    names = [_named(h) for h in rows]
+    axes.barh(names, [max(found.scale.score(h), 0.0) for h in rows], color=colours)
+    axes.set_xlabel("score [ln units]")
+    axes.set_title("Blue: the answer; orange: may be it;\n"
+                   "grey: fails a rule",
+                   loc="left", fontsize=10)  # fmt: skip
+    axes.tick_params(labelsize=8)
+
+
+def _shares(axes: Axes, d: Diagnosis) -> None:
+    b = d.budget
+    if b is None:
+        return
+    shares = [*b.causes, *([b.unnamed] if b.unnamed is not None else [])]
+    names = [plain(s.what).replace(" ", "\n") for s in b.causes]
+    names += [f"unnamed:\n{d.patch.kind}"] if d.patch is not None and b.unnamed is not None else []
+    values = [100.0 * s.share for s in shares]
+    errors = np.array([[100.0 * (s.share - max(s.interval[0], 0.0)) for s in shares],
+                       [100.0 * (min(s.interval[1], 1.0) - s.share) for s in shares]])  # fmt: skip
+    axes.bar(names, values, color=_BLUE, yerr=np.abs(errors), capsize=4)
+    left = 100.0 * (b.remains_rms_m / max(b.excess_rms_m, 1e-300)) ** 2
+    axes.bar(["remains"], [left], color=_GREY)
+    scale = length_scale(b.excess_rms_m)
+    axes.set_ylabel("share of the excess [%]")
+    title = f"Of {scale.text(b.excess_rms_m)} above the noise of {scale.text(b.noise_rms_m)}"
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.tick_params(labelsize=8)
+
+
+def _best(found: Searched) -> Sequence[Hypothesis]:
+    return sorted(found.known.values(), key=lambda h: -found.scale.score(h))[:_SHOWN]
+
+
+def _named(h: Hypothesis) -> str:
+    return " + ".join(plain(c.name) for c in h.causes) or "base"

@@ -1,0 +1,397 @@
+"""Commands in odd surroundings, many at once, and with a damaged cache.
+
+In each a command works, or ends with a sentence that names the cause.
+"""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from psa_casadi.errors import InputError
+from tests.studies.fuzz.campaign import FALSE_PASS, LEFT_OVER, WRONG_EXIT, Draw, Found, Target
+from tests.studies.fuzz.commands import (
+    LIBC,
+    LIMIT_S,
+    WORKS,
+    Around,
+    environment,
+    given_files,
+    half_written,
+    left_files,
+    misbehaved,
+    place,
+    psa,
+)
+
+#: Of Linux's prctl: take a right away, such as what lets root write anywhere.
+_DROP, _RIGHTS = 24, (1, 2, 3, 24)
+#: A cache in its usual place, below the folder of the user.
+_USUAL = {
+    "PSA_CASADI_CACHE": None, "XDG_CACHE_HOME": None,
+    "ZIG_GLOBAL_CACHE_DIR": None, "ZIG_LOCAL_CACHE_DIR": None,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """How they are made in a folder; words of which a failure must say one, lower case.
+
+    Without `words` the command must work. The command runs as a user who may not do everything.
+    """
+
+    prepare: Callable[[Path], Around]
+    words: tuple[str, ...] = ()
+    output: str = ""  # folder of the output, below the one of the command
+
+
+def _variables(words: tuple[str, ...] = (), /, **environment: str | None) -> Surroundings:
+    return Surroundings(lambda _: Around(environment), words)
+
+
+def _home(words: tuple[str, ...] = (), **environment: str | None) -> Surroundings:
+    """Change the folder of the user, where the cache is."""
+    return _variables((*_CACHE, *words), **_USUAL, **environment)
+
+
+def _named(
+    variable: str, make: Callable[[Path], object], *words: str, name: str = "place"
+) -> Surroundings:
+    """Let a variable name a path that is made in some way."""
+    usual = _USUAL if variable == "HOME" else {}
+
+    def prepare(folder: Path) -> Around:
+        make(folder / name)
+        return Around({**usual, variable: str(folder / name)})
+
+    return Surroundings(prepare, words)
+
+
+def _output(make: Callable[[Path], None], name: str, *words: str, **env: str) -> Surroundings:
+    """Make the folder of the output in some way."""
+
+    def prepare(folder: Path) -> Around:
+        make(folder / name)
+        return Around(env)
+
+    return Surroundings(prepare, words, name)
+
+
+def _first(do: Callable[..., object], *arguments: object, words: tuple[str, ...]) -> Surroundings:
+    """Do something in the process before the command begins."""
+    return Surroundings(lambda _: Around(first=lambda: (do(*arguments), None)[1]), words)
+
+
+def _limited(which: int, value: int, *words: str) -> Surroundings:
+    return _first(resource.setrlimit, which, (value, value), words=words)
+
+
+def _unwritable(path: Path) -> None:
+    path.mkdir()
+    path.chmod(0o555)
+
+
+def _file(path: Path) -> None:
+    path.write_text("a file")
+
+
+def _full(path: Path) -> None:
+    """Make a file system of 64 KiB, which is small enough to be full soon."""
+    path.mkdir()
+    mounted = ["mount", "-t", "tmpfs", "-o", "size=64k,mode=0777", "tmpfs", str(path)]
+    if os.geteuid() or subprocess.run(mounted, capture_output=True, check=False).returncode:
+        raise InputError("A small file system cannot be mounted here; this is left out.")
+
+
+def _open(path: Path) -> None:
+    path.mkdir()
+    path.chmod(0o777)
+
+
+def _written_to(stream: str, path: str) -> Callable[[Path], Around]:
+    return lambda _: Around(streams={stream: os.open(path, os.O_RDWR)})
+
+
+def _broken_pipe(_: Path) -> Around:
+    reads, writes = os.pipe()
+    os.close(reads)
+    return Around(streams={"stdout": writes})
+
+
+def _gone(folder: Path) -> Around:
+    """Start in a folder that is no more."""
+    gone = folder / "gone"
+    _open(gone)
+
+    def first() -> None:
+        os.chdir(gone)
+        gone.rmdir()
+
+    return Around(first=first)
+
+
+def _ignore() -> None:
+    for which in (signal.SIGPIPE, signal.SIGCHLD, signal.SIGHUP):
+        signal.signal(which, signal.SIG_IGN)
+
+
+def _compiler(text: str, folder: str = "tools") -> Surroundings:
+    """Let CC name a program by its text."""
+
+    def make(path: Path) -> None:
+        path.parent.mkdir()
+        path.write_text(text)
+        path.chmod(0o755)
+
+    return _named("CC", make, *_CC, name=f"{folder}/cc")
+
+
+_CACHE = ("cache", "psa_casadi_cache", "home", "place")
+_TEMPORARY = ("temporary", "tmpdir", "place")
+_DISK = ("space", "full", "place", "disk")
+_CC = ("cc", "compiler")
+_ASCII: dict[str, Any] = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+SURROUNDINGS: dict[str, Surroundings] = {
+    "no HOME": _home(HOME=None),
+    "HOME unwritable": _named("HOME", _unwritable, *_CACHE),
+    "HOME a file": _named("HOME", _file, *_CACHE),
+    "HOME empty": _home(HOME=""),
+    "HOME missing": _home(("/nowhere",), HOME="/nowhere/at/all"),
+    "HOME relative": _home(HOME="home"),
+    "XDG_CACHE_HOME empty": _variables(_CACHE, **{**_USUAL, "XDG_CACHE_HOME": "", "HOME": "/no"}),
+    "XDG_CACHE_HOME relative": _variables(_CACHE, **{**_USUAL, "XDG_CACHE_HOME": "here"}),
+    "cache a file": _named("PSA_CASADI_CACHE", _file, *_CACHE),
+    "cache unwritable": _named("PSA_CASADI_CACHE", _unwritable, *_CACHE),
+    "cache in /proc": _variables((*_CACHE, "/proc"), PSA_CASADI_CACHE="/proc/no/such"),
+    "cache a link to nothing": _named(
+        "PSA_CASADI_CACHE", lambda p: p.symlink_to("/nowhere/x"), *_CACHE, "/nowhere"
+    ),
+    "cache with spaces and unicode": _named(
+        "PSA_CASADI_CACHE", lambda _: None, name="mein käsch ➕ 'x'"
+    ),
+    "cache on a full disk": _named("PSA_CASADI_CACHE", _full, *_CACHE, *_DISK),
+    "TMPDIR missing": _variables((*_TEMPORARY, "/nowhere"), TMPDIR="/nowhere/at/all"),
+    "TMPDIR unwritable": _named("TMPDIR", _unwritable, *_TEMPORARY),
+    "TMPDIR a file": _named("TMPDIR", _file, *_TEMPORARY),
+    "TMPDIR on a full disk": _named("TMPDIR", _full, *_TEMPORARY, *_DISK),
+    "output on a full disk": _output(_full, "place", *_DISK, "write"),
+    "output folder unwritable": _output(_unwritable, "place", "write"),
+    "output with spaces and unicode": _output(_open, "o ü ➕"),
+    "unicode path without UTF-8": _output(_open, "ü", **_ASCII, LC_ALL="C"),
+    "LC_ALL=C": _variables(LC_ALL="C", LANG=None),
+    "POSIX without UTF-8": _variables(LC_ALL="POSIX", PYTHONIOENCODING="ascii", **_ASCII),
+    "unknown locale": _variables(LC_ALL="xx_YY.nonsense", LANG="tlh"),
+    "PYTHONOPTIMIZE=2": _variables(PYTHONOPTIMIZE="2"),
+    "stdin closed": _first(os.close, 0, words=()),
+    "stdout closed": _first(os.close, 1, words=("output", "closed", "written", "descriptor")),
+    "stderr closed": _first(os.close, 2, words=()),
+    "stdout a broken pipe": Surroundings(_broken_pipe, ("",)),
+    "stdout on a full disk": Surroundings(_written_to("stdout", "/dev/full"), (*_DISK, "output")),
+    "stderr on a full disk": Surroundings(_written_to("stderr", "/dev/full"), ("",)),
+    "COLUMNS=1": _variables(COLUMNS="1", LINES="1"),
+    "COLUMNS no number": _variables(COLUMNS="wide", TERM="dumb", NO_COLOR="1"),
+    "unknown terminal": _variables(TERM="no-such-terminal", FORCE_COLOR="1"),
+    "CC missing": _variables(_CC, CC="/nowhere/cc"),
+    "CC with a space": _compiler(
+        f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc "$@"\n', "my tools"
+    ),
+    "CC fails": _compiler("#!/bin/sh\nexit 1\n"),
+    "CC is no program": _compiler("\0\1\2"),
+    "CC does nothing": _compiler("#!/bin/sh\nexit 0\n"),
+    "CC with quotes": _variables(_CC, CC="cc '-DX=\"a"),
+    "PATH empty": _variables(PATH=""),
+    "little memory": _limited(resource.RLIMIT_AS, 700 << 20, "memory"),
+    "few open files": _limited(resource.RLIMIT_NOFILE, 16, "open files", "files"),
+    "small files only": _limited(
+        resource.RLIMIT_FSIZE, 4096, "large", "space", "write", "cache", "compiler"
+    ),
+    "no new processes": _limited(resource.RLIMIT_NPROC, 1, "process", "resource", "compiler"),
+    "directory gone": Surroundings(_gone, ("directory", "folder")),
+    "umask 777": _first(os.umask, 0o777, words=(*_CACHE, *_TEMPORARY, "permission", "write")),
+    "debugging": _variables(PSA_CASADI_DEBUG="1"),
+    "SIGPIPE and SIGCHLD ignored": _first(_ignore, words=()),
+    "odd numbers of threads": _variables(
+        OPENBLAS_NUM_THREADS="0", OMP_NUM_THREADS="x", MKL_NUM_THREADS="-1"
+    ),
+}
+
+
+#: What is run; the first needs a compiler, a cache and a temporary folder, and so does the second.
+_RUNS = ("simulate", "export fmu", "identify", "check")
+
+
+def _surroundings_case(rng: Draw) -> bytes:
+    names = list(SURROUNDINGS)
+    turn = rng.turn // len(names) + rng.turn % len(names) * (rng.turn >= len(names))
+    run = _RUNS[turn % len(_RUNS)]
+    return json.dumps({"surroundings": names[rng.turn % len(names)], "run": run}).encode()
+
+
+def _surround(data: bytes, where: Path) -> Iterator[Found]:
+    """Run a command in odd surroundings, as a user without rights: it works or names the cause."""
+    case = json.loads(data)
+    chosen, work = SURROUNDINGS[case["surroundings"]], WORKS[case["run"]]
+    with place(where) as folder:
+        around = chosen.prepare(folder)
+
+        def first() -> None:
+            for right in () if os.geteuid() else _RIGHTS:
+                LIBC.prctl(_DROP, right, 0, 0, 0)
+            around.first()
+
+        target = folder / chosen.output
+        places = {n: folder / n for n in given_files()} | {n: target / n for n in work.outputs}
+        named = [places.get(a, a) for a in work.arguments]  # whole paths: the folder may be gone
+        what = f"{case['surroundings']}: psa {case['run']}"
+        ended = psa(named, folder, replace(around, first=first))
+        for stream in around.streams.values():
+            os.close(stream)
+        mute = "stderr" in around.streams
+        yield from misbehaved(ended, (0, 1, 2) if chosen.words else (0,), what, mute=mute)
+        said = (ended.err + ended.out).lower()
+        if ended.code in (1, 2) and not any(word in said for word in chosen.words):
+            tail = " ".join(ended.err.split())[-200:]
+            yield Found(WRONG_EXIT, f"{what}: the failure does not name its cause: {tail}")
+        yield from half_written(target, work, what, may_miss=ended.code != 0)
+        yield from left_files(folder, what)
+
+
+def _many(data: bytes, where: Path) -> Iterator[Found]:
+    """Run many commands at once on one empty cache; all give the same."""
+    count = json.loads(data)["commands"]
+    with place(where) as folder:
+        command = [sys.executable, "-m", "psa_casadi.cli", *WORKS["simulate"].arguments[:-1]]
+        running = [
+            subprocess.Popen([*command, f"{k}.csv"], env=environment(folder, Around()), cwd=folder,
+                             stderr=subprocess.PIPE)
+            for k in range(count)
+        ]  # fmt: skip
+        what = f"{count} commands on an empty cache"
+        for process in running:
+            _, err = process.communicate()
+            if process.returncode:
+                yield Found(WRONG_EXIT, f"{what}: one says {err.decode()[-200:]}")
+        if (n := len({(folder / f"{k}.csv").read_bytes() for k in range(count)})) != 1:
+            yield Found(WRONG_EXIT, f"{what} give {n} results")
+        if left := [p.name for p in (folder / "cache" / "models").iterdir() if p.is_dir()]:
+            yield Found(LEFT_OVER, f"{what} leave folders: {', '.join(left[:3])}")
+
+
+#: Commands that keep a library, with the folder of the cache that it lies in.
+_KEPT = {"simulate": "models", "export fmu": "binaries"}
+
+
+def _content(change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(change(path.read_bytes()))
+
+
+def _flipped(place: float) -> Callable[[Path], object]:
+    def flip(data: bytes) -> bytes:
+        at = int(place * (len(data) - 1))
+        return data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]
+
+    return _content(flip)
+
+
+def _instead(make: Callable[[Path], object]) -> Callable[[Path], object]:
+    """Put something else in the place of a library."""
+
+    def put(path: Path) -> None:
+        path.unlink()
+        make(path)
+
+    return put
+
+
+def _whole_file(path: Path) -> None:
+    """Put a file where the folder of the libraries is."""
+    shutil.rmtree(path.parent)
+    path.parent.write_text("x")
+
+
+#: Ways to damage a library in the cache.
+WAYS: dict[str, Callable[[Path], object]] = {
+    "empty": _content(lambda _: b""),
+    "one byte": _content(lambda data: data[:1]),
+    "header only": _content(lambda data: data[:64]),
+    "half": _content(lambda data: data[: len(data) // 2]),
+    "last byte gone": _content(lambda data: data[:-1]),
+    "zeros": _content(lambda data: bytes(len(data))),
+    "zeros at the end": _content(lambda data: data[: len(data) // 2] + bytes(len(data) // 2)),
+    "text": _content(lambda _: b"this is no library\n"),
+    "bit in the header": _flipped(0.0005),
+    "bit in the first third": _flipped(0.3),
+    "bit in the middle": _flipped(0.5),
+    "bit in the last third": _flipped(0.75),
+    "more bytes": _content(lambda data: data + bytes(4096)),
+    "folder": _instead(lambda path: (path / "inside").mkdir(parents=True)),
+    "link to nothing": _instead(lambda path: path.symlink_to("nowhere")),
+    "link to itself": _instead(lambda path: path.symlink_to(".")),
+    "link to a device": _instead(lambda path: path.symlink_to("/dev/null")),
+    "other library": _instead(lambda path: shutil.copyfile(shutil.which("true") or "", path)),
+    "not readable": lambda path: path.chmod(0o000),
+    "not executable": lambda path: path.chmod(0o444),
+    "folder is a file": _whole_file,
+    "pipe": _instead(os.mkfifo),
+    "gone": Path.unlink,
+}
+
+
+@cache
+def _sound(command: str) -> tuple[bytes, dict[str, bytes]]:
+    """Return the output of a command, and the libraries that it leaves in an empty cache."""
+    work = WORKS[command]
+    with tempfile.TemporaryDirectory() as name, place(Path(name)) as folder:
+        if (ended := psa(work.arguments, folder)).code:
+            raise RuntimeError(f"no output to compare with: {ended.err}")
+        libraries = [p for p in (folder / "cache" / _KEPT[command]).iterdir() if p.is_file()]
+        output = (folder / work.outputs[0]).read_bytes()
+        return output, {p.name: p.read_bytes() for p in libraries}
+
+
+def _cache_case(rng: Draw) -> bytes:
+    names, runs = list(WAYS), list(_KEPT)
+    turn = rng.turn // len(names)
+    return json.dumps({"way": names[rng.turn % len(names)], "run": runs[turn % len(runs)]}).encode()
+
+
+def _damage_cache(data: bytes, where: Path) -> Iterator[Found]:
+    """Damage a library in the cache: the next command repairs it and gives the same result."""
+    case = json.loads(data)
+    expected, libraries = _sound(case["run"])
+    with place(where) as folder:
+        kept = folder / "cache" / _KEPT[case["run"]]
+        kept.mkdir(parents=True)
+        for name, content in libraries.items():
+            (kept / name).write_bytes(content)
+            (kept / name).chmod(0o755)
+        WAYS[case["way"]](kept / max(libraries, key=lambda n: len(libraries[n])))  # no checksum
+        what = f"psa {case['run']} with a library in the cache: {case['way']}"
+        for turn in ("at first", "again"):
+            output = folder / WORKS[case["run"]].outputs[0]
+            found = [*misbehaved(psa(WORKS[case["run"]].arguments, folder), (0,), what)]
+            yield from found
+            if not found and output.read_bytes() != expected:
+                yield Found(FALSE_PASS, f"{what}, {turn}: the output differs")
+            output.unlink(missing_ok=True)
+        yield from left_files(folder, what)
+
+
+TARGETS = (
+    Target("environments", "environments", ".json", _surroundings_case, _surround, 5.0,
+           2 * LIMIT_S, None, given_files),
+    Target("many-at-once", "environments", ".json", lambda _: b'{"commands": 20}', _many, 1.0,
+           2 * LIMIT_S, None, given_files),
+    Target("cache", "cache", ".json", _cache_case, _damage_cache, 1.0, 4 * LIMIT_S, None,
+           lambda: [_sound(command) for command in _KEPT]),
+)  # fmt: skip

@@ -1,0 +1,147 @@
+"""Hide an effect in a base simulation: draw it, scale it until it is as visible as wanted."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from tests.studies.plants.base import Run, simulate_base
+from tests.studies.plants.effect import HiddenEffect
+from tests.studies.plants.stack import FloatArray
+from tests.studies.plants.table import HIDDEN_EFFECTS
+from tests.studies.plants.visibility import refitted_ratio, visible_ratio
+
+RATIO = (1.5, 4.0)
+"""Visible ratio (tests/studies/plants/visibility.py) that is drawn at strength 1."""
+SEARCH = 12
+"""Sub-intervals while a gain is searched; the record itself has the full number."""
+WEAK = 0.02
+"""Where a ratio is asked for, gains go down to this share of the smallest that is plausible: that
+one is worth noticing, a weaker one is no less possible.
+"""
+ATTEMPTS, ENOUGH = 4, 1.25
+"""Base fits for an effect that asks for them, and the factor within which they stop."""
+
+Visible = float | tuple[float, float]
+"""A visible ratio, or a range from which it is drawn, uniform in its logarithm."""
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One effect in a record.
+
+    gain, parameters: the effect's own, SI. visible: rms of what the base cannot absorb over the
+    noise's. gain_limited: the gain wanted was beyond the plausible range and was clipped (for
+    an effect with `refit`: the ratio wanted was missed by more than a quarter). added:
+    what the effect adds to the displacement, (N,) [m].
+    """
+
+    effect: HiddenEffect
+    gain: float
+    parameters: Mapping[str, float]
+    visible: float
+    gain_limited: bool
+    added: FloatArray
+
+
+def effect_called(name: str) -> HiddenEffect:
+    """The effect of that name."""
+    if name not in HIDDEN_EFFECTS:
+        raise KeyError(f"No hidden effect is called {name}; there are {sorted(HIDDEN_EFFECTS)}.")
+    return HIDDEN_EFFECTS[name]
+
+
+def hide(
+    hidden: HiddenEffect,
+    run: Run,
+    rng: np.random.Generator,
+    directions: FloatArray,
+    noise_rms: float,
+    strength: float,
+    visible: Visible | None,
+    gain: float | None = None,
+) -> Hidden:
+    """Draw the effect and its gain. strength scales a visible ratio drawn from RATIO; `visible`
+    replaces both, and a `gain` that is known the search for it.
+    """
+    parameters = hidden.draw(rng, run)
+    if gain is not None:
+        added = hidden.contribution(run, parameters, gain)
+        shown = visible_ratio(directions, added, noise_rms)
+        return Hidden(hidden, gain, parameters, shown, gain_limited=False, added=added)
+    wanted = strength * float(rng.uniform(*RATIO)) if visible is None else _draw(rng, visible)
+    weakest = hidden.plausible[0] * (1.0 if visible is None else WEAK)
+    gain, limited = find_gain(
+        hidden, run, parameters, directions, wanted * noise_rms, (weakest, hidden.plausible[1])
+    )
+    if hidden.refit and gain > 0.0:
+        gain, reached = refit_gain(hidden, run, parameters, gain, wanted, noise_rms)
+        limited = abs(math.log(reached / wanted)) > math.log(ENOUGH)
+    added = hidden.contribution(run, parameters, gain)
+    if not hidden.refit or gain == 0.0:
+        reached = visible_ratio(directions, added, noise_rms)
+    return Hidden(hidden, gain, parameters, reached, limited, added)
+
+
+def _draw(rng: np.random.Generator, visible: Visible) -> float:
+    if isinstance(visible, tuple):
+        low, high = visible
+        return math.exp(float(rng.uniform(math.log(low), math.log(high))))
+    return float(visible)
+
+
+def find_gain(
+    hidden: HiddenEffect,
+    run: Run,
+    parameters: Mapping[str, float],
+    directions: FloatArray,
+    wanted: float,
+    plausible: tuple[float, float],
+) -> tuple[float, bool]:
+    """Gain within `plausible` at which the part that the base cannot absorb has the rms `wanted`
+    [m], and whether it was clipped.
+    """
+    if wanted <= 0.0:
+        return 0.0, False
+
+    trial = run if hidden.linear else simulate_base(run.stack, run.times, run.command, SEARCH)
+
+    def excess(log_gain: float) -> float:
+        added = hidden.contribution(trial, parameters, math.exp(log_gain))
+        return math.log(max(visible_ratio(directions, added, wanted), 1e-9))
+
+    low, high = (math.log(edge) for edge in plausible)
+    if hidden.linear:
+        log_gain = low - excess(low)
+        return math.exp(min(max(log_gain, low), high)), not low <= log_gain <= high
+    if excess(low) >= 0.0 or excess(high) <= 0.0:
+        return math.exp(low if excess(low) >= 0.0 else high), True
+    return math.exp(float(brentq(excess, low, high, xtol=0.02))), False
+
+
+def refit_gain(
+    hidden: HiddenEffect,
+    run: Run,
+    parameters: Mapping[str, float],
+    gain: float,
+    wanted: float,
+    noise_rms: float,
+) -> tuple[float, float]:
+    """Gain near the visible ratio `wanted` of a base that is fitted again, and the ratio reached:
+    the nearest of a few proportional corrections.
+    """
+    trial = simulate_base(run.stack, run.times, run.command, SEARCH)
+    low, high = WEAK * hidden.plausible[0], hidden.plausible[1]
+    tried: dict[float, float] = {}
+    for _ in range(ATTEMPTS):
+        added = hidden.contribution(trial, parameters, gain)
+        reached = max(refitted_ratio(trial, added, noise_rms), 1e-9)
+        tried[gain] = reached
+        following = min(max(gain * wanted / reached, low), high)
+        if max(reached / wanted, wanted / reached) < ENOUGH or following in tried:
+            break
+        gain = following
+    best = min(tried, key=lambda one: abs(math.log(tried[one] / wanted)))
+    return best, tried[best]

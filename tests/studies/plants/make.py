@@ -1,0 +1,205 @@
+"""Synthetic records with one hidden effect, none, or several, and the truth behind them.
+
+    python -m tests.studies.plants.make demo OUT.csv
+    python -m tests.studies.plants.make EFFECT SEED OUT.csv
+
+EFFECT is a name of tests/studies/plants/table.py, or none.
+"""
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from tests.studies.plants.base import Run, simulate_base
+from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind, draw_excitation
+from tests.studies.plants.hide import RATIO, Hidden, Visible, effect_called, hide
+from tests.studies.plants.noise import NOISES, Noise, NoiseKind, disturb, draw_noise
+from tests.studies.plants.several import added_by
+from tests.studies.plants.stack import FloatArray, Stack, draw_stack
+from tests.studies.plants.table import HIDDEN_EFFECTS
+from tests.studies.plants.visibility import base_directions
+
+__all__ = ["HEADER", "RATIO", "Truth", "Visible", "make_demo", "make_record"]
+HEADER = "time [s],voltage [V],displacement [um]"
+THERMOMETER = ",temperature [degC]"
+DEMO_EFFECT, DEMO_SEED = "slow_creep", 2015
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is behind a record.
+
+    effect: the hidden effect or None; foreign: True where the project's table has no such effect.
+    gain and parameters: the effect's own, SI. stack: the base. sigma, quantum: rms of the noise and
+    count of the sensor [m]. visible: rms of what the base cannot absorb over sigma. gain_limited:
+    the gain wanted was beyond the effect's plausible range and was clipped. times, voltage,
+    displacement, base_displacement: (N,) clean [s, V, m], the last without any effect. noise: kind
+    and figures of the noise; lost: (N,) True where a sample is missing or stuck. excitation: class
+    of the voltage. temperature: (N,) [degC] where the record has a thermometer. more: further
+    hidden effects, added to the first.
+    """
+
+    effect: str | None
+    foreign: bool
+    gain: float
+    parameters: Mapping[str, float]
+    stack: Stack
+    sigma: float
+    quantum: float
+    visible: float
+    gain_limited: bool
+    times: FloatArray
+    voltage: FloatArray
+    displacement: FloatArray
+    base_displacement: FloatArray
+    noise: Noise
+    lost: npt.NDArray[np.bool_]
+    excitation: ExcitationKind
+    temperature: FloatArray | None
+    more: tuple[Hidden, ...]
+
+    @property
+    def hidden(self) -> tuple[tuple[str, Mapping[str, float], float], ...]:
+        """Name, parameters and gain of every hidden effect."""
+        first = () if self.effect is None else ((self.effect, self.parameters, self.gain),)
+        return (*first, *((h.effect.name, h.parameters, h.gain) for h in self.more))
+
+
+def make_record(
+    effect: str | None,
+    seed: int,
+    path: Path,
+    strength: float = 1.0,
+    *,
+    noise: NoiseKind = "white",
+    excitation: ExcitationKind = "rich",
+    visible: Visible | None = None,
+    gain: float | None = None,
+    more: tuple[str, ...] = (),
+    more_visible: Visible | None = None,
+) -> Truth:
+    """Write a synthetic record as CSV and return the truth; the same seed gives the same bytes.
+
+    effect: a name of `HIDDEN_EFFECTS` or None. strength scales the drawn visible ratio (1.5 to 4);
+    0 removes the effect; `visible` (a ratio or a range) replaces it, and a `gain` both: where it is
+    known, no search takes its time. The same seed gives the same stack, voltage and noise with
+    every effect, and the same stack with every excitation. more: further effects, each as visible
+    beside the base as `more_visible` says; they act on each other (`added_by`).
+    """
+    _check(noise, excitation)
+    chosen = None if effect is None else effect_called(effect)
+    further = [effect_called(name) for name in more]
+    base_rng, effect_rng, noise_rng, *more_rng = (
+        np.random.default_rng(child)
+        for child in np.random.SeedSequence(seed).spawn(3 + len(further))
+    )
+    stack = draw_stack(base_rng)
+    run = simulate_base(stack, *draw_excitation(base_rng, excitation, stack.u_rated))
+    kind = draw_noise(noise_rng, noise, float(np.ptp(run.displacement)))
+    bare = chosen is None and not further
+    directions = np.empty((run.times.size, 0)) if bare else base_directions(run)
+    first = (
+        None
+        if chosen is None
+        else hide(chosen, run, effect_rng, directions, kind.rms, strength, visible, gain)
+    )
+    others = tuple(
+        hide(one, run, rng, directions, kind.rms, 1.0, more_visible)
+        for one, rng in zip(further, more_rng, strict=True)
+    )
+    every = [found for found in (first, *others) if found is not None]
+    clean = run.displacement + added_by(run, [(h.effect, h.parameters, h.gain) for h in every])
+    read, lost = disturb(noise_rng, kind, clean)
+    truth = _truth(run, clean, kind, lost, excitation, first, others)
+    write_csv(path, run.times, run.command, read, truth.temperature)
+    return truth
+
+
+def _check(noise: str, excitation: str) -> None:
+    for value, known in ((noise, NOISES), (excitation, EXCITATIONS)):
+        if value not in known:
+            raise KeyError(f"There is no {value!r}; there are {', '.join(known)}.")
+
+
+def _truth(
+    run: Run,
+    clean: FloatArray,
+    noise: Noise,
+    lost: npt.NDArray[np.bool_],
+    excitation: ExcitationKind,
+    first: Hidden | None,
+    more: tuple[Hidden, ...],
+) -> Truth:
+    temperature = None
+    for found in (first, *more):
+        if found is not None and found.effect.room is not None:
+            temperature = found.effect.room(run.times, found.parameters)
+    return Truth(
+        effect=None if first is None else first.effect.name,
+        foreign=first is not None and first.effect.foreign,
+        gain=0.0 if first is None else first.gain,
+        parameters={} if first is None else first.parameters,
+        stack=run.stack,
+        sigma=noise.rms,
+        quantum=noise.quantum,
+        visible=0.0 if first is None else first.visible,
+        gain_limited=first is not None and first.gain_limited,
+        times=run.times,
+        voltage=run.command,
+        displacement=clean,
+        base_displacement=run.displacement,
+        noise=noise,
+        lost=lost,
+        excitation=excitation,
+        temperature=temperature,
+        more=more,
+    )
+
+
+def write_csv(
+    path: Path,
+    times: FloatArray,
+    voltage: FloatArray,
+    displacement: FloatArray,
+    temperature: FloatArray | None = None,
+) -> None:
+    """Write a record: times to 1 us, voltage to 1 mV, displacement [m] in um to 1 pm (an empty cell
+    where it is nan), temperature [degC] to 1 mK.
+    """
+    rows = [
+        f"{t:.6f},{v:.3f}," + ("" if math.isnan(x) else f"{x * 1e6:.6f}")
+        for t, v, x in zip(times.tolist(), voltage.tolist(), displacement.tolist(), strict=True)
+    ]
+    header = HEADER
+    if temperature is not None:
+        header += THERMOMETER
+        rows = [f"{row},{t:.3f}" for row, t in zip(rows, temperature.tolist(), strict=True)]
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+
+
+def make_demo(path: Path) -> Truth:
+    """The demonstration's record: a stack that creeps."""
+    return make_record(DEMO_EFFECT, DEMO_SEED, path)
+
+
+def main(arguments: list[str]) -> int:
+    """Run from the command line; 0 done, 2 wrong usage."""
+    if len(arguments) == 2 and arguments[0] == "demo":
+        make_demo(Path(arguments[1]))
+        return 0
+    known = {*HIDDEN_EFFECTS, "none"}
+    if len(arguments) == 3 and arguments[0] in known and arguments[1].isdigit():
+        effect = None if arguments[0] == "none" else arguments[0]
+        make_record(effect, int(arguments[1]), Path(arguments[2]))
+        return 0
+    sys.stderr.write(__doc__ or "")
+    return 2
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

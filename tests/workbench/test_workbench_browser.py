@@ -1,0 +1,166 @@
+"""The local page as people use it: a record is given, columns are mapped, the verdict is read."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from tests.report.browser import find_browser
+from tests.report.steered_browser import Steered, steered
+from tests.tiers import slow
+
+pytestmark = pytest.mark.xdist_group("browser")
+DEMO = Path(__file__).parents[2] / "psa_casadi" / "data" / "demo.csv"
+#: A name that is markup where somebody takes it for that.
+HOSTILE = "<img src=x onerror=document.title=1>.csv"
+#: Leaves of the page what was tried, the verdict, and the top of the report.
+_FROM_THE_SEARCH = """
+  var away = 'main > :not(section), section:has(#h-files, #h-columns), #h-run ~ :not(#search),'
+    + ' #h-run, #said, #downloads, #result .bar';
+  document.querySelectorAll(away).forEach(n => { n.style.display = 'none'; });
+  document.querySelector('#report').style.height = '740px';
+  scrollTo(0, 0);
+"""
+PICTURES = os.environ.get("PSA_CASADI_PICTURES", "")
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> Iterator[str]:
+    command = [sys.executable, "-m", "psa_casadi.cli", "web", "--diagnose", "--no-browser"]
+    (tmp_path / "tmp").mkdir()
+    given = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+    process = subprocess.Popen(
+        command, env=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    yield process.stdout.readline().split()[1]
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=20)[1]
+    assert process.returncode == 0, said
+    assert "Ended" in said
+    assert not list((tmp_path / "tmp").iterdir())
+
+
+def picture(tab: Steered, name: str, width: int = 1100, height: int = 1500, **how: bool) -> None:
+    if PICTURES:
+        tab.look(Path(PICTURES) / f"{name}.png", width, height, **how)
+
+
+def pictures_of_the_result(tab: Steered) -> None:
+    """Save the page as it is, and from the search on: docs/pictures/web_diagnose_result.png."""
+    picture(tab, "result", height=3000)
+    picture(tab, "phone", 390, 2600)
+    picture(tab, "night", height=2200, dark=True)
+    if PICTURES:
+        tab.call("Emulation.setScrollbarsHidden", hidden=True)
+        tab.run(_FROM_THE_SEARCH)
+        for _ in range(3):  # the report is drawn again for another width, which takes a second
+            picture(tab, "web_diagnose_result", 500, 1350)
+
+
+def drop(tab: Steered, path: Path) -> None:
+    """Drop a file with the mouse, as from a window of the system."""
+    data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        tab.call("Input.dispatchDragEvent", type=kind, x=300, y=300, data=data)
+
+
+def faults(tab: Steered, axe: str) -> list[str]:
+    """Return what axe calls serious or critical in the page as it is now."""
+    tab.run(f"{axe}; window.found = null; axe.run({{resultTypes: ['violations']}}).then("
+            "r => { window.found = r.violations; }); 0")  # fmt: skip
+    tab.until("window.found")
+    told: list[str] = tab.run(
+        "window.found.filter(v => ['serious', 'critical'].includes(v.impact)).map("
+        "v => v.id + ': ' + v.nodes[0].html)"
+    )
+    return told
+
+
+def report_runs(tab: Steered, address: str) -> None:
+    """In its sandbox the report draws its plots, and its model runs."""
+    tab.call("Page.navigate", url=address.partition("?")[0] + "report")
+    alive = "document.querySelector('.live') && document.querySelector('.live').psa"
+    tab.until(f"{alive} && document.querySelector('.main-svg')")
+
+
+def narrow(tab: Steered) -> None:
+    """A phone need not scroll sideways."""
+    tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844,
+             deviceScaleFactor=1, mobile=True)  # fmt: skip
+    assert tab.run("document.documentElement.scrollWidth") <= 390
+
+
+def of_another_layout(tab: Steered, path: Path, line: str) -> None:
+    """Choose a file whose columns have other names: they are said of it alone, and go with it."""
+    rows = ["time [s],voltage [V],pos", *DEMO.read_text(encoding="utf-8").splitlines()[1:300]]
+    path.write_text("\n".join(rows), encoding="utf-8")
+    tab.choose("#pick", path)
+    tab.until("document.querySelector('#layout1c2')")
+    tab.run("s = document.querySelector('#layout1c2'); s.value = 'displacement'; s.onchange()")
+    tab.until("document.querySelectorAll('#curves figure').length === 2")
+    said = "time=time:s", "voltage=voltage:V", "displacement=pos:um"
+    both = ",".join([line, *(f"{path.name}@{part}" for part in said)])
+    assert tab.run("document.querySelector('#set-columns').value") == both
+    picture(tab, "layouts")
+    tab.run(f"document.querySelector('[aria-label=\"Remove {path.name}\"]').click()")
+    tab.until(f"document.querySelector('#set-columns').value === '{line}'")
+
+
+def nothing_outside_nor_wrong(tab: Steered, address: str) -> None:
+    """Every request went to the server itself, and the console has no error."""
+    told = [(e.get("method"), e.get("params", {})) for e in tab.heard]
+    asked = [p["request"]["url"] for m, p in told if m == "Network.requestWillBeSent"]
+    own = (address.partition("?")[0], "data:", "blob:")
+    assert asked
+    assert [u for u in asked if not u.startswith(own)] == []
+    words = [p["entry"] for m, p in told if m == "Log.entryAdded"]
+    assert [w for w in words if w["level"] == "error"] == []
+
+
+@slow
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes with numbers of POSIX")
+def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) -> None:
+    record = tmp_path / HOSTILE
+    record.write_text(DEMO.read_text("utf-8").replace("displacement [um]", "CH2"), "utf-8")
+    axe = files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+    browser = find_browser(tmp_path)
+    with steered(browser) as tab:
+        tab.call("Page.navigate", url=address)
+        tab.until("location.search === '' && document.querySelector('#start')")
+        drop(tab, record)
+        tab.until("document.querySelector('.problems')")
+        assert tab.run("document.querySelector('#files .name').textContent") == HOSTILE
+        assert tab.run("document.querySelector('#start').disabled")
+        tab.run("s = document.querySelector('#layout0c2'); s.value = 'displacement'; s.onchange()")
+        tab.until("!document.querySelector('#start').disabled")
+        line = "time=time:s,voltage=voltage:V,displacement=CH2:um"
+        assert tab.run("document.querySelector('#set-columns').value") == line
+        of_another_layout(tab, tmp_path / "b.csv", line)
+        assert faults(tab, axe) == []
+        picture(tab, "files")
+        tab.run("document.querySelector('#start').focus()")
+        tab.press("Enter", 13, "\r")
+        tab.until("document.querySelectorAll('#tree li').length > 2", 120)
+        picture(tab, "search")
+        tab.call("Page.navigate", url=address)  # a tab that is opened anew sees the same run
+        tab.until("document.querySelectorAll('#tree li').length > 2")
+        tab.until("!document.querySelector('#result').hidden", 240)
+        tab.until("document.querySelector('#verdict').textContent.startsWith('Verdict: cause')")
+        assert "slow creep" in tab.run("document.querySelector('#verdict').textContent")
+        assert "the answer" in tab.run("document.querySelector('.best').textContent")
+        assert line in tab.run("document.querySelector('#command').textContent")
+        names = "[...document.querySelectorAll('#downloads a[download]')].map(a => a.textContent)"
+        assert {"report.html", "extended.json", "diagnosis.json"} <= set(tab.run(names))
+        assert tab.run("document.title") == "Diagnose records"
+        assert not tab.run("document.querySelector('img:not(.still)')")
+        assert faults(tab, axe) == []
+        pictures_of_the_result(tab)
+        narrow(tab)
+        report_runs(tab, address)
+        nothing_outside_nor_wrong(tab, address)
