@@ -103,8 +103,3 @@ class Run:
     def share(self) -> Floats:
         """Times as shares of the record's length."""
         return np.asarray(self.times / self.times[-1])
-
-
-def names(*alternatives: str) -> frozenset[str]:
-    """Return the names that are right for one cause."""
-    return frozenset(alternatives)
