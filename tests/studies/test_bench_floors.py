@@ -130,6 +130,6 @@ def test_where_a_record_comes_from_is_found() -> None:
 def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["identify", "--folder", str(tmp_path)])
     assert said.exit_code == 2
-    assert "takes no records of your own; floors, mirror does" in said.stderr.replace("\n", " ")
+    assert "--folder: 'identify' takes none" in said.stderr.replace("\n", " ")
     with pytest.raises(InputError, match="holds no CSV file"):
         run_on(lambda _: None, tmp_path)
