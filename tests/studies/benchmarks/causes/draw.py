@@ -11,10 +11,9 @@ from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import draw_excitation
 from tests.studies.plants.hide import SEARCH
 from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.sensor import room, temperature
 from tests.studies.plants.stack import FloatArray
 from tests.studies.plants.table import FOREIGN, KNOWN, called
-from tests.studies.plants.temperature import draw as draw_room
-from tests.studies.plants.temperature import room
 from tests.studies.plants.visibility import base_columns
 
 #: Shares of the kinds of cases; what is left over goes to the first.
@@ -140,7 +139,7 @@ def _thermometer(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
     for name, parameters, _ in truth.hidden:
         if name == "temperature":
             return dict(parameters)
-    return draw_room(rng, simulate_base(truth.stack, truth.times, truth.voltage, SEARCH))
+    return temperature.draw(rng, simulate_base(truth.stack, truth.times, truth.voltage, SEARCH))
 
 
 def _read(path: Path) -> FloatArray:
