@@ -12,8 +12,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from tests.studies.__main__ import app
-from tests.studies.benchmarks.floor_features import play
-from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, ridge
+from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
 from tests.studies.benchmarks.floors import floor_on, run_on
 
 FloatArray = npt.NDArray[np.float64]

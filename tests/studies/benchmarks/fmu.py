@@ -9,36 +9,205 @@ the set-up of the experiment, one call for every communication step.
 import subprocess
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from ctypes import c_size_t
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise, product
 from math import inf, log
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import fmpy
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
+from fmpy.sundials import CVodeSolver
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from scipy.integrate import solve_ivp
 
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fixed_step.export import export_c, fixed_step
 from psa_casadi.export.fixed_step.probe import VOLTAGES
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.sources import compiled_files, exported_texts
-from psa_casadi.export.importer.fmu import Fmu, FmuError
+from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import multisine, time_grid
+from psa_casadi.reference import simulate
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
-from tests.studies.benchmarks.work_precision_methods import METHODS, OURS, Case, Method
+from psa_casadi.simulation.stepper import run as run_stepper
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled, table_of
 
 FloatArray = npt.NDArray[np.float64]
+
+#: The share of the importer's tolerance that the FMU's solver gives each step (instance.c).
+STEP_SHARE = 0.003
+TIGHTEST_STEP = 1e-11
+OURS = "co-simulation FMU"
+_OUTPUT = "displacement"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model and its voltage [V] at regular times (n,) [s].
+
+    The voltage is linear between the times or, with `hold`, constant from each to the next.
+    """
+
+    name: str
+    model: Model
+    times: FloatArray
+    voltage: FloatArray
+    hold: bool
+
+    @property
+    def jumps(self) -> list[int]:
+        """Return the indices of the times at which the voltage jumps."""
+        return [int(k) + 1 for k in np.flatnonzero(np.diff(self.voltage))] if self.hold else []
+
+    def at(self, t: float) -> float:
+        """Return the voltage at t; at a jump, that after it."""
+        if not self.hold:
+            return float(np.interp(t, self.times, self.voltage))
+        return float(self.voltage[np.searchsorted(self.times, t, side="right") - 1])
+
+    def truth(self, rtol: float) -> FloatArray:
+        """Return the displacement (n,) of the reference, which shares no code with the model."""
+        marks = self.times[self.jumps] if self.hold else self.times
+        breakpoints = list(marks)
+        return simulate(
+            self.model.values, self.at, self.times, breakpoints=breakpoints, rtol=rtol
+        ).displacement
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The displacement (n,) of one run; `evaluations` of the right-hand side, if counted on it."""
+
+    displacement: FloatArray
+    evaluations: int | None = None
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to integrate: `solve` is timed; `count`, where needed, counts in a run of its own."""
+
+    name: str
+    solve: Callable[[Case, Fmu, float], Solved]
+    count: Callable[[Case, Fmu, float], int] | None = None
+
+
+def _stepped(case: Case, fmu: Fmu, tolerance: float) -> Solved:
+    """Step the FMU from sample to sample; with slopes where the voltage is linear."""
+    inputs = Signals(("voltage",), case.times, case.voltage[:, None])
+    found = co_simulate(
+        fmu, case.times, inputs, [_OUTPUT], tolerance=tolerance, rates=not case.hold
+    )
+    return Solved(found[:, 0])
+
+
+def _stepped_count(case: Case, _fmu: Fmu, tolerance: float) -> int:
+    """Count with the simulator: the same C code with the same tolerance of a step."""
+    u = np.zeros((len(case.times), len(case.model.input_names)))
+    u[:, case.model.input_names.index("voltage")] = case.voltage
+    return run_stepper(
+        case.model, case.times, u, np.zeros(len(case.model.state_names)),
+        rtol=max(STEP_SHARE * tolerance, TIGHTEST_STEP), hold="zero" if case.hold else "linear",
+    ).evaluations  # fmt: skip
+
+
+class _Unused:
+    """What fmpy's CVode would set inputs with, but only where it looks for events."""
+
+    def apply(self, time: float) -> None:
+        """Do nothing: the inputs are set with the time."""
+
+
+def _cvode(case: Case, fmu: Fmu, tolerance: float) -> Solved:
+    """Integrate the model-exchange FMU with the CVode that fmpy carries.
+
+    It restarts at jumps of the voltage and at zeros of the FMU's event indicators.
+    fmpy's own `simulate_fmu` sets inputs once a step at most, and not at the right-hand side,
+    which costs a moving voltage all accuracy; here they are set with every time.
+    """
+    t, calls, last = case.times, [0], [0.0]
+    with fmu.start(MODEL_EXCHANGE, tolerance=tolerance) as instance:
+
+        def set_time(time: float) -> None:
+            instance.require("SetTime", float(time))
+            instance.set({"voltage": case.at(min(time, last[0]))})
+
+        def vector(function: str) -> Callable[[Any, int], None]:
+            return lambda values, count: instance.require(function, values, c_size_t(count))
+
+        def derivatives(values: Any, count: int) -> None:
+            calls[0] += 1
+            instance.require("GetDerivatives", values, c_size_t(count))
+
+        solver = CVodeSolver(
+            nx=len(fmu.states()), nz=int(fmu.description.numberOfEventIndicators),
+            get_x=vector("GetContinuousStates"), set_x=vector("SetContinuousStates"),
+            get_dx=derivatives, get_z=vector("GetEventIndicators"), input=_Unused(),
+            get_nominals=vector("GetNominalsOfContinuousStates"), set_time=set_time,
+            startTime=float(t[0]), maxStep=float(t[-1] - t[0]) / 50.0, relativeTolerance=tolerance,
+        )  # fmt: skip
+        rows = [instance.get([_OUTPUT])]
+        for begin, end in pairwise([0, *case.jumps, len(t) - 1]):
+            last[0] = float(np.nextafter(t[end], -np.inf))
+            for k in range(begin, end):
+                now = float(t[k])
+                while now < t[k + 1]:
+                    try:
+                        event, _, now = solver.step(now, float(t[k + 1]))
+                    except RuntimeError as error:
+                        raise FmuError(f"CVode stopped after {now:g} s: {error}") from error
+                    if event:
+                        solver.reset(now)
+                rows.append(instance.get([_OUTPUT]))
+            solver.reset(float(t[end]))
+    return Solved(np.array(rows)[:, 0], calls[0])
+
+
+def _scipy(solver: Any, case: Case, fmu: Fmu, tolerance: float) -> Solved:
+    """Integrate the right-hand side of the model-exchange FMU, restarted at jumps."""
+    calls, t = [0], case.times
+    with fmu.start(MODEL_EXCHANGE, tolerance=tolerance) as instance:
+        states = fmu.states()
+        x, atol = instance.get(states), tolerance * np.array([fmu.nominals[s] for s in states])
+        rows = [instance.get([_OUTPUT])]
+        for begin, end in pairwise([0, *case.jumps, len(t) - 1]):
+            last = float(np.nextafter(t[end], -np.inf))
+
+            def rates(time: float, x: FloatArray, last: float = last) -> FloatArray:
+                calls[0] += 1
+                return instance.derivatives(time, x, {"voltage": case.at(min(time, last))})
+
+            found = solve_ivp(
+                rates, (t[begin], t[end]), x, solver, t[begin + 1 : end + 1], rtol=tolerance,
+                atol=atol,
+            )  # fmt: skip
+            if not found.success:
+                raise FmuError(f"scipy stopped after {t[begin]:g} s: {found.message}")
+            counted = calls[0]
+            for time, state in zip(found.t, found.y.T, strict=True):
+                rates(float(time), state)
+                rows.append(instance.get([_OUTPUT]))
+            calls[0], x = counted, found.y[:, -1]
+    return Solved(np.array(rows)[:, 0], calls[0])
+
+
+METHODS = (
+    Method(OURS, _stepped, _stepped_count),
+    Method("CVode, model exchange", _cvode),
+    Method("scipy Radau, model exchange", partial(_scipy, "Radau")),
+    Method("scipy LSODA, model exchange", partial(_scipy, "LSODA")),
+)
+
 
 #: The step of issue and table [s], and what is asked of it.
 STEP, MOST_NS, MOST_RATIO = 1e-5, 400.0, 1.5
@@ -91,80 +260,54 @@ def cost_table(progress: Progress, *, quick: bool) -> TitledTable:
         "psa export fmu --solver fixed": fixed[1],
         "psa export fmu": ordinary[1],
     }
-    rows = tuple(
-        (name, f"{c.mean():.0f}", f"{c.max():.0f}", f"{c.max() / c.mean():.2f}")
-        for name, c in ways.items()
-    )
-    return TitledTable(
+    return table_of(
         f"cost of a step of {1e6 * STEP:g} us, P-885.51: ramps, holds, tones and jumps",
-        Table(("way", "mean [ns]", "worst [ns]", "worst / mean"), rows),
+        ways,
+        {
+            "way": str,
+            "mean [ns]": lambda way: f"{ways[way].mean():.0f}",
+            "worst [ns]": lambda way: f"{ways[way].max():.0f}",
+            "worst / mean": lambda way: f"{ways[way].max() / ways[way].mean():.2f}",
+        },
         f"Asked of the generated code: at most {MOST_NS:g} ns, worst over mean below"
         f" {MOST_RATIO:g}. Each step counts with the least time of its repetitions.",
     )
 
 
-_FONT = 10.5
 _STYLES = (("#0072b2", "o"), ("#d55e00", "s"), ("#009e73", "^"), ("#9a6fb0", "v"))
 
 
-class Measured(Protocol):
-    """What a run must tell to be drawn."""
-
-    @property
-    def case(self) -> str: ...
-    @property
-    def method(self) -> str: ...
-    @property
-    def tolerance(self) -> float: ...
-    @property
-    def error(self) -> float: ...
-    @property
-    def seconds(self) -> float: ...
-    @property
-    def evaluations(self) -> float: ...
-
-
-def picture(runs: Sequence[Measured]) -> Figure:
+def picture(runs: Sequence["Run"]) -> Figure:
     """Return a row for every case: error over CPU time, over right-hand sides, over tolerance."""
     cases = list(dict.fromkeys(r.case for r in runs))
     figure = Figure(figsize=(14.0, 4.6 * len(cases)), layout="constrained")
     grid = figure.subplots(len(cases), 3, squeeze=False)
+    across = {
+        "seconds": "CPU time [s]",
+        "evaluations": "evaluations of the right-hand side",
+        "tolerance": "tolerance asked for",
+    }
     for row, case in zip(grid, cases, strict=True):
         of_case = [r for r in runs if r.case == case]
-        _curves(row[0], of_case, "seconds", "CPU time [s]")
-        _curves(row[1], of_case, "evaluations", "evaluations of the right-hand side")
-        _curves(row[2], of_case, "tolerance", "tolerance asked for")
+        for axes, (of, label) in zip(row, across.items(), strict=True):
+            for method, (colour, marker) in zip(_methods(of_case), _STYLES, strict=False):
+                mine = [r for r in of_case if r.method == method]
+                axes.loglog(
+                    [getattr(r, of) for r in mine], [r.error for r in mine], color=colour,
+                    marker=marker, markersize=5, linewidth=1.4, label=method,
+                )  # fmt: skip
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            styled(axes, label, "largest error / range", case if of == "seconds" else "")
         ends = [min(r.tolerance for r in of_case), max(r.tolerance for r in of_case)]
         row[2].plot(ends, ends, color="0.6", linewidth=1.0, zorder=0, label="error = tolerance")
-        row[0].set_title(case, loc="left", fontsize=_FONT)
-        row[2].legend(fontsize=_FONT - 2)
+        row[2].legend(fontsize=8.5)
     return figure
-
-
-def _curves(axes: Axes, runs: Sequence[Measured], across: str, label: str) -> None:
-    methods = list(dict.fromkeys(r.method for r in runs))
-    for method, (colour, marker) in zip(methods, _STYLES, strict=False):
-        mine = [r for r in runs if r.method == method]
-        axes.loglog(
-            [getattr(r, across) for r in mine], [r.error for r in mine], color=colour,
-            marker=marker, markersize=5, linewidth=1.4, label=method,
-        )  # fmt: skip
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel(label, fontsize=_FONT)
-    axes.set_ylabel("largest error / range", fontsize=_FONT)
-    axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=_FONT - 2)
 
 
 _TRUTH, _CHECK = 1e-12, 1e-11
 _LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 _SAMPLE_TIME = 5e-5
 _SLOW = 0.3
-_HEAD = (
-    "method", "tolerance asked for", "largest error / range", "error / tolerance",
-    "CPU time [ms]", "right-hand sides",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -189,7 +332,12 @@ def run(progress: Progress, quick: bool) -> Outcome:
         doubt = np.max(np.abs(case.truth(_CHECK) - truth)) / np.ptp(truth)
         with tempfile.TemporaryDirectory() as folder:
             path = export_fmu(case.model, Path(folder) / "model.fmu")
-            found = _runs(case, path, tolerances, truth, progress, 1 if quick else 3)
+            with Fmu(path) as fmu:
+                found = [
+                    _measured(m, case, fmu, tolerance, truth, progress, 1 if quick else 3)
+                    for m in METHODS
+                    for tolerance in tolerances
+                ]
         tables.append(_table(case, found, float(doubt)))
         runs += found
     cost = cost_table(progress, quick=quick)
@@ -216,18 +364,6 @@ def cases(quick: bool) -> tuple[Case, Case]:
     )  # fmt: skip
 
 
-def _runs(
-    case: Case, path: Path, tolerances: Sequence[float], truth: FloatArray, progress: Progress,
-    repeats: int,
-) -> list[Run]:  # fmt: skip
-    with Fmu(path) as fmu:
-        return [
-            _measured(method, case, fmu, tolerance, truth, progress, repeats)
-            for method in METHODS
-            for tolerance in tolerances
-        ]
-
-
 def _measured(
     method: Method, case: Case, fmu: Fmu, tolerance: float, truth: FloatArray,
     progress: Progress, repeats: int,
@@ -252,15 +388,19 @@ def _measured(
 
 
 def _table(case: Case, runs: Sequence[Run], doubt: float) -> TitledTable:
-    rows = tuple(
-        (
-            r.method, f"{r.tolerance:.0e}", number(r.error, 2), number(r.error / r.tolerance, 2),
-            number(1e3 * r.seconds), number(r.evaluations),
-        )
-        for r in runs
-    )  # fmt: skip
-    note = f"The reference at 1e-11 and at 1e-12 differ by {number(doubt, 2)} of the range."
-    return TitledTable(f"Reached error and work: {case.name}", Table(_HEAD, rows), note)
+    return table_of(
+        f"Reached error and work: {case.name}",
+        runs,
+        {
+            "method": lambda r: r.method,
+            "tolerance asked for": lambda r: f"{r.tolerance:.0e}",
+            "largest error / range": lambda r: number(r.error, 2),
+            "error / tolerance": lambda r: number(r.error / r.tolerance, 2),
+            "CPU time [ms]": lambda r: number(1e3 * r.seconds),
+            "right-hand sides": lambda r: number(r.evaluations),
+        },
+        f"The reference at 1e-11 and at 1e-12 differ by {number(doubt, 2)} of the range.",
+    )
 
 
 def work_at(runs: Sequence[Run], error: float) -> tuple[float, float]:
@@ -287,26 +427,26 @@ def work_at(runs: Sequence[Run], error: float) -> tuple[float, float]:
 def _summary(runs: Sequence[Run]) -> TitledTable:
     """Return the work of the others over that of the FMU, at equal error."""
     rows = []
-    for case in dict.fromkeys(r.case for r in runs):
-        of_case = [r for r in runs if r.case == case]
-        for method in (m.name for m in METHODS if m.name != OURS):
-            for error in _LEVELS:
-                ours, theirs = (
-                    work_at([r for r in of_case if r.method == name], error)
-                    for name in (OURS, method)
-                )
-                if inf not in (*ours, *theirs):
-                    ratios = (number(b / a, 2) for a, b in zip(ours, theirs, strict=True))
-                    rows.append((case.partition(" (")[0], method, f"{error:.0e}", *ratios))
+    names = [m.name for m in METHODS if m.name != OURS]
+    for case, method, error in product(dict.fromkeys(r.case for r in runs), names, _LEVELS):
+        ours, theirs = (
+            work_at([r for r in runs if (r.case, r.method) == (case, name)], error)
+            for name in (OURS, method)
+        )
+        if inf not in (*ours, *theirs):
+            ratios = (number(b / a, 2) for a, b in zip(ours, theirs, strict=True))
+            rows.append((case.partition(" (")[0], method, f"{error:.0e}", *ratios))
     head = ("case", "method", "error", "CPU time over the FMU's", "right-hand sides over the FMU's")
-    return TitledTable("Work of the others at equal error", Table(head, tuple(rows)), _NOTE)
+    note = (
+        "CPU time of one process of one run; only the ratios carry over to other machines. All are"
+        " driven from Python: co-simulation pays for it once a communication step, the others at"
+        " every right-hand side, so the right-hand sides are the fairer measure of the methods"
+        " themselves. They include those spent on Jacobians by differences; the FMU's solver has"
+        " the exact Jacobian and evaluates it once a step, which is not counted. CVode and scipy"
+        " restart at jumps and run through the samples of the record."
+    )
+    return TitledTable("Work of the others at equal error", Table(head, tuple(rows)), note)
 
 
-_NOTE = (
-    "CPU time of one process of one run; only the ratios carry over to other machines. All are"
-    " driven from Python: co-simulation pays for it once a communication step, the others at every"
-    " right-hand side, so the right-hand sides are the fairer measure of the methods themselves."
-    " They include those spent on Jacobians by differences; the FMU's solver has the exact Jacobian"
-    " and evaluates it once a step, which is not counted. CVode and scipy restart at jumps and run"
-    " through the samples of the record."
-)
+def _methods(runs: Sequence["Run"]) -> list[str]:
+    return list(dict.fromkeys(r.method for r in runs))

@@ -8,6 +8,7 @@ from importlib import import_module
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from psa_casadi.report.words.tables import Table
@@ -110,3 +111,13 @@ BENCHES: dict[str, str] = dict(line.split(" ", 1) for line in _TABLE.strip().spl
 def offers(name: str, run: str) -> Any:
     """Return `run`, `run_on` or `run_sized` of a benchmark, None where it has none."""
     return getattr(import_module(f"tests.studies.benchmarks.{name}"), run, None)
+
+
+def styled(axes: Axes, x: str = "", y: str = "", title: str = "", *, size: float = 10.5) -> None:
+    """Give axes labels and a title, a light grid below the curves, and small numbers."""
+    axes.set_xlabel(x, fontsize=size)
+    axes.set_ylabel(y, fontsize=size)
+    axes.set_title(title, loc="left", fontsize=size)
+    axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=size - 2)

@@ -15,8 +15,8 @@ from psa_casadi.cli.screen import Quiet, show_table, working
 from psa_casadi.errors import InputError
 from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.causes import score
-from tests.studies.benchmarks.causes.answers import write_answer
-from tests.studies.benchmarks.causes.write import write
+from tests.studies.benchmarks.causes.data import write
+from tests.studies.benchmarks.causes.methods import write_answer
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 SEED, CASES, QUICK = 20261126, 60, 10
