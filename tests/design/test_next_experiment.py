@@ -20,11 +20,10 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record
 from psa_casadi.report.words.text import story
-from tests.studies.plants.again import play_again
+from tests.studies.plants.again import in_terms_of, play_again
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.hide import effect_called
 from tests.studies.plants.make import make_record
-from tests.studies.plants.same_device import in_terms_of
 from tests.tiers import slow
 
 #: The loop from record to name is run once: with pytest-xdist by one process.

@@ -9,7 +9,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import gaps, without_gaps
 from psa_casadi.units import FloatArray
 from tests.studies.plants.base import simulate_base
-from tests.studies.plants.excitation import loops
+from tests.studies.plants.excitations import loops
 from tests.studies.plants.stack import draw_stack
 
 T = np.arange(900) / 200.0

@@ -43,7 +43,7 @@ from tests.effects.effect_runs import (
 from tests.export.modelica_runs import right_side_error
 from tests.model.random_models import random_model, random_point
 from tests.model.stack_models import stack
-from tests.studies.plants.hysteresis_memory import play
+from tests.studies.plants.ceramic import play
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
 

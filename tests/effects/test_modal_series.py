@@ -14,8 +14,8 @@ from psa_casadi.identification.start.linear_response import Shaken, modes_of
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine
 from tests.studies.plants.base import simulate_base
+from tests.studies.plants.mechanics import structural_mode
 from tests.studies.plants.stack import draw_stack
-from tests.studies.plants.structural_mode import contribution
 from tests.tiers import slow
 
 FloatArray = NDArray[np.float64]
@@ -96,7 +96,8 @@ def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN
     command = stack.u_rated * wave * np.clip((time - 0.01) / 0.05, 0.0, 1.0)
     run = simulate_base(stack, time, command)
     x = run.displacement + sum(
-        contribution(run, {"frequency": f, "zeta": z}, share) for f, z, share in modes
+        structural_mode.contribution(run, {"frequency": f, "zeta": z}, share)
+        for f, z, share in modes
     )
     x = x + 1e-3 * np.ptp(x) * rng.standard_normal(COUNT)
     return Record(name="shaken", time=time, voltage=command, displacement=x)

@@ -29,7 +29,7 @@ from tests.export import sampled_fmus
 from tests.export.fmi3_instances import Instance3, Update
 from tests.export.fmu_models import exported, model_named
 from tests.model.sampled_models import PERIOD, loop
-from tests.studies.benchmarks.work_precision_methods import STEP_SHARE, TIGHTEST_STEP
+from tests.studies.benchmarks.fmu import STEP_SHARE, TIGHTEST_STEP
 from tests.tiers import slow, slow_but
 
 STACKS = ("PTBS200", "WYDS0808020", "P-885.51", "manipulator", "slow_creep")

@@ -13,8 +13,7 @@ from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from tests.export.ssp_master import SspArchive, couple, points
 from tests.export.ssp_systems import END, RATE, archive_of, closed_loop, monolithic, pushed_stage
-from tests.studies.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
-from tests.studies.benchmarks.coupling_stability import settles
+from tests.studies.benchmarks.coupling import by_ecos, by_fmpy, load_ecos, settles
 from tests.tiers import slow
 
 _HEIGHT, _PERIOD, _LOOP_END = 4e-6, 2e-3, 1e-3

@@ -25,7 +25,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.suspects import suspects
 from psa_casadi.units import FloatArray
 from tests.studies.plants.base import simulate_base
-from tests.studies.plants.excitation import loops
+from tests.studies.plants.excitations import loops
 from tests.studies.plants.stack import draw_stack
 
 TABLE = [EFFECTS["slow_creep"], EFFECTS["sensor_jump"]]

@@ -11,7 +11,7 @@ from psa_casadi.simulation.simulate import simulate
 from tests.model.random_models import random_model, random_point
 from tests.model.stack_models import LINEAR, PAPER_STACKS, jacobian, stack
 from tests.studies.plants.base import Run, simulate_base
-from tests.studies.plants.reciprocal_coupling import two_masses
+from tests.studies.plants.mechanics import two_masses
 from tests.studies.plants.stack import Stack
 
 EFFECT = EFFECTS["reciprocal_coupling"]

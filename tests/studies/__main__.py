@@ -13,7 +13,7 @@ from psa_casadi.cli.screen import Quiet, show, show_table, tell_written, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path, atomic_write
 from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.table import BENCHES, Outcome
+from tests.studies.benchmarks.table import BENCHES, Outcome, offers
 
 
 def bench(
@@ -34,28 +34,21 @@ def bench(
 ) -> None:
     """List the benchmarks, or run one and print its tables."""
     if name is None:
-        rows = tuple((b.name, b.description) for b in BENCHES.values())
-        show_table(Table(("benchmark", "shows"), rows))
+        show_table(Table(("benchmark", "shows"), tuple(BENCHES.items())))
         return
     given = Given()
+    ways = {"run_on": ("--folder", folder), "run_sized": ("--size", size)}
     if name not in BENCHES:
         given.add(f"There is no benchmark '{name}'; there are {', '.join(BENCHES)}.")
-    elif folder is not None and BENCHES[name].run_on is None:
-        able = ", ".join(b.name for b in BENCHES.values() if b.run_on is not None)
-        given.add(f"--folder: the benchmark '{name}' takes no records of your own; {able} does.")
-    elif size is not None and BENCHES[name].run_sized is None:
-        able = ", ".join(b.name for b in BENCHES.values() if b.run_sized is not None)
-        given.add(f"--size: the benchmark '{name}' has a fixed size; {able} has not.")
+    for way, (option, value) in ways.items():
+        if name in BENCHES and value is not None and offers(name, way) is None:
+            given.add(f"{option}: '{name}' takes none; the list of benchmarks says which do.")
     given.outputs({"--figure": figure, "--json": json_file}, [])
     given.check()
+    asked = [(way, value) for way, (_, value) in ways.items() if value is not None]
+    way, value = (*asked, ("run", quick))[0]
     with working(f"benchmark {name}", quiet) as progress:
-        own, sized = BENCHES[name].run_on, BENCHES[name].run_sized
-        if own and folder:
-            outcome = own(progress, folder)
-        elif sized and size:
-            outcome = sized(progress, size)
-        else:
-            outcome = BENCHES[name].run(progress, quick)
+        outcome = offers(name, way)(progress, value)
     for titled in outcome.tables:
         show(f"\n{titled.title}\n", quiet)
         show_table(titled.table, quiet)
@@ -87,7 +80,7 @@ if __name__ == "__main__":
 
         fuzz_app(sys.argv[2:], prog_name="python -m tests.studies fuzz")
     if sys.argv[1:2] == ["causes"]:
-        from tests.studies.benchmarks.causes.command import app as causes_app
+        from tests.studies.benchmarks.causes import app as causes_app
 
         causes_app(sys.argv[2:], prog_name="python -m tests.studies causes")
     app(prog_name="python -m tests.studies")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.studies.benchmarks.hidden import (
+from tests.studies.benchmarks.diagnose import (
     RELIABILITY,
     Covered,
     in_class,

@@ -12,8 +12,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from tests.studies.__main__ import app
-from tests.studies.benchmarks.floor_features import play
-from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, ridge
+from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
 from tests.studies.benchmarks.floors import floor_on, run_on
 
 FloatArray = npt.NDArray[np.float64]
@@ -130,6 +129,6 @@ def test_where_a_record_comes_from_is_found() -> None:
 def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["identify", "--folder", str(tmp_path)])
     assert said.exit_code == 2
-    assert "takes no records of your own; floors, mirror does" in said.stderr.replace("\n", " ")
+    assert "--folder: 'identify' takes none" in said.stderr.replace("\n", " ")
     with pytest.raises(InputError, match="holds no CSV file"):
         run_on(lambda _: None, tmp_path)

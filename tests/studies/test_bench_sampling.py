@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from psa_casadi.simulation.simulate import simulate
-from tests.studies.benchmarks.posterior_pymc import (
+from tests.studies.benchmarks.sampling import (
     LEG,
     Drawn,
     hysteresis_rate,

@@ -10,8 +10,8 @@ from psa_casadi.records.read.reading import read_record
 from tests.studies.benchmarks.exam import Marked, answers, counts
 from tests.studies.exam import hysteresis as h
 from tests.studies.exam import marks as m
+from tests.studies.exam.hysteresis import draw_density, preisach
 from tests.studies.exam.play import CAUSES, play, write
-from tests.studies.exam.preisach import draw_density, preisach
 from tests.studies.exam.record import Floats
 from tests.studies.exam.records import RECORDS
 from tests.studies.exam.voltages import VOLTAGES

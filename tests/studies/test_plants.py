@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from psa_casadi.cli.demo import HIDDEN
 from tests.studies.plants.base import (
@@ -15,24 +16,47 @@ from tests.studies.plants.base import (
     hysteresis_force,
     simulate_base,
 )
-from tests.studies.plants.current_limit import limited_drive
-from tests.studies.plants.dry_friction import friction
+from tests.studies.plants.ceramic import creep, play
+from tests.studies.plants.drive import limited_drive
 from tests.studies.plants.effect import HiddenEffect
-from tests.studies.plants.excitation import draw_voltage
-from tests.studies.plants.hysteresis_memory import play
-from tests.studies.plants.make import HEADER, RATIO, make_demo, make_record
-from tests.studies.plants.ode import solve_as_ode
-from tests.studies.plants.offset_drift import OFFSET_DRIFT
-from tests.studies.plants.sensor_delay import SENSOR_DELAY
-from tests.studies.plants.slow_creep import creep
-from tests.studies.plants.stack import FloatArray, draw_stack, loop_width
-from tests.studies.plants.structural_mode import STRUCTURAL_MODE
+from tests.studies.plants.excitations import draw_voltage
+from tests.studies.plants.hide import RATIO
+from tests.studies.plants.make import HEADER, make_demo, make_record
+from tests.studies.plants.mechanics import friction, structural_mode
+from tests.studies.plants.sensor import offset_drift, sensor_delay
+from tests.studies.plants.stack import FloatArray, Stack, draw_stack, loop_width
 from tests.studies.plants.table import HIDDEN_EFFECTS
 from tests.tiers import slow_but
 
 CONVERGENCE = 2e-5
 """Largest change of the displacement over its range when the grid is refined by 4."""
 EFFECTS = list(HIDDEN_EFFECTS.values())
+
+
+def solve_as_ode(s: Stack, times: FloatArray, command: FloatArray) -> FloatArray:
+    """The contract's equations as one set of differential equations, restarted at every sample."""
+
+    def rate(t: float, z: FloatArray) -> FloatArray:
+        u, force, out, y, v_y, x, v_x = z
+        du = (np.interp(t, times, command) - u) / s.drive_time
+        sign = du / np.hypot(du, s.hold_rate)
+        power = (abs(force) / s.h_ref) ** s.n
+        hysteresis = s.a * du - power * (s.beta * du * sign * np.sign(force) + s.gamma * du)
+        reaction = s.c_p * v_y + s.k_p * y
+        a_x = (reaction - s.c_b * (v_x - v_y) - s.k_b * (x - y)) / s.m_b
+        lag = (s.k_l * u + force - out) / s.tau
+        return np.array(
+            [du, hysteresis + s.delta * u * sign, lag, v_y, (out - reaction) / s.m_p, v_x, a_x]
+        )
+
+    state = np.zeros(7)
+    displacement = [0.0]
+    scale = np.array([1e-9, 1e-7, 1e-7, 1e-14, 1e-9, 1e-14, 1e-9])
+    for start, end in pairwise(times.tolist()):
+        found = solve_ivp(rate, (start, end), state, method="LSODA", rtol=1e-9, atol=scale)
+        state = found.y[:, -1]
+        displacement.append(float(state[5]))
+    return np.asarray(displacement)
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +209,7 @@ def test_creep_is_straight_in_log_time() -> None:
 def test_delay_shifts() -> None:
     base = _part(_base_run(6), 1200)
     step = float(base.times[1] - base.times[0])
-    moved = base.displacement + SENSOR_DELAY.contribution(base, {}, 3.0 * step)
+    moved = base.displacement + sensor_delay.contribution(base, {}, 3.0 * step)
     assert np.allclose(moved[3:], base.displacement[:-3], atol=1e-9 * np.ptp(moved))
 
 
@@ -224,9 +248,9 @@ def test_play_equals_its_sample_by_sample_recursion(run: Run) -> None:
 def test_drift_ignores_the_voltage(run: Run) -> None:
     quiet = simulate_base(run.stack, run.times, np.zeros_like(run.command), 1)
     for seed in range(4):
-        parameters = OFFSET_DRIFT.draw(np.random.default_rng(seed), run)
-        drift = OFFSET_DRIFT.contribution(run, parameters, 1e-7)
-        assert np.array_equal(drift, OFFSET_DRIFT.contribution(quiet, parameters, 1e-7))
+        parameters = offset_drift.draw(np.random.default_rng(seed), run)
+        drift = offset_drift.contribution(run, parameters, 1e-7)
+        assert np.array_equal(drift, offset_drift.contribution(quiet, parameters, 1e-7))
         line = np.polyval(np.polyfit(run.times, drift, 1), run.times)
         assert np.ptp(drift - line) > 1e-3 * np.ptp(drift)
 
@@ -236,7 +260,7 @@ def test_mode_rings_at_its_frequency(run: Run) -> None:
     command: FloatArray = np.full(times.size, 40.0)
     command[:51] = 0.0
     base = simulate_base(run.stack, times, command, 8)
-    mode = STRUCTURAL_MODE.contribution(base, {"frequency": 60.0, "zeta": 0.01}, 0.01)
+    mode = structural_mode.contribution(base, {"frequency": 60.0, "zeta": 0.01}, 0.01)
     tail = mode[100:1124] - mode[-1]
     spectrum = np.abs(np.fft.rfft(tail * np.hanning(tail.size), 16384))
     assert np.argmax(spectrum) / (16384 * 1e-3) == pytest.approx(60.0, abs=0.3)

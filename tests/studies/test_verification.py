@@ -7,8 +7,7 @@ import pytest
 
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import steps, time_grid
-from tests.studies.benchmarks.verification import verification_tables
-from tests.studies.benchmarks.verification_cases import (
+from tests.studies.benchmarks.verification import (
     FITTED_LOOPS,
     KEPT_LOOPS,
     LOOPS,
@@ -21,6 +20,7 @@ from tests.studies.benchmarks.verification_cases import (
     matches,
     plant_response,
     synthetic,
+    verification_tables,
     with_single_mass,
 )
 from tests.tiers import slow

@@ -8,7 +8,7 @@ import numpy as np
 
 from psa_casadi.diagnosis.task import STEPS, Method, Thresholds
 from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.hidden import diagnose_all
+from tests.studies.benchmarks.diagnose import diagnose_all
 from tests.studies.benchmarks.hidden_cases import Case, Found, study
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share
 from tests.studies.plants.table import FOREIGN, KNOWN

@@ -6,19 +6,30 @@ come from. The truth is one model of the same parts and wires (`connect`), integ
 A second table shows at which step the contact between stack and flexure turns unstable.
 """
 
+import ctypes
+import importlib.metadata
+import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from math import cos, isfinite, log, nan, pi
+from importlib import import_module
+from math import cos, inf, isfinite, log, log10, nan, pi
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fmpy.ssp.simulation import simulate_ssp
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from psa_casadi.export.importer.fmu import FmuError
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.export.ssp.archive import export_ssp
+from psa_casadi.export.ssp.archive import export_ssp, wiring_of
+from psa_casadi.export.ssp.drawing import OUTSIDE
+from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.model.nanopositioner import nanopositioner, positioner_plant
 from psa_casadi.model.system import System
 from psa_casadi.report.words.phrases import number
@@ -26,10 +37,216 @@ from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.stepper import run as integrate
 from psa_casadi.units import FloatArray
 from tests.export.ssp_master import SspArchive, couple, points
-from tests.studies.benchmarks.coupling_figure import picture
-from tests.studies.benchmarks.coupling_masters import by_ecos, by_fmpy, load_ecos
-from tests.studies.benchmarks.coupling_stability import Limit, limits, limits_table
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled, table_of
+
+#: The system's inputs as functions of time; 0 at the start, as fmpy sets them so.
+Inputs = Mapping[str, Callable[[float], float]]
+
+
+def by_fmpy(
+    path: Path, step: float, count: int, inputs: Inputs, outputs: Sequence[str]
+) -> FloatArray:
+    """Return outputs ("part.port" or of the system) at the points k step, shape (count + 1, ny)."""
+    early = {name: partial(lambda f, t: f(t + step), f) for name, f in inputs.items()}
+    rows = simulate_ssp(str(path), stop_time=(count - 0.5) * step, step_size=step, input=early)
+    if len(rows) != count:
+        raise RuntimeError(f"fmpy made {len(rows)} steps where {count} were asked for")
+    found = np.array([rows[name] for name in outputs]).T
+    return np.vstack([np.zeros(len(outputs)), found])
+
+
+def load_ecos() -> Any | None:
+    """Return the module ecospy, with the TBB library that it needs loaded; None if one lacks."""
+    if sys.platform != "linux":
+        return None
+    try:
+        files = importlib.metadata.files("tbb") or []
+        libraries = [f for f in files if Path(str(f)).name == "libtbb.so.12"]
+        if not libraries:
+            return None
+        ctypes.CDLL(str(libraries[0].locate()), mode=ctypes.RTLD_GLOBAL)
+        return import_module("ecospy")
+    except (importlib.metadata.PackageNotFoundError, ImportError, OSError):
+        return None
+
+
+def by_ecos(
+    ecos: Any, path: Path, step: float, count: int, inputs: Inputs, outputs: Sequence[str]
+) -> FloatArray:
+    """Return outputs at the points k step, shape (count + 1, ny).
+
+    The wires are those of the archive; the parameters are those that its FMUs carry.
+    """
+    with SspArchive(path) as archive, tempfile.TemporaryDirectory() as folder:
+        with zipfile.ZipFile(path) as files:
+            files.extractall(folder)
+        structure = ecos.EcosSimulationStructure()
+        for name in archive.fmus:
+            structure.add_model(name, Path(folder) / "resources" / f"{name}.fmu")
+        for wire in archive.wires:
+            if OUTSIDE not in (wire.start.part, wire.end.part):
+                ends = (f"{port.part}::{port.name}" for port in (wire.start, wire.end))
+                structure.make_real_connection(*ends)
+        outer = [w for w in archive.wires if w.start.part == OUTSIDE and w.start.name in inputs]
+        wanted = ["::".join(archive.origin(name)) for name in outputs]
+        simulation = ecos.EcosSimulation(step_size=step, structure=structure)
+        simulation.init()
+        rows = [[simulation.get_real(name) for name in wanted]]
+        for k in range(count):
+            for wire in outer:
+                value = inputs[wire.start.name](k * step)
+                simulation.set_real(f"{wire.end.part}::{wire.end.name}", value)
+            simulation.step(1)
+            rows.append([simulation.get_real(name) for name in wanted])
+        simulation.terminate()
+        simulation.free()
+        structure.free()
+    return np.array(rows)
+
+
+_STIFFNESSES = (5e6, 2e7, 5e7, 1e8, 2e8, 5e8)
+_KICK, _COUNT, _CLOSE, _LONG, _SETTLING_TOLERANCE = 1.0, 1500, 0.02, 1e-3, 1e-7
+#: Ratio of one step to the next on the way up.
+_WALK = 1.15
+#: Share of the first roughness below which a coupling has settled.
+_SETTLED = 1e-4
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The longest stable communication step [s] of one contact stiffness [N/m]."""
+
+    stiffness: float
+    slopes: bool
+    predicted: float
+    measured: float
+
+
+def limits(system: System, path: Path, quick: bool) -> tuple[Limit, ...]:
+    """Return the limits of a system with the parts `stack` and `flexure` and the input `command`.
+
+    Contacts of several stiffnesses are tried, with inputs held and with input derivatives.
+    """
+    found = []
+    with SspArchive(path) as archive:
+        for stiffness in _STIFFNESSES[2:3] if quick else _STIFFNESSES:
+            flexure = system.parts["flexure"].with_values({"k_c": stiffness})
+            parts = {**system.parts, "flexure": flexure}
+            wiring = wiring_of(replace(system, parts=parts))
+            for slopes in (False, True):
+                predicted = stable_step(wiring, rates=slopes)
+                measured = _bisected(archive, predicted, {"flexure.k_c": stiffness}, slopes)
+                found.append(Limit(stiffness, slopes, predicted, measured))
+    return tuple(found)
+
+
+def _bisected(
+    archive: SspArchive, guess: float, values: Mapping[str, float], slopes: bool
+) -> float:
+    """Return the step between the last stable and the first unstable one, 2 percent apart.
+
+    Infinity if none is predicted and steps of 1 ms are stable. Else the search walks up from a
+    third of the guess in small strides, since longer steps than an unstable one may be stable.
+    """
+    if not isfinite(guess):
+        return inf if settles(archive, _LONG, values, slopes=slopes) else nan
+    low = guess / 3.0
+    while not settles(archive, low, values, slopes=slopes):
+        low /= 3.0
+    high = _WALK * low
+    while settles(archive, high, values, slopes=slopes):
+        low, high = high, _WALK * high
+    while log10(high / low) > log10(1.0 + _CLOSE):
+        middle = (low * high) ** 0.5
+        if settles(archive, middle, values, slopes=slopes):
+            low = middle
+        else:
+            high = middle
+    return float((low * high) ** 0.5)
+
+
+def settles(archive: SspArchive, step: float, values: Mapping[str, float], *, slopes: bool) -> bool:
+    """Return whether the force on the stack settles after a jump of the command.
+
+    It does where its roughness falls, or is as small as what the parts' tolerances leave.
+    """
+    times = points(step, _COUNT * step)
+    kick = Signals(("command",), times[:1], np.array([[_KICK]]), held=True)
+    how: Any = {"rates": slopes, "values": values, "tolerance": _SETTLING_TOLERANCE}
+    try:
+        found = couple(archive, times, kick, ["flexure.reaction_force"], **how)[:, 0]
+    except FmuError:
+        return False
+    rough, third = np.abs(np.diff(found, 2)), _COUNT // 3
+    early, later, last = rough[:third].max(), rough[third:-third].max(), rough[-third:].max()
+    return bool(last < max(later, _SETTLED * early))
+
+
+def limits_table(found: tuple[Limit, ...]) -> TitledTable:
+    """Return the limits, predicted and found."""
+
+    def written(step: float) -> str:
+        return number(1e6 * step) if isfinite(step) else "no limit" if step == inf else "unstable"
+
+    return table_of(
+        "Longest stable communication step",
+        found,
+        {
+            "contact stiffness [N/um]": lambda f: number(1e-6 * f.stiffness),
+            "inputs": lambda f: "input derivatives" if f.slopes else "held",
+            "predicted [us]": lambda f: written(f.predicted),
+            "found [us]": lambda f: written(f.measured),
+        },
+        "Predicted: the spectral radius of the map over one step is 1, from the parts linearised at"
+        " rest. Found: the own master on the FMUs, by bisection to 2 percent."
+        " Where there is no limit, steps of 1 ms were stable.",
+    )
+
+
+_STYLES = (("#9a6fb0", "v", 9), ("#009e73", "^", 6), ("#d55e00", "s", 5), ("#0072b2", "o", 5))
+
+
+def picture(runs: Sequence["Run"], limits: Sequence[Limit]) -> Figure:
+    """Return a panel for every system, and one for the stable steps."""
+    cases = list(dict.fromkeys(r.case for r in runs))
+    figure = Figure(figsize=(5.6 * (len(cases) + 1), 4.8), layout="constrained")
+    panels = figure.subplots(1, len(cases) + 1, squeeze=False)[0]
+    for axes, case in zip(panels, cases, strict=False):
+        _errors(axes, [r for r in runs if r.case == case])
+        styled(axes, "communication step [us]", "largest error of the position [% of range]", case)
+    last = panels[-1]
+    for slopes, colour, name in (
+        (False, "#d55e00", "inputs held"),
+        (True, "#0072b2", "input derivatives"),
+    ):
+        mine = [f for f in limits if f.slopes == slopes]
+        x = [1e-6 * f.stiffness for f in mine]
+        predicted, found = (
+            [1e6 * getattr(f, of) for f in mine] for of in ("predicted", "measured")
+        )
+        last.loglog(x, predicted, color=colour, linewidth=1.4, label=f"{name}: predicted")
+        last.loglog(x, found, "o", color=colour, markersize=6, label=f"{name}: found")
+    title = "where the co-simulation turns unstable"
+    styled(last, "contact stiffness [N/um]", "longest stable step [us]", title)
+    ticks = [{1e6 * r.step for r in runs}] * len(cases) + [{1e-6 * f.stiffness for f in limits}]
+    for axes, at in zip(panels, ticks, strict=True):
+        axes.set_xticks(sorted(at), [f"{t:g}" for t in sorted(at)])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.legend(fontsize=8.5)
+    return figure
+
+
+def _errors(axes: Axes, runs: Sequence["Run"]) -> None:
+    names = dict.fromkeys(r.master for r in runs)
+    for name, (colour, marker, size) in zip(names, _STYLES, strict=False):
+        mine = [r for r in runs if r.master == name]
+        slope = order(mine)
+        axes.loglog(
+            [1e6 * r.step for r in mine], [100.0 * r.error for r in mine], color=colour,
+            marker=marker, markersize=size, markerfacecolor="none" if size > 5 else colour,
+            linewidth=1.4, label=name + (f" (slope {slope:.2f})" if isfinite(slope) else ""),
+        )  # fmt: skip
+
 
 _END, _FREQUENCY, _TRUTH_STEP, _TRUTH, _TOLERANCE = 4e-3, 250.0, 2.5e-7, 1e-10, 1e-9
 _STEPS = (1e-5, 5e-6, 2.5e-6, 1.25e-6, 6.25e-7)
@@ -174,28 +391,20 @@ def order(runs: Sequence[Run]) -> float:
 
 
 def _table(case: Case, runs: Sequence[Run], apart: dict[float, float]) -> TitledTable:
+    of = {(r.master, r.step): r.error for r in runs}
     names = list(dict.fromkeys(r.master for r in runs))
-    rows = [
-        (
-            number(1e6 * step, 4),
-            *(_share(r.error) for n in names for r in runs if (r.master, r.step) == (n, step)),
-            number(apart[step], 1) if step in apart else "",
-        )
-        for step in dict.fromkeys(r.step for r in runs)
-    ]
+    rows: list[tuple[str, ...]] = []
+    for step in dict.fromkeys(r.step for r in runs):
+        errors = (of[name, step] for name in names)
+        shares = (number(100.0 * e, 2) if isfinite(e) else "unstable" for e in errors)
+        rows.append((number(1e6 * step, 4), *shares, number(apart[step], 1) if step in apart else ""))
     slopes = (number(order([r for r in runs if r.master == n]), 3) for n in names)
     rows.append(("order", *slopes, ""))
     head = ("communication step [us]", *(f"{n} [%]" for n in names), "fmpy - ecos (of the range)")
-    title = f"Largest error of the stage's position, percent of its range: {case.title}"
-    return TitledTable(title, Table(head, tuple(rows)), _NOTE)
-
-
-def _share(error: float) -> str:
-    return number(100.0 * error, 2) if isfinite(error) else "unstable"
-
-
-_NOTE = (
-    "The truth is one model of the same parts and wires. The order is the slope between the two"
-    " shortest steps. fmpy and ecos pass outputs on as they stand at the end of a step; the own"
-    " master passes them on in the order in which outputs depend on inputs."
-)
+    return TitledTable(
+        f"Largest error of the stage's position, percent of its range: {case.title}",
+        Table(head, tuple(rows)),
+        "The truth is one model of the same parts and wires. The order is the slope between the two"
+        " shortest steps. fmpy and ecos pass outputs on as they stand at the end of a step; the own"
+        " master passes them on in the order in which outputs depend on inputs.",
+    )

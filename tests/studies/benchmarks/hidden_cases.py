@@ -24,8 +24,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.table import TitledTable
 from tests.studies.plants.again import play_again
-from tests.studies.plants.designs import DesignKind
-from tests.studies.plants.excitations import ExcitationKind, PoorKind
+from tests.studies.plants.excitations import DesignKind, ExcitationKind, PoorKind
 from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.noise import NoiseKind
 from tests.studies.plants.table import called

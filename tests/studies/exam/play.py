@@ -5,19 +5,32 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.studies.exam.drive import AMPLIFIER, ELECTRICAL, amplified, stack_voltage
+from tests.studies.exam.causes import (
+    AMPLIFIER,
+    AT_ONCE,
+    CREEP,
+    ELECTRICAL,
+    MASSES,
+    MOTION,
+    READING,
+    amplified,
+    displacement,
+    free_strain,
+    reading,
+    stack_voltage,
+    temperature,
+    with_noise,
+)
 from tests.studies.exam.hysteresis import (
     bouc_wen,
     coleman_hodgdon,
+    draw_density,
     duhem,
     prandtl_ishlinskii,
+    preisach,
     relays,
 )
-from tests.studies.exam.mechanics import MASSES, MOTION, displacement
-from tests.studies.exam.preisach import draw_density, preisach
 from tests.studies.exam.record import Floats, Record, Run
-from tests.studies.exam.sensor import READING, reading, with_noise
-from tests.studies.exam.strain import AT_ONCE, CREEP, free_strain, temperature
 from tests.studies.exam.voltages import draw_voltage
 
 _GROWING = "growing thresholds"

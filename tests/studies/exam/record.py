@@ -1,11 +1,13 @@
 """What defines a record of the exam: stack, voltage, what is hidden, and which names are right."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter
 
 Floats = NDArray[np.float64]
 Values = tuple[float, ...]
@@ -105,6 +107,25 @@ class Run:
         return np.asarray(self.times / self.times[-1])
 
 
-def names(*alternatives: str) -> frozenset[str]:
-    """Return the names that are right for one cause."""
-    return frozenset(alternatives)
+def filtered(
+    numerator: Sequence[float], denominator: Sequence[float], signal: Floats, step: float
+) -> Floats:
+    """Return numerator(s)/denominator(s) of a signal, at rest before its first sample."""
+    b, a, _ = cont2discrete((np.array(numerator), np.array(denominator)), step, method="foh")
+    rest = numerator[-1] / denominator[-1] * signal[0]
+    out = rest + lfilter(np.ravel(b), np.ravel(a), signal - signal[0])
+    return np.asarray(out, dtype=np.float64)
+
+
+def lagged(signal: Floats, time_constant: float, step: float) -> Floats:
+    """Return 1/(tau s + 1) of a signal."""
+    return filtered([1.0], [time_constant, 1.0], signal, step)
+
+
+def resonant(
+    signal: Floats, frequency: float, damping: float, step: float, zero: float = 0.0
+) -> Floats:
+    """Return (zero s + 1)/(s^2/w^2 + 2 zeta s/w + 1) of a signal, w = 2 pi f."""
+    w = 2 * math.pi * frequency
+    numerator = [zero, 1.0] if zero else [1.0]
+    return filtered(numerator, [1 / w**2, 2 * damping / w, 1.0], signal, step)

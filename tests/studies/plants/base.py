@@ -80,6 +80,19 @@ def simulate_base(
 ) -> Run:
     """Simulate the paper's model for a voltage given at uniform times, (N,) [s], (N,) [V]."""
     fine_time, fine_command = refine(times, command, sub_intervals)
+    return _driven(stack, times, command, fine_time, fine_command, sub_intervals)
+
+
+def follow(run: Run, command: FloatArray) -> Run:
+    """The same stack driven by another command on the fine grid, (M,) [V], linear in between."""
+    fine_time = run.path.time
+    return _driven(run.stack, run.times, run.command, fine_time, command, run.sub_intervals)
+
+
+def _driven(
+    stack: Stack, times: FloatArray, command: FloatArray, fine_time: FloatArray,
+    fine_command: FloatArray, sub_intervals: int,
+) -> Run:  # fmt: skip
     step = float(times[1] - times[0]) / sub_intervals
     path = linear_drive(stack, fine_time, fine_command, step)
     hysteresis = hysteresis_force(stack, path)
@@ -148,7 +161,8 @@ def hysteresis_force(stack: Stack, path: DrivePath, branch: float = 0.0) -> Floa
     both = branch * du * sign
     force, inverse, n = 0.0, 1.0 / stack.h_ref, stack.n
     out = [0.0]
-    for add, up, down in zip(free.tolist(), *_losses(back + both, loss), strict=True):
+    ups, downs = (back + both + loss).tolist(), (back + both - loss).tolist()
+    for add, up, down in zip(free.tolist(), ups, downs, strict=True):
         if add != 0.0:
             k1 = add - (abs(force) * inverse) ** n * (up if force > 0.0 else down)
             half = force + 0.5 * k1
@@ -160,11 +174,6 @@ def hysteresis_force(stack: Stack, path: DrivePath, branch: float = 0.0) -> Floa
             force += (k1 + 2.0 * (k2 + k3) + k4) / 6.0
         out.append(force)
     return np.asarray(out)[path.node]
-
-
-def _losses(shared: FloatArray, loss: FloatArray) -> tuple[list[float], list[float]]:
-    """Factors of r^n while the force is positive and while it is negative [N]."""
-    return (shared + loss).tolist(), (shared - loss).tolist()
 
 
 def elastic_displacement(stack: Stack, command: FloatArray, step: float) -> FloatArray:

@@ -16,15 +16,15 @@ from psa_casadi.records.record import Record
 from tests.studies.plants.base import (
     DrivePath,
     Run,
+    follow,
     force_to_displacement,
     hysteresis_force,
     simulate_base,
 )
+from tests.studies.plants.ceramic import bent as saturated
 from tests.studies.plants.excitations import ExcitationKind, draw_excitation
-from tests.studies.plants.load_stiffness import balance
-from tests.studies.plants.rerun import follow
-from tests.studies.plants.saturation_of_strain import bend as saturated
-from tests.studies.plants.sensor_nonlinearity import bend as bent
+from tests.studies.plants.mechanics import balance
+from tests.studies.plants.sensor import bend as bent
 from tests.studies.plants.stack import FloatArray, draw_stack
 from tests.studies.plants.table import HIDDEN_EFFECTS
 

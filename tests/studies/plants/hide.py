@@ -1,14 +1,15 @@
 """Hide an effect in a base simulation: draw it, scale it until it is as visible as wanted."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
 from tests.studies.plants.base import Run, simulate_base
-from tests.studies.plants.effect import HiddenEffect
+from tests.studies.plants.effect import HiddenEffect, Parameters
 from tests.studies.plants.stack import FloatArray
 from tests.studies.plants.table import HIDDEN_EFFECTS
 from tests.studies.plants.visibility import refitted_ratio, visible_ratio
@@ -145,3 +146,35 @@ def refit_gain(
         gain = following
     best = min(tried, key=lambda one: abs(math.log(tried[one] / wanted)))
     return best, tried[best]
+
+
+Effect = tuple[HiddenEffect, Parameters, float]
+"""An effect with its secondary parameters and its gain, SI."""
+
+
+def added_by(run: Run, effects: Sequence[Effect]) -> FloatArray:
+    """What the effects add to the displacement of a run together, (N,) [m].
+
+    Each acts on what those before it have left:
+
+        command -> effects of the drive -> stack and its effects -> effects of the sensor
+
+    A sum of what each adds to the base alone is no device where they are large: a lag or a delay
+    that a base model takes over nearly as a whole may add forty times the noise, and two of them,
+    summed, let a step begin the other way. Those of one place act in the order given. Between
+    the samples an effect of stack or sensor is a cubic spline.
+    """
+    total = np.zeros_like(run.times)
+    for effect, parameters, gain in sorted(effects, key=lambda e: _place(e[0])):
+        own = effect.contribution(run, parameters, gain)
+        total = total + own
+        if effect.driven is not None:
+            run = run if gain == 0.0 else effect.driven(run, parameters, gain)
+            continue
+        between = CubicSpline(run.times, own)(run.path.time)
+        run = replace(run, fine_displacement=run.fine_displacement + between)
+    return total
+
+
+def _place(effect: HiddenEffect) -> int:
+    return 0 if effect.driven is not None else 2 if effect.of_sensor else 1

@@ -1,13 +1,6 @@
-"""Synthetic records with one hidden effect, none, or several, and the truth behind them.
-
-    python -m tests.studies.plants.make demo OUT.csv
-    python -m tests.studies.plants.make EFFECT SEED OUT.csv
-
-EFFECT is a name of tests/studies/plants/table.py, or none.
-"""
+"""Synthetic records with one hidden effect, none, or several, and the truth behind them."""
 
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +10,13 @@ import numpy.typing as npt
 
 from tests.studies.plants.base import Run, simulate_base
 from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind, draw_excitation
-from tests.studies.plants.hide import RATIO, Hidden, Visible, effect_called, hide
+from tests.studies.plants.hide import Hidden, Visible, added_by, effect_called, hide
 from tests.studies.plants.noise import NOISES, Noise, NoiseKind, disturb, draw_noise
-from tests.studies.plants.several import added_by
 from tests.studies.plants.stack import FloatArray, Stack, draw_stack
-from tests.studies.plants.table import HIDDEN_EFFECTS
 from tests.studies.plants.visibility import base_directions
 
-__all__ = ["HEADER", "RATIO", "Truth", "Visible", "make_demo", "make_record"]
 HEADER = "time [s],voltage [V],displacement [um]"
 THERMOMETER = ",temperature [degC]"
-DEMO_EFFECT, DEMO_SEED = "slow_creep", 2015
 
 
 @dataclass(frozen=True)
@@ -91,7 +80,9 @@ def make_record(
     every effect, and the same stack with every excitation. more: further effects, each as visible
     beside the base as `more_visible` says; they act on each other (`added_by`).
     """
-    _check(noise, excitation)
+    for value, known in ((noise, NOISES), (excitation, EXCITATIONS)):
+        if value not in known:
+            raise KeyError(f"There is no {value!r}; there are {', '.join(known)}.")
     chosen = None if effect is None else effect_called(effect)
     further = [effect_called(name) for name in more]
     base_rng, effect_rng, noise_rng, *more_rng = (
@@ -118,12 +109,6 @@ def make_record(
     truth = _truth(run, clean, kind, lost, excitation, first, others)
     write_csv(path, run.times, run.command, read, truth.temperature)
     return truth
-
-
-def _check(noise: str, excitation: str) -> None:
-    for value, known in ((noise, NOISES), (excitation, EXCITATIONS)):
-        if value not in known:
-            raise KeyError(f"There is no {value!r}; there are {', '.join(known)}.")
 
 
 def _truth(
@@ -184,22 +169,4 @@ def write_csv(
 
 def make_demo(path: Path) -> Truth:
     """The demonstration's record: a stack that creeps."""
-    return make_record(DEMO_EFFECT, DEMO_SEED, path)
-
-
-def main(arguments: list[str]) -> int:
-    """Run from the command line; 0 done, 2 wrong usage."""
-    if len(arguments) == 2 and arguments[0] == "demo":
-        make_demo(Path(arguments[1]))
-        return 0
-    known = {*HIDDEN_EFFECTS, "none"}
-    if len(arguments) == 3 and arguments[0] in known and arguments[1].isdigit():
-        effect = None if arguments[0] == "none" else arguments[0]
-        make_record(effect, int(arguments[1]), Path(arguments[2]))
-        return 0
-    sys.stderr.write(__doc__ or "")
-    return 2
-
-
-if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    return make_record("slow_creep", 2015, path)

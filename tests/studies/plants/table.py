@@ -1,78 +1,22 @@
 """All hidden effects by name."""
 
-from tests.studies.plants.ageing import AGEING
-from tests.studies.plants.asymmetric_memory import ASYMMETRIC_MEMORY
-from tests.studies.plants.backlash import BACKLASH
-from tests.studies.plants.charge_leakage import CHARGE_LEAKAGE
-from tests.studies.plants.converter_step import CONVERTER_STEP
-from tests.studies.plants.cross_axis import CROSS_AXIS
-from tests.studies.plants.current_limit import CURRENT_LIMIT
-from tests.studies.plants.dead_zone_hysteresis import DEAD_ZONE_HYSTERESIS
-from tests.studies.plants.drive_lag import DRIVE_LAG
-from tests.studies.plants.dry_friction import DRY_FRICTION
+from tests.studies.plants import ceramic, drive, mechanics, sensor
 from tests.studies.plants.effect import HiddenEffect
-from tests.studies.plants.encoder_ripple import ENCODER_RIPPLE
-from tests.studies.plants.field_dependent_gain import FIELD_DEPENDENT_GAIN
-from tests.studies.plants.floor_vibration import FLOOR_VIBRATION
-from tests.studies.plants.guide_stiffness import GUIDE_STIFFNESS
-from tests.studies.plants.hysteresis_memory import HYSTERESIS_MEMORY
-from tests.studies.plants.load_stiffness import LOAD_STIFFNESS
-from tests.studies.plants.mains_hum import MAINS_HUM
-from tests.studies.plants.offset_drift import OFFSET_DRIFT
-from tests.studies.plants.preload_loss import PRELOAD_LOSS
-from tests.studies.plants.range_switch import RANGE_SWITCH
-from tests.studies.plants.rate_dependent_hysteresis import RATE_DEPENDENT_HYSTERESIS
-from tests.studies.plants.rate_independent_asymmetry import RATE_INDEPENDENT_ASYMMETRY
-from tests.studies.plants.saturation_of_strain import SATURATION_OF_STRAIN
-from tests.studies.plants.self_heating import SELF_HEATING
-from tests.studies.plants.sensor_delay import SENSOR_DELAY
-from tests.studies.plants.sensor_lag import SENSOR_LAG
-from tests.studies.plants.sensor_nonlinearity import SENSOR_NONLINEARITY
-from tests.studies.plants.slow_creep import SLOW_CREEP
-from tests.studies.plants.source_power import SOURCE_POWER
-from tests.studies.plants.structural_mode import STRUCTURAL_MODE
-from tests.studies.plants.temperature import TEMPERATURE
-from tests.studies.plants.voltage_saturation import VOLTAGE_SATURATION
 
-HIDDEN_EFFECTS: dict[str, HiddenEffect] = {
-    effect.name: effect
-    for effect in (
-        SLOW_CREEP,
-        RATE_DEPENDENT_HYSTERESIS,
-        HYSTERESIS_MEMORY,
-        ASYMMETRIC_MEMORY,
-        RATE_INDEPENDENT_ASYMMETRY,
-        FIELD_DEPENDENT_GAIN,
-        SATURATION_OF_STRAIN,
-        STRUCTURAL_MODE,
-        LOAD_STIFFNESS,
-        PRELOAD_LOSS,
-        BACKLASH,
-        SELF_HEATING,
-        AGEING,
-        CURRENT_LIMIT,
-        VOLTAGE_SATURATION,
-        DRIVE_LAG,
-        CHARGE_LEAKAGE,
-        SENSOR_DELAY,
-        SENSOR_LAG,
-        SENSOR_NONLINEARITY,
-        ENCODER_RIPPLE,
-        CONVERTER_STEP,
-        OFFSET_DRIFT,
-        MAINS_HUM,
-        TEMPERATURE,
-        DRY_FRICTION,
-        FLOOR_VIBRATION,
-        GUIDE_STIFFNESS,
-        DEAD_ZONE_HYSTERESIS,
-        CROSS_AXIS,
-        RANGE_SWITCH,
-        SOURCE_POWER,
-    )
-}
+_EFFECTS = (
+    ceramic.slow_creep, ceramic.rate_dependent_hysteresis, ceramic.hysteresis_memory,
+    ceramic.asymmetric_memory, ceramic.rate_independent_asymmetry, ceramic.field_dependent_gain,
+    ceramic.saturation_of_strain, mechanics.structural_mode, mechanics.load_stiffness,
+    mechanics.preload_loss, mechanics.backlash, ceramic.self_heating, ceramic.ageing,
+    drive.current_limit, drive.voltage_saturation, drive.drive_lag, drive.charge_leakage,
+    sensor.sensor_delay, sensor.sensor_lag, sensor.sensor_nonlinearity, sensor.encoder_ripple,
+    sensor.converter_step, sensor.offset_drift, sensor.mains_hum, sensor.temperature,
+    mechanics.dry_friction, mechanics.floor_vibration, mechanics.guide_stiffness,
+    ceramic.dead_zone_hysteresis, mechanics.cross_axis, sensor.range_switch, sensor.source_power,
+)  # fmt: skip
+HIDDEN_EFFECTS: dict[str, HiddenEffect] = {effect.name: effect for effect in _EFFECTS}
 """In the project's table, then the foreign ones. Reciprocal coupling has a plant of its own
-(reciprocal_coupling.py) but is left out: it moves resonances of 1-20 kHz, which no record
+(`mechanics.two_masses`) but is left out: it moves resonances of 1-20 kHz, which no record
 here sees.
 """
 

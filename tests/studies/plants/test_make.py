@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.studies.plants.base import first_order, simulate_base
+from tests.studies.plants.base import first_order, follow, simulate_base
 from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind
 from tests.studies.plants.make import HEADER, THERMOMETER, make_record
 from tests.studies.plants.noise import coloured
-from tests.studies.plants.rerun import moved_by
 from tests.studies.plants.stack import FloatArray
 from tests.studies.plants.visibility import base_directions, refitted_ratio, visible_ratio
 from tests.tiers import slow, slow_but
@@ -138,7 +137,7 @@ def test_a_pole_before_the_drive_vanishes_in_a_fit(tmp_path: Path) -> None:
     truth = make_record(None, 1, tmp_path / "a.csv")
     run = simulate_base(truth.stack, truth.times[:2000], truth.voltage[:2000], 12)
     late = first_order(-1.0 / 2e-3 + 0j, run.fine_command, run.fine_step).real / 2e-3
-    added = moved_by(run, late)
+    added = follow(run, late).displacement - run.displacement
     assert visible_ratio(base_directions(run), added, truth.sigma) > 1.0
     assert refitted_ratio(run, added, truth.sigma) < 0.5
 

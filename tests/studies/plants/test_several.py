@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.studies.plants.base import Run, simulate_base
-from tests.studies.plants.hide import effect_called
-from tests.studies.plants.several import Effect, added_by
+from tests.studies.plants.hide import Effect, added_by, effect_called
 from tests.studies.plants.stack import FloatArray, draw_stack
 
 _RATE, _FREQUENCY = 1000.0, 20.0
