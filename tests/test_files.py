@@ -294,15 +294,20 @@ def test_requests_to_end_are_answered_in_the_block_alone(
     assert len(os.listdir(tmp_path)) == left
 
 
+def runs(pid: int) -> bool:
+    """Whether a process is there, and no one that has ended and is not waited for."""
+    state = Path(f"/proc/{pid}/stat")
+    try:
+        os.kill(pid, 0)
+        return not (state.exists() and state.read_text().rsplit(")", 1)[1].split()[0] == "Z")
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
 def ended(pid: int) -> bool:
     """Whether a process ends within two seconds."""
     for _ in range(200):
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return True
-        state = Path(f"/proc/{pid}/stat")
-        if state.exists() and state.read_text().rsplit(")", 1)[1].split()[0] == "Z":
+        if not runs(pid):
             return True
         time.sleep(0.01)
     return False

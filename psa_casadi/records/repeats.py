@@ -126,10 +126,9 @@ def _runs(record: Record, lag: int) -> list[Repetition]:
         same &= _same(record.load_force, lag)
     later = record.time[lag:] - record.time[:-lag]
     same &= np.abs(later - np.median(later)) <= 0.25 * record.sample_time
-    starts, stops = runs_of(same)
-    longest = np.sort(np.argsort(starts - stops, kind="stable")[:RUNS])
+    longest = sorted(runs_of(same), key=lambda run: run[0] - run[1])[:RUNS]
     found = []
-    for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):
+    for start, stop in sorted(longest):
         if stop - start < FEWEST:
             continue
         v = record.voltage[start:stop]

@@ -37,8 +37,8 @@ def mat(path: Path, content: Mapping[str, Any], version: str = "5") -> Path:
         arrays = {name: np.atleast_2d(values) for name, values in content.items()}
         path.write_bytes(hdf5(arrays, {}, userblock_size=512))
     else:
-        form = {"do_compression": version == "7", "oned_as": "column"}
-        path.write_bytes(laboratory_bytes.mat(content, **form))
+        packed = version == "7"
+        path.write_bytes(laboratory_bytes.mat(content, do_compression=packed, oned_as="column"))
     return path
 
 

@@ -312,7 +312,7 @@ def named(columns: Mapping[str, Any]) -> dict[str, Any]:
 WRITERS: dict[str, Callable[[Mapping[str, Any]], bytes]] = {
     ".csv": csv,
     ".xlsx": lambda c: xlsx([list(c), *np.column_stack(list(c.values())).tolist()]),
-    ".h5": lambda c: hdf5(named(c), {}, chunks=(16,), compression="lzf"),
+    ".h5": lambda c: hdf5(named(c), {}, compression="lzf"),
     ".parquet": lambda c: parquet(c, row_group_size=64),
     ".tdms": lambda c: tdms(c, {}),
     ".npz": npz,

@@ -20,11 +20,11 @@ import numpy as np
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
-from psa_casadi.records.read.choose import choose
+from psa_casadi.records.read.choose import Choice
 from psa_casadi.records.read.columns import Field, stated_unit
 from psa_casadi.records.read.file_bytes import check_there, read_text
 from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
-from psa_casadi.records.read.samples import Outcome, Request, Samples, samples_of
+from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Table, parts_of_file
 from psa_casadi.records.read.text import decoded, text_tables
 
@@ -80,7 +80,7 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -
         raise InputError(f"{path}: holds no header and no data; export the record again.")
     parts = parts_of_file(tables)
     one = parts.get(table, tables[0])
-    choice = choose(one, NEEDED, {}, Problems())
+    choice = Choice(one, NEEDED, {}, Problems())
     guess = dict(choice.fields)
     labels = list(one.labels)
     for name, source in choice.sources.items() if not one.headless else ():
@@ -118,12 +118,12 @@ def read(path: str, request: Request) -> tuple[Outcome, str]:
         return samples_of(path, tables, request), digest
     with temporary_folder() as folder:
         told = answered_apart(Asked(path, request, str(folder)))
-        problems, samples = Problems(), None
+        outcome = Outcome(units=told.units, notes=told.notes, tables=told.tables)
         for sentence in told.problems:
-            problems.add(sentence)
+            outcome.problems.add(sentence)
         if told.units:
-            samples = Samples(told.units, np.load(folder / "values.npy"), told.notes)
-        return Outcome(samples, problems, told.tables), told.sha256
+            outcome.values = np.load(folder / "values.npy")
+        return outcome, told.sha256
 
 
 def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
@@ -208,12 +208,11 @@ def answered(asked: Asked) -> Answer:
         return _unreadable(path, said[0][:120] if said else type(error).__name__)
     with Path(path).open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    told = Answer(outcome.problems.sentences(), tables=tuple(outcome.tables), sha256=digest)
-    found = outcome.samples
-    if found is None:
-        return told
-    np.save(Path(asked.out) / "values.npy", found.values)
-    return replace(told, units=found.units, notes=tuple(found.notes))
+    if outcome.units:
+        np.save(Path(asked.out) / "values.npy", outcome.values)
+    return Answer(
+        outcome.problems.sentences(), None, outcome.units, outcome.notes, outcome.tables, digest
+    )
 
 
 def main() -> None:

@@ -169,6 +169,13 @@ def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray,
     return without_overload(numbers), np.array([v is None for v in found], dtype=np.bool_)
 
 
+def as_numbers(cells: Cells, unit: str = "") -> FloatArray:
+    """Return the numbers in cells (n,) in a unit, nan where there is none."""
+    if isinstance(cells, np.ndarray):
+        return cells.astype(np.float64)
+    return numbers_in(cells, decimal_sign(cells), unit)[0]
+
+
 def _number(cell: str, point: str, unit: str) -> float | None:
     """Return the number of a cell, nan where it says that there is none, else None."""
     text = _FORTRAN.sub("e", cell.strip())

@@ -78,7 +78,7 @@ def _read(suffix: str, count: int) -> tuple[str, ...]:
     name, peer = PEERS[suffix]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"record{suffix}"
-        WRITERS[suffix](path, columns)
+        path.write_bytes(WRITERS[suffix](columns))
         took, record = _timed(read_record, path)
         theirs, _ = _timed(peer, path)
         size = path.stat().st_size / 1e6
