@@ -70,7 +70,14 @@ def check_time(time: Located, problems: Problems) -> None:
     known = np.flatnonzero(np.isfinite(time.values))
     wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
     if wrong.size > LISTED:
-        problems.add(_disorder(time, known[wrong], known[wrong + 1]))
+        first, places = known[wrong[0] + 1], f"{time.place}s"
+        stands = (time.values[known[wrong]] == time.values[known[wrong + 1]]).all()
+        what = f": the {places} are not in the order of time; sort them by it."
+        what = f": their time stands still; remove repeated {places}." if stands else what
+        problems.add(
+            f"{time.path}: column 'time': {wrong.size} of {time.values.size} {places} are not later"
+            f" than the one before, {time.place} {time.lines[first]} the first of them{what}"
+        )
         return
     for row, before in zip(known[wrong + 1], known[wrong], strict=True):
         now, last = time.values[row], time.values[before]
@@ -81,19 +88,6 @@ def check_time(time: Located, problems: Problems) -> None:
             f"instant in every {time.place}; remove repeated {time.place}s or split the file where "
             f"a new record begins."
         )
-
-
-def _disorder(time: Located, before: NDArray[np.intp], after: NDArray[np.intp]) -> str:
-    """Say in one sentence what is wrong with the order of many rows."""
-    first, still = after[0], time.values[after] == time.values[before]
-    places = f"{time.place}s"
-    where = (
-        f"{time.path}: column 'time': {after.size} of {time.values.size} {places} are not later"
-        f" than the one before, {time.place} {time.lines[first]} the first of them"
-    )
-    if np.all(still):
-        return f"{where}: their time stands still; remove repeated {places}."
-    return f"{where}: the {places} are not in the order of time; sort them by it."
 
 
 def check_complete(column: Located, problems: Problems) -> None:
@@ -227,7 +221,12 @@ class Record(Plotted):
             raise InputError(problems)
         self._check()
         if not self.sha256:
-            object.__setattr__(self, "sha256", self._hash())
+            digest = hashlib.sha256()
+            for column in COLUMNS:
+                array = getattr(self, column)
+                if array is not None or column in _HASHED:
+                    digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
+            object.__setattr__(self, "sha256", digest.hexdigest())
 
     def _check(self) -> None:
         """Refuse numbers that no experiment gives, as of a file."""
@@ -329,14 +328,6 @@ class Record(Plotted):
         arrays = {c: a[part] for c in _OPTIONAL if (a := getattr(self, c)) is not None}
         name = f"{self.name}[{first}:{last}]"
         return replace(self, name=name, time=self.time[part], voltage=self.voltage[part], **arrays)
-
-    def _hash(self) -> str:
-        digest = hashlib.sha256()
-        for column in COLUMNS:
-            array = getattr(self, column)
-            if array is not None or column in _HASHED:
-                digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
-        return digest.hexdigest()
 
 
 def _frozen(values: ArrayLike) -> FloatArray:
