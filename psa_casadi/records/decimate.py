@@ -56,8 +56,9 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
         return best, factor
     while record.n // (2 * factor) >= FEWEST:
         q = 2 * factor
-        columns: dict[str, Any] = {n: _means(v, q) for n, v in record.recorded.items()}
-        time = _means(record.time, q)
+        columns: dict[str, Any]
+        columns = {n: _blocks(v, q).mean(axis=1) for n, v in record.recorded.items()}
+        time = _blocks(record.time, q).mean(axis=1)
         if record.displacement is not None:
             columns["displacement"] = _valid_means(record, time, q)
         wider = replace(record, time=time, **columns)
@@ -67,32 +68,23 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
     return best, factor
 
 
-def _means(array: FloatArray, q: int) -> FloatArray:
-    return np.asarray(array[: array.size // q * q].reshape(-1, q).mean(axis=1), dtype=float)
-
-
-def _valid(record: Record, q: int) -> NDArray[np.int64]:
-    """Return the number of valid samples in each block."""
-    blocks = record.n // q
-    there = record.mask[: blocks * q].reshape(blocks, q)
-    return np.asarray(there.sum(axis=1), dtype=np.int64)
+def _blocks(values: NDArray[Any], q: int) -> NDArray[Any]:
+    """Return values (n,) in blocks of q, (n // q, q)."""
+    return values[: values.size // q * q].reshape(-1, q)
 
 
 def _valid_means(record: Record, time: FloatArray, q: int) -> FloatArray:
     """Return the displacement at the middle of each block, nan where more than half is missing."""
-    blocks = record.n // q
-    there = record.mask[: blocks * q].reshape(blocks, q)
-    count = _valid(record, q)
-    known = 2 * count >= q
+    there = _blocks(record.mask, q)
+    count = there.sum(axis=1)
+    known, whole = 2 * count >= q, count == q
     y = np.nan_to_num(np.asarray(record.displacement, dtype=float), nan=0.0)
-    y = y[: blocks * q].reshape(blocks, q).sum(axis=1)
-    t = np.where(there, record.time[: blocks * q].reshape(blocks, q), 0.0).sum(axis=1)
-    means = np.full(blocks, np.nan)
+    sums = _blocks(y, q).sum(axis=1)
+    t = np.where(there, _blocks(record.time, q), 0.0).sum(axis=1)
+    means = np.full(count.size, np.nan)
     if known.any():
-        centres, levels = t[known] / count[known], y[known] / count[known]
-        whole = count[known] == q
-        centres[whole] = time[known][whole]
-        means[known] = np.interp(time[known], centres, levels)
+        centres = np.where(whole, time, t / np.maximum(count, 1))
+        means[known] = np.interp(time[known], centres[known], sums[known] / count[known])
     return means
 
 
@@ -108,7 +100,7 @@ def _nothing_lost(record: Record, wider: Record, q: int, noise: float, allowed: 
         return True
     if wider.mask.sum() < 0.98 * record.mask.sum() / q:
         return False
-    valid = _valid(record, q)
+    valid = _blocks(record.mask, q).sum(axis=1)
     least = int(np.min(valid[2 * valid >= q], initial=q))
     return _straight(wider.displacement, noise / np.sqrt(least)) and _white(record, wider, q)
 

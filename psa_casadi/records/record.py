@@ -205,21 +205,25 @@ class Record(Plotted):
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        problems = []
+        problems, where = Problems(), f"record '{self.name}'"
         for column in COLUMNS:
             given = getattr(self, column)
             if given is None and column in _OPTIONAL:
                 continue
-            array = _frozen(given)
+            array = frozen(given)
             object.__setattr__(self, column, array)
             if array.ndim != 1 or array.size != self.time.size:
-                problems.append(
-                    f"record '{self.name}': '{column}' has shape {array.shape}, but time has "
-                    f"{self.time.size} samples; give one value for each instant."
+                problems.add(
+                    f"{where}: '{column}' has shape {array.shape}, but time has {self.time.size}"
+                    " samples; give one value for each instant."
                 )
-        if problems:
-            raise InputError(problems)
-        self._check()
+        problems.raise_if_any()
+        numbers, unreported = np.arange(self.n, dtype=np.int64), np.zeros(self.n, dtype=np.bool_)
+        checks = {"time": check_time, "displacement": check_finite}
+        for column, values in {"time": self.time, **self.recorded}.items():
+            located = Located(where, column, values, numbers, unreported, "sample")
+            checks.get(column, check_complete)(located, problems)
+        problems.raise_if_any()
         if not self.sha256:
             digest = hashlib.sha256()
             for column in COLUMNS:
@@ -227,21 +231,6 @@ class Record(Plotted):
                 if array is not None or column in _HASHED:
                     digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
             object.__setattr__(self, "sha256", digest.hexdigest())
-
-    def _check(self) -> None:
-        """Refuse numbers that no experiment gives, as of a file."""
-        problems = Problems()
-        numbers = np.arange(self.n, dtype=np.int64)
-        unreported = np.zeros(self.n, dtype=np.bool_)
-        for column in COLUMNS:
-            values = getattr(self, column)
-            if values is None:
-                continue
-            where = f"record '{self.name}'"
-            located = Located(where, column, values, numbers, unreported, "sample")
-            checks = {"time": check_time, "displacement": check_finite}
-            checks.get(column, check_complete)(located, problems)
-        problems.raise_if_any()
 
     def __repr__(self) -> str:
         """Return name, size and range in one line."""
@@ -330,7 +319,8 @@ class Record(Plotted):
         return replace(self, name=name, time=self.time[part], voltage=self.voltage[part], **arrays)
 
 
-def _frozen(values: ArrayLike) -> FloatArray:
+def frozen(values: ArrayLike) -> FloatArray:
+    """Return numbers that cannot be changed, a copy where they could be."""
     array = np.asarray(values, dtype=np.float64)
     if array.flags.writeable or not array.flags.c_contiguous:
         array = array.copy()
