@@ -136,9 +136,10 @@ def multisine(
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, last - first + 1)
     spectrum = np.zeros(time.size // 2 + 1, dtype=np.complex128)
     spectrum[first : last + 1] = np.exp(1j * phases)
-    signal: FloatArray = np.fft.irfft(spectrum, time.size)
+    signal = np.fft.irfft(spectrum, time.size)
     bottom, top = signal.min(), signal.max()
-    return np.clip(low + (high - low) * (signal - bottom) / (top - bottom), low, high)
+    voltage: FloatArray = low + (high - low) * (signal - bottom) / (top - bottom)
+    return np.clip(voltage, low, high)
 
 
 def concatenate(parts: Sequence[FloatArray], sample_time: float) -> Waveform:
