@@ -8,6 +8,7 @@ dependence and refuses a loop.
 import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -228,17 +229,17 @@ class Component:
         function of CasADi.
         """
         if self.home:
-            return _of_module, ("psa_casadi.model.own_effects", self.home, self.name)
+            return _found, ("psa_casadi.model.own_effects", "own_effects", self.home, self.name)
         for module, table in _TABLES:
             for key, component in getattr(import_module(module), table).items():
                 if component is self:
-                    return _of_table, (module, table, key)
+                    return _found, (module, table, None, key)
         declared = {f.name: getattr(self, f.name) for f in fields(self)}
         try:
             pickle.dumps(self.equations)
         except (pickle.PicklingError, AttributeError, TypeError):
             declared["equations"] = KeptEquations.of(self)
-        return _of_fields, (declared,)
+        return partial(Component, **declared), ()
 
     def at_gain(self, gain: float, values: Mapping[str, float]) -> dict[str, float]:
         """Return `values` with a gain, as a fit has them: the `linear` ones times it, beside 1."""
@@ -285,15 +286,7 @@ class KeptEquations:
         return Equations(**parts)
 
 
-def _of_table(module: str, table: str, key: Any) -> Component:
-    found: Component = getattr(import_module(module), table)[key]
-    return found
-
-
-def _of_module(reader: str, module: str, name: str) -> Component:
-    found: Component = import_module(reader).own_effects(module)[name]
-    return found
-
-
-def _of_fields(declared: dict[str, Any]) -> Component:
-    return Component(**declared)
+def _found(module: str, name: str, given: str | None, key: Any) -> Any:
+    """Return a component of a table, or of what a function makes of what is given."""
+    table = getattr(import_module(module), name)
+    return (table if given is None else table(given))[key]

@@ -47,18 +47,14 @@ def read_json(path: str | os.PathLike[str], advice: str, source: str = "") -> An
     """
     source = source or os.fspath(path)
     try:
-        text = _read_text(Path(path))
+        with Path(path).open("rb") as stream:
+            data = stream.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise ValueError(f"it has more than {MOST_BYTES / 2**20:g} MiB")  # noqa: TRY301
+        text = data.decode("utf-8-sig")
     except (OSError, ValueError) as error:
         raise InputError(f"{source}: cannot be read ({why_not_read(error)}); {advice}") from error
     return parse_json(text, source, advice)
-
-
-def _read_text(path: Path) -> str:
-    with path.open("rb") as stream:
-        data = stream.read(MOST_BYTES + 1)
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"it has more than {MOST_BYTES / 2**20:g} MiB")
-    return data.decode("utf-8-sig")
 
 
 def parse_json(text: str, source: str, advice: str) -> Any:

@@ -10,11 +10,10 @@ Source: FMI 2.0.5, section 2.2.2, and FMI 3.0.2, section 2.4.3 (definition of un
 
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
-from typing import Any, overload
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,8 @@ from numpy.typing import NDArray
 from psa_casadi.errors import InputError
 
 FloatArray = NDArray[np.float64]
+#: A number, or an array of them.
+Value = TypeVar("Value", float, FloatArray)
 
 #: The base units in FMI's order; `Unit.exponents` follows it.
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
@@ -63,16 +64,7 @@ class Unit:
         return {b: e for b, e in zip(BASE_UNITS, self.exponents, strict=True) if e}
 
 
-_PREFIXES = {
-    "p": Fraction(1, 10**12),
-    "n": Fraction(1, 10**9),
-    "u": Fraction(1, 10**6),
-    "m": Fraction(1, 10**3),
-    "": Fraction(1),
-    "k": Fraction(10**3),
-    "M": Fraction(10**6),
-    "G": Fraction(10**9),
-}
+_POWERS = {"p": -12, "n": -9, "u": -6, "m": -3, "": 0, "k": 3, "M": 6, "G": 9}
 
 # symbol, quantity, prefixes in use beside none, exponents of kg m s A K mol cd rad
 _SI_UNITS: tuple[tuple[str, str, str, Exponents], ...] = (
@@ -110,15 +102,14 @@ _OTHER_UNITS: tuple[Unit, ...] = (
 )
 
 
-def _table() -> Iterator[Unit]:
-    for symbol, quantity, prefixes, exponents in _SI_UNITS:
-        for prefix in ("", *prefixes):
-            yield Unit(prefix + symbol, _PREFIXES[prefix], 0.0, exponents, quantity=quantity)
-    yield from _OTHER_UNITS
-
-
 #: Every unit that has a symbol of its own, by that symbol.
-UNITS: dict[str, Unit] = {unit.name: unit for unit in _table()}
+UNITS: dict[str, Unit] = {
+    f"{prefix}{symbol}": Unit(
+        f"{prefix}{symbol}", Fraction(10) ** _POWERS[prefix], 0.0, exponents, quantity=quantity
+    )
+    for symbol, quantity, prefixes, exponents in _SI_UNITS
+    for prefix in ("", *prefixes)
+} | {unit.name: unit for unit in _OTHER_UNITS}
 
 _ALIASES = str.maketrans(
     {"\u00b5": "u", "\u03bc": "u", "\u03a9": "Ohm", "\u2126": "Ohm", "°": "deg", "·": ".",
@@ -238,11 +229,7 @@ def _unknown_symbol(symbol: str, text: str, quantity: str) -> str:
     return f"the unit '{symbol[:60]}'{within} is unknown; {what} that exist: {', '.join(listed)}."
 
 
-@overload
-def convert(value: float, from_unit: str, to_unit: str) -> float: ...
-@overload
-def convert(value: FloatArray, from_unit: str, to_unit: str) -> FloatArray: ...
-def convert(value: float | FloatArray, from_unit: str, to_unit: str) -> float | FloatArray:
+def convert(value: Value, from_unit: str, to_unit: str) -> Value:
     """Return `value`, given in `from_unit`, in `to_unit`.
 
     Powers of ten convert with a single rounding: 7 um becomes exactly the float 7e-6.
@@ -263,11 +250,7 @@ def convert(value: float | FloatArray, from_unit: str, to_unit: str) -> float | 
     return scaled + (source.offset - target.offset) / target.factor
 
 
-@overload
-def to_si(value: float, unit: str) -> float: ...
-@overload
-def to_si(value: FloatArray, unit: str) -> FloatArray: ...
-def to_si(value: float | FloatArray, unit: str) -> float | FloatArray:
+def to_si(value: Value, unit: str) -> Value:
     """Return `value`, given in `unit`, in SI base units; counts stay counts.
 
     Raises:

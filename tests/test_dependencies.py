@@ -93,9 +93,7 @@ def test_an_optional_package_is_asked_for_in_a_sentence(extra: str) -> None:
     assert users
     for path, inside in users:
         assert inside, f"{path} imports one of {names} when it is loaded"
-    assert names <= {
-        package for _, package in READERS.values()
-    }  # see tests/records/test_formats.py
+    assert names <= {package for _, package, _ in READERS.values()}
 
 
 def test_the_developers_install_has_every_extra() -> None:

@@ -1,7 +1,6 @@
 """What Python users give and get: records in any form, results that show themselves."""
 
 import pickle
-import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import psa_casadi as psa
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.records import records_given
 from tests.report.report_cases import diagnosis, identification
-from tests.tiers import slow
 
 T = np.arange(64) * 1e-3
 V = 50.0 - 50.0 * np.cos(40.0 * T)
@@ -57,32 +55,6 @@ def test_one_or_several_records_paths_and_tables_are_records(tmp_path: Path) -> 
         (listed,) = records_given([one])
         assert alone.n == listed.n == 64
     assert [r.n for r in records_given([record, path, TABLE])] == [64, 64, 64]
-
-
-def test_results_are_short_in_a_line() -> None:
-    d, found = diagnosis("cause_named"), identification()
-    assert repr(d).startswith("<Diagnosis cause_named: ")
-    for shown in (d, found, found.fit, d.model, d.experiments[0].record):
-        assert len(repr(shown)) < 300
-        assert "\n" not in repr(shown)
-        assert "array(" not in repr(shown)
-    assert re.fullmatch(r"<Identification: \d+ parameters from 2 records; .*rms>", repr(found))
-
-
-@slow
-def test_results_draw_and_report_themselves(tmp_path: Path) -> None:
-    d, found = diagnosis("cause_named"), identification()
-    run = psa.simulate(found.model, T, V)
-    assert len(d.plot().axes) == 5
-    assert len(found.plot().axes) == 4
-    assert len(run.plot().axes) == 2
-    for result in (d, found, run):
-        cell = result._repr_html_()
-        assert cell.startswith("<pre")
-        assert "data:image/png;base64," in cell
-    for k, reported in enumerate((d, found)):
-        reported.report(tmp_path / f"{k}.html", still=True)
-        assert (tmp_path / f"{k}.html").stat().st_size > 10_000
 
 
 def test_results_are_data_frames() -> None:

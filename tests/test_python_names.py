@@ -1,8 +1,6 @@
 """The public names: few to begin with, the others where they belong; a model in CasADi's words."""
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 
 import casadi as ca
@@ -39,14 +37,6 @@ def test_a_space_has_what_it_names(space: str) -> None:
         assert name in dir(module)
     with pytest.raises(AttributeError, match="nothing"):
         _ = module.nothing
-
-
-def test_names_are_loaded_when_they_are_used() -> None:
-    code = (
-        "import sys, psa_casadi;print(*{'casadi', 'numpy', 'psa_casadi.design'} & {*sys.modules})"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
 
 
 def test_a_model_in_casadis_words_integrates_as_it_simulates() -> None:

@@ -84,7 +84,7 @@ def _runs(
                 averaged=factor,
                 fitted_m=_rms(errors[e.known]),
                 held_out_m=_rms(errors[e.held_out]) if held else None,
-                held_out=tuple(zip(*(k.tolist() for k in runs_of(e.held_out)), strict=True)),
+                held_out=tuple(runs_of(e.held_out)),
             )
         )
     return tuple(runs)

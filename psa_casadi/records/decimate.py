@@ -19,6 +19,8 @@ SHARE = 0.1
 LARGEST = 6.0
 #: Blocks over which a bend of the displacement is averaged before it is held against the noise.
 ACROSS = 5
+#: Lines over which a hump is looked for, and frequencies over which the local mean is taken.
+_HUMP, _AROUND = 64, 2048
 
 
 def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
@@ -48,58 +50,41 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
                 f"record '{record.name}': the {name} is {value:g}, expected a positive number; give"
                 f" what was measured."
             )
-    best, factor = record, 1
-    if not _uniform(record.time):
+    best, factor, intervals = record, 1, np.diff(record.time)
+    usual = float(np.median(intervals))
+    if np.any(np.abs(intervals - usual) >= 1e-3 * usual):
         return best, factor
     while record.n // (2 * factor) >= FEWEST:
-        wider = _averages(record, 2 * factor)
-        if not _nothing_lost(record, wider, 2 * factor, noise, SHARE * noise / abs(slope)):
+        q = 2 * factor
+        columns: dict[str, Any]
+        columns = {n: _blocks(v, q).mean(axis=1) for n, v in record.recorded.items()}
+        time = _blocks(record.time, q).mean(axis=1)
+        if record.displacement is not None:
+            columns["displacement"] = _valid_means(record, time, q)
+        wider = replace(record, time=time, **columns)
+        if not _nothing_lost(record, wider, q, noise, SHARE * noise / abs(slope)):
             break
-        best, factor = wider, 2 * factor
+        best, factor = wider, q
     return best, factor
 
 
-def _uniform(time: FloatArray) -> bool:
-    steps = np.diff(time)
-    usual = float(np.median(steps))
-    return bool(np.all(np.abs(steps - usual) < 1e-3 * usual))
-
-
-def _averages(record: Record, q: int) -> Record:
-    """Return the record of block averages over q samples."""
-    time = _means(record.time, q)
-    columns: dict[str, Any] = {n: _means(values, q) for n, values in record.recorded.items()}
-    if record.displacement is not None:
-        columns["displacement"] = _valid_means(record, time, q)
-    return replace(record, time=time, **columns)
-
-
-def _means(array: FloatArray, q: int) -> FloatArray:
-    return np.asarray(array[: array.size // q * q].reshape(-1, q).mean(axis=1), dtype=float)
-
-
-def _valid(record: Record, q: int) -> NDArray[np.int64]:
-    """Return the number of valid samples in each block."""
-    blocks = record.n // q
-    there = record.mask[: blocks * q].reshape(blocks, q)
-    return np.asarray(there.sum(axis=1), dtype=np.int64)
+def _blocks(values: NDArray[Any], q: int) -> NDArray[Any]:
+    """Return values (n,) in blocks of q, (n // q, q)."""
+    return values[: values.size // q * q].reshape(-1, q)
 
 
 def _valid_means(record: Record, time: FloatArray, q: int) -> FloatArray:
     """Return the displacement at the middle of each block, nan where more than half is missing."""
-    blocks = record.n // q
-    there = record.mask[: blocks * q].reshape(blocks, q)
-    count = _valid(record, q)
-    known = 2 * count >= q
+    there = _blocks(record.mask, q)
+    count = there.sum(axis=1)
+    known, whole = 2 * count >= q, count == q
     y = np.nan_to_num(np.asarray(record.displacement, dtype=float), nan=0.0)
-    y = y[: blocks * q].reshape(blocks, q).sum(axis=1)
-    t = np.where(there, record.time[: blocks * q].reshape(blocks, q), 0.0).sum(axis=1)
-    means = np.full(blocks, np.nan)
+    sums = _blocks(y, q).sum(axis=1)
+    t = np.where(there, _blocks(record.time, q), 0.0).sum(axis=1)
+    means = np.full(count.size, np.nan)
     if known.any():
-        centres, levels = t[known] / count[known], y[known] / count[known]
-        whole = count[known] == q
-        centres[whole] = time[known][whole]
-        means[known] = np.interp(time[known], centres, levels)
+        centres = np.where(whole, time, t / np.maximum(count, 1))
+        means[known] = np.interp(time[known], centres[known], sums[known] / count[known])
     return means
 
 
@@ -115,7 +100,7 @@ def _nothing_lost(record: Record, wider: Record, q: int, noise: float, allowed: 
         return True
     if wider.mask.sum() < 0.98 * record.mask.sum() / q:
         return False
-    valid = _valid(record, q)
+    valid = _blocks(record.mask, q).sum(axis=1)
     least = int(np.min(valid[2 * valid >= q], initial=q))
     return _straight(wider.displacement, noise / np.sqrt(least)) and _white(record, wider, q)
 
@@ -136,10 +121,7 @@ def _followed(
 def _lines(time: FloatArray, centres: FloatArray, means: FloatArray) -> FloatArray:
     """Return straight lines between the means, continued before the first and after the last."""
     found = np.interp(time, centres, means)
-    for end, inner, outside in (
-        (0, 1, time < centres[0]),
-        (-1, -2, time > centres[-1]),
-    ):
+    for end, inner, outside in ((0, 1, time < centres[0]), (-1, -2, time > centres[-1])):
         rate = (means[end] - means[inner]) / (centres[end] - centres[inner])
         found[outside] = means[end] + rate * (time[outside] - centres[end])
     return found
@@ -176,22 +158,13 @@ def _white(record: Record, wider: Record, q: int) -> bool:
     taken = np.where(record.mask, np.nan_to_num(record.displacement) - lines, 0.0)
     power = np.abs(np.fft.rfft(taken)) ** 2
     upper = power[int(np.ceil(record.n / (2 * q))) : -1]
-    local = _local_mean(upper)
+    parts = np.array_split(upper, max(1, upper.size // _AROUND))
+    middle = np.cumsum([p.size for p in parts]) - np.array([p.size for p in parts]) / 2.0
+    medians = np.array([float(np.median(p)) for p in parts])  # which lines do not move
+    local = np.interp(np.arange(upper.size), middle, medians / np.log(2.0))
+    local = np.maximum(local, 1e-300)
     hump = np.convolve(upper / local, np.ones(_HUMP) / _HUMP, mode="valid")
     return bool(
         np.max(upper / local) < np.log(upper.size) + 10.0
         and np.max(hump) < 1.0 + 8.0 / np.sqrt(_HUMP)
     )
-
-
-_HUMP, _AROUND = 64, 2048
-
-
-def _local_mean(power: NDArray[np.float64]) -> FloatArray:
-    """Return the mean power around each frequency from medians, which lines do not move."""
-    count = max(1, power.size // _AROUND)
-    medians = [float(np.median(part)) for part in np.array_split(power, count)]
-    sizes = [part.size for part in np.array_split(power, count)]
-    middle = np.cumsum(sizes) - np.array(sizes) / 2.0
-    found = np.interp(np.arange(power.size), middle, np.array(medians) / np.log(2.0))
-    return np.asarray(np.maximum(found, 1e-300), dtype=float)

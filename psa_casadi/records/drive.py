@@ -32,32 +32,20 @@ def drive_frequency(record: Record) -> float | None:
     return peak / record.duration if share > _DOMINANT and peak > _SIDE_LINES else None
 
 
-def among_harmonics(frequency: float, record: Record) -> bool:
-    """Whether a frequency [Hz] lies in the range of a periodic drive's first twelve harmonics.
+def tells_tone(frequency: float, record: Record, *, hum: bool) -> bool:
+    """Whether a record tells a tone [Hz] from its drive; a `hum` on the mains, too.
 
     A resonance answers a periodic drive at the drive's harmonics only, and so does distortion: in
-    that range such a record cannot tell the two apart.
+    the range of its first twelve such a record cannot tell the two apart, but for a line of the
+    mains or its harmonics that is none of the drive's.
     """
     drive = drive_frequency(record)
-    return drive is not None and frequency < (_ORDERS + 0.5) * drive
-
-
-def mains_line(frequency: float, record: Record) -> bool:
-    """Whether a frequency [Hz] is that of a mains, or a harmonic of it, and none of the drive's."""
-    near = any(
-        abs(frequency - m * mains) < _OFF * m * mains
-        for mains in _MAINS
-        for m in range(1, _MULTIPLES + 1)
-    )
-    drive = drive_frequency(record)
-    if drive is None or not near:
-        return near
-    return abs(frequency - round(frequency / drive) * drive) > _APART / record.duration
-
-
-def tells_tone(frequency: float, record: Record, *, hum: bool) -> bool:
-    """Whether a record tells a tone [Hz] from its drive; a `hum` on the mains, too."""
-    return not among_harmonics(frequency, record) or (hum and mains_line(frequency, record))
+    if drive is None or frequency >= (_ORDERS + 0.5) * drive:
+        return True
+    lines = [m * mains for mains in _MAINS for m in range(1, _MULTIPLES + 1)]
+    near = any(abs(frequency - line) < _OFF * line for line in lines)
+    own = abs(frequency - round(frequency / drive) * drive) <= _APART / record.duration
+    return hum and near and not own
 
 
 def turns(voltage: FloatArray, share: float = 0.1) -> bool:

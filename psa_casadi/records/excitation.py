@@ -51,7 +51,7 @@ def sine(time: FloatArray, low: float, high: float, frequency: float) -> FloatAr
     """
     _check(time, low, high, frequency)
     share = 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * time))
-    return _within(low, high, low + (high - low) * share)
+    return np.clip(low + (high - low) * share, low, high)
 
 
 def triangle(time: FloatArray, low: float, high: float, frequency: float) -> FloatArray:
@@ -65,7 +65,7 @@ def triangle(time: FloatArray, low: float, high: float, frequency: float) -> Flo
     _check(time, low, high, frequency)
     phase = frequency * time
     share = 1.0 - np.abs(2.0 * (phase - np.floor(phase)) - 1.0)
-    return _within(low, high, low + (high - low) * share)
+    return np.clip(low + (high - low) * share, low, high)
 
 
 def decaying_triangle(
@@ -91,7 +91,7 @@ def decaying_triangle(
     turns = np.arange(2 * periods + 1)
     ends = np.where(turns % 2 == 0, low, high)
     levels = middle + (1.0 - turns / (2 * periods)) * (ends - middle)
-    return _within(low, high, np.interp(time, turns * length / (2 * periods), levels))
+    return np.clip(np.interp(time, turns * length / (2 * periods), levels), low, high)
 
 
 def steps(time: FloatArray, levels: ArrayLike) -> FloatArray:
@@ -138,7 +138,8 @@ def multisine(
     spectrum[first : last + 1] = np.exp(1j * phases)
     signal = np.fft.irfft(spectrum, time.size)
     bottom, top = signal.min(), signal.max()
-    return _within(low, high, low + (high - low) * (signal - bottom) / (top - bottom))
+    voltage: FloatArray = low + (high - low) * (signal - bottom) / (top - bottom)
+    return np.clip(voltage, low, high)
 
 
 def concatenate(parts: Sequence[FloatArray], sample_time: float) -> Waveform:
@@ -155,12 +156,6 @@ def concatenate(parts: Sequence[FloatArray], sample_time: float) -> Waveform:
         )
     voltage = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
     return Waveform(np.arange(voltage.size, dtype=np.float64) * sample_time, voltage)
-
-
-def _within(low: float, high: float, voltage: FloatArray) -> FloatArray:
-    """Remove what rounding put outside of the range."""
-    inside: FloatArray = np.clip(voltage, low, high)
-    return inside
 
 
 def _length(time: FloatArray) -> float:

@@ -56,14 +56,6 @@ def convolved(x: FloatArray, kernel: FloatArray) -> FloatArray:
     return whole
 
 
-def without_line(parts: FloatArray) -> FloatArray:
-    """Return rows (k, n) less the straight line that fits each best."""
-    t = np.linspace(-1.0, 1.0, parts.shape[1])
-    flat = parts - np.mean(parts, axis=1, keepdims=True)
-    rest: FloatArray = flat - np.outer(flat @ t / (t @ t), t)
-    return rest
-
-
 def peaks(values: FloatArray, apart: int, most: int) -> NDArray[np.int64]:
     """Return the places of the highest local maxima, at least `apart` samples apart, in order."""
     inner = values[1:-1]
@@ -126,10 +118,10 @@ def last_place_of(signal: FloatArray) -> float:
     return 0.0
 
 
-def runs_of(found: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first sample of every run of True in (n,), and the one behind its last, (k,)."""
-    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8)))
-    return edges[::2], edges[1::2]
+def runs_of(found: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the first sample of every run of True in (n,), and the one behind its last."""
+    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8))).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 #: Fewer samples than this are noise as a whole; third differences of this many standard deviations
@@ -165,14 +157,10 @@ def high_frequency_noise(signal: FloatArray) -> float:
     length = int(np.clip(len(squares) // _BLOCKS, 1, _BLOCK))
     count = len(squares) // length
     powers = np.mean(squares[: count * length].reshape(count, length), axis=1)
-    power = float(np.median(powers)) / (1.0 - 2.0 / (9.0 * _freedom(length))) ** 3
-    return min(float(np.sqrt(power)), float(np.std(signal))) if power > 0 else float(np.std(signal))
-
-
-def _freedom(length: int) -> float:
-    """Degrees of freedom of the mean square of so many third differences of white noise."""
     alike = sum((1.0 - k / length) * r for k, r in enumerate(_SQUARES, 1) if k < length)
-    return length / (1.0 + 2.0 * alike)
+    freedom = length / (1.0 + 2.0 * alike)  # of the mean square of so many third differences
+    power = float(np.median(powers)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
+    return min(float(np.sqrt(power)), float(np.std(signal))) if power > 0 else float(np.std(signal))
 
 
 def first_order_noise(signal: FloatArray) -> tuple[float, float]:
@@ -187,32 +175,26 @@ def first_order_noise(signal: FloatArray) -> tuple[float, float]:
     n, white = len(signal), high_frequency_noise(signal)
     if n < _FEWEST_SEGMENTS * _SEGMENT:
         return white, 0.0
-    density = _median_density(signal)
+    parts = np.lib.stride_tricks.sliding_window_view(signal, _SEGMENT)[:: _SEGMENT // 2]
+    window, t = np.hanning(_SEGMENT), np.linspace(-1.0, 1.0, _SEGMENT)
+    flat = parts - np.mean(parts, axis=1, keepdims=True)
+    flat -= np.outer(flat @ t / (t @ t), t)
+    power = np.median(np.abs(np.fft.rfft(flat * window, axis=1)) ** 2, axis=0)
+    density = power / np.sum(window**2) / np.log(2.0)  # the median of a periodogram is ln 2 means
     index = np.arange(len(density))
     fast = (index >= _FAST * _SEGMENT) & (index < _SEGMENT / 2)
     if not np.all(density[fast] > 0):
         return white, 0.0
     turn = np.cos(2 * np.pi * index[fast] / _SEGMENT)
     shape = np.log(1 - 2 * _CORRELATIONS[:, None] * turn + _CORRELATIONS[:, None] ** 2)
-    flat = np.log(density[fast]) + shape
-    levels = np.median(flat, axis=1)
-    best = int(np.argmin(np.sum(np.abs(flat - levels[:, None]), axis=1)))
+    white_part = np.log(density[fast]) + shape
+    levels = np.median(white_part, axis=1)
+    best = int(np.argmin(np.sum(np.abs(white_part - levels[:, None]), axis=1)))
     r = float(_CORRELATIONS[best])
     if r < max(_LEAST_noise, _SURE / np.sqrt(n)):
         return white, 0.0
     rms = float(np.sqrt(np.exp(levels[best]) / (1 - r**2)))
     return min(rms, float(np.std(signal))), r
-
-
-def _median_density(signal: FloatArray) -> FloatArray:
-    """Return the median periodogram of half-overlapping segments, that of white noise its variance.
-
-    A periodogram's values have an exponential distribution, whose median is ln 2 means.
-    """
-    parts = np.lib.stride_tricks.sliding_window_view(signal, _SEGMENT)[:: _SEGMENT // 2]
-    window = np.hanning(_SEGMENT)
-    power = np.abs(np.fft.rfft(without_line(parts) * window, axis=1)) ** 2
-    return np.asarray(np.median(power, axis=0) / np.sum(window**2) / np.log(2.0))
 
 
 def correlation_inflation(residual: FloatArray) -> float:

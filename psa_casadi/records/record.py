@@ -70,7 +70,14 @@ def check_time(time: Located, problems: Problems) -> None:
     known = np.flatnonzero(np.isfinite(time.values))
     wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
     if wrong.size > LISTED:
-        problems.add(_disorder(time, known[wrong], known[wrong + 1]))
+        first, places = known[wrong[0] + 1], f"{time.place}s"
+        stands = (time.values[known[wrong]] == time.values[known[wrong + 1]]).all()
+        what = f": the {places} are not in the order of time; sort them by it."
+        what = f": their time stands still; remove repeated {places}." if stands else what
+        problems.add(
+            f"{time.path}: column 'time': {wrong.size} of {time.values.size} {places} are not later"
+            f" than the one before, {time.place} {time.lines[first]} the first of them{what}"
+        )
         return
     for row, before in zip(known[wrong + 1], known[wrong], strict=True):
         now, last = time.values[row], time.values[before]
@@ -81,19 +88,6 @@ def check_time(time: Located, problems: Problems) -> None:
             f"instant in every {time.place}; remove repeated {time.place}s or split the file where "
             f"a new record begins."
         )
-
-
-def _disorder(time: Located, before: NDArray[np.intp], after: NDArray[np.intp]) -> str:
-    """Say in one sentence what is wrong with the order of many rows."""
-    first, still = after[0], time.values[after] == time.values[before]
-    places = f"{time.place}s"
-    where = (
-        f"{time.path}: column 'time': {after.size} of {time.values.size} {places} are not later"
-        f" than the one before, {time.place} {time.lines[first]} the first of them"
-    )
-    if np.all(still):
-        return f"{where}: their time stands still; remove repeated {places}."
-    return f"{where}: the {places} are not in the order of time; sort them by it."
 
 
 def check_complete(column: Located, problems: Problems) -> None:
@@ -211,38 +205,32 @@ class Record(Plotted):
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        problems = []
+        problems, where = Problems(), f"record '{self.name}'"
         for column in COLUMNS:
             given = getattr(self, column)
             if given is None and column in _OPTIONAL:
                 continue
-            array = _frozen(given)
+            array = frozen(given)
             object.__setattr__(self, column, array)
             if array.ndim != 1 or array.size != self.time.size:
-                problems.append(
-                    f"record '{self.name}': '{column}' has shape {array.shape}, but time has "
-                    f"{self.time.size} samples; give one value for each instant."
+                problems.add(
+                    f"{where}: '{column}' has shape {array.shape}, but time has {self.time.size}"
+                    " samples; give one value for each instant."
                 )
-        if problems:
-            raise InputError(problems)
-        self._check()
-        if not self.sha256:
-            object.__setattr__(self, "sha256", self._hash())
-
-    def _check(self) -> None:
-        """Refuse numbers that no experiment gives, as of a file."""
-        problems = Problems()
-        numbers = np.arange(self.n, dtype=np.int64)
-        unreported = np.zeros(self.n, dtype=np.bool_)
-        for column in COLUMNS:
-            values = getattr(self, column)
-            if values is None:
-                continue
-            where = f"record '{self.name}'"
+        problems.raise_if_any()
+        numbers, unreported = np.arange(self.n, dtype=np.int64), np.zeros(self.n, dtype=np.bool_)
+        checks = {"time": check_time, "displacement": check_finite}
+        for column, values in {"time": self.time, **self.recorded}.items():
             located = Located(where, column, values, numbers, unreported, "sample")
-            checks = {"time": check_time, "displacement": check_finite}
             checks.get(column, check_complete)(located, problems)
         problems.raise_if_any()
+        if not self.sha256:
+            digest = hashlib.sha256()
+            for column in COLUMNS:
+                array = getattr(self, column)
+                if array is not None or column in _HASHED:
+                    digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
+            object.__setattr__(self, "sha256", digest.hexdigest())
 
     def __repr__(self) -> str:
         """Return name, size and range in one line."""
@@ -330,16 +318,9 @@ class Record(Plotted):
         name = f"{self.name}[{first}:{last}]"
         return replace(self, name=name, time=self.time[part], voltage=self.voltage[part], **arrays)
 
-    def _hash(self) -> str:
-        digest = hashlib.sha256()
-        for column in COLUMNS:
-            array = getattr(self, column)
-            if array is not None or column in _HASHED:
-                digest.update(column.encode() + (b"-" if array is None else array.tobytes()))
-        return digest.hexdigest()
 
-
-def _frozen(values: ArrayLike) -> FloatArray:
+def frozen(values: ArrayLike) -> FloatArray:
+    """Return numbers that cannot be changed, a copy where they could be."""
     array = np.asarray(values, dtype=np.float64)
     if array.flags.writeable or not array.flags.c_contiguous:
         array = array.copy()

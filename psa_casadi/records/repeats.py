@@ -126,10 +126,9 @@ def _runs(record: Record, lag: int) -> list[Repetition]:
         same &= _same(record.load_force, lag)
     later = record.time[lag:] - record.time[:-lag]
     same &= np.abs(later - np.median(later)) <= 0.25 * record.sample_time
-    starts, stops = runs_of(same)
-    longest = np.sort(np.argsort(starts - stops, kind="stable")[:RUNS])
+    longest = sorted(runs_of(same), key=lambda run: run[0] - run[1])[:RUNS]
     found = []
-    for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):
+    for start, stop in sorted(longest):
         if stop - start < FEWEST:
             continue
         v = record.voltage[start:stop]
@@ -229,13 +228,13 @@ def holds(record: Record) -> Holds | None:
         first = start + (stop - start) // 4
         part = slice(first, min(stop, first + ENOUGH))
         t, y = record.time[part] - record.time[start], record.displacement[part]
-        d = _without_creep(t, y)
-        while d is not None and _rings(d):
-            half = d.size // 2
-            t, y = t[half:], y[half:]
-            d = _without_creep(t, y)
-        if d is not None:
-            pieces.append((d, 4))
+        while (d := _without_creep(t, y)) is not None:
+            early, late = np.array_split(d**2, 2)
+            there = np.isfinite(early).any() and np.isfinite(late).any()
+            if not there or np.nanmean(early) <= _RINGS * np.nanmean(late):
+                pieces.append((d, 4))
+                break
+            t, y = t[d.size // 2 :], y[d.size // 2 :]
     noise = _pooled(pieces, 1.0, 1)
     return None if noise is None else Holds(*noise, len(pieces))
 
@@ -249,13 +248,6 @@ def _without_creep(t: FloatArray, y: FloatArray) -> FloatArray | None:
     x = np.column_stack([np.ones_like(t), place, place**2, np.log(place)])
     left: FloatArray = y - x @ np.linalg.lstsq(x[there], y[there])[0]
     return left
-
-
-def _rings(d: FloatArray) -> bool:
-    """Whether the first half of a remainder holds much more power than the second."""
-    first, second = np.array_split(d**2, 2)
-    there = np.isfinite(first).any() and np.isfinite(second).any()
-    return bool(there and np.nanmean(first) > _RINGS * np.nanmean(second))
 
 
 def _without_drift(change: FloatArray, apart: FloatArray, lag: int) -> tuple[FloatArray, int]:

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import why_not_read
+from psa_casadi.records.record import frozen
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 #: What an input does between two samples.
 Hold = Literal["linear", "zero"]
 #: So many jumps, and such a share of all moves, make a staircase.
@@ -46,36 +46,31 @@ class Signals:
     sha256: str = ""
 
     def __post_init__(self) -> None:
-        time = _frozen(self.time)
-        columns = {str(n): _frozen(v) for n, v in self.columns.items()}
+        time = frozen(self.time)
+        columns = {str(n): frozen(v) for n, v in self.columns.items()}
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "columns", columns)
-        self._check()
-        if not self.sha256:
-            digest = hashlib.sha256(time.tobytes())
-            for name, values in sorted(columns.items()):
-                digest.update(name.encode() + values.tobytes())
-            object.__setattr__(self, "sha256", digest.hexdigest())
-
-    def _check(self) -> None:
         problems, where = Problems(), f"signals '{self.name}'"
-        if self.time.ndim != 1 or self.time.size < 8 or not np.isfinite(self.time).all():
-            problems.add(
-                f"{where}: the time has shape {self.time.shape}; give eight or more times."
-            )
-        elif not np.all(np.diff(self.time) > 0):
+        if time.ndim != 1 or time.size < 8 or not np.isfinite(time).all():
+            problems.add(f"{where}: the time has shape {time.shape}; give eight or more times.")
+        elif not np.all(np.diff(time) > 0):
             problems.add(f"{where}: the time does not strictly increase; sort it.")
         if self.hold not in ("linear", "zero"):
             problems.add(f"{where}: the hold '{self.hold}' does not exist; use 'linear' or 'zero'.")
-        for name, values in self.columns.items():
-            if values.shape != self.time.shape:
+        for name, values in columns.items():
+            if values.shape != time.shape:
                 problems.add(
-                    f"{where}: '{name}' has shape {values.shape}, but time has {self.time.size}"
+                    f"{where}: '{name}' has shape {values.shape}, but time has {time.size}"
                     " samples; give one value for each instant."
                 )
             elif np.isinf(values).any():
                 problems.add(f"{where}: '{name}' holds infinite numbers; mark missing ones as nan.")
         problems.raise_if_any()
+        if not self.sha256:
+            digest = hashlib.sha256(time.tobytes())
+            for name, values in sorted(columns.items()):
+                digest.update(name.encode() + values.tobytes())
+            object.__setattr__(self, "sha256", digest.hexdigest())
 
     def __repr__(self) -> str:
         """Return name, size and columns in one line."""
@@ -156,9 +151,8 @@ def _of_table(table: Mapping[str, Any], name: str) -> Signals:
             f"{name} has the columns {sorted(table)} and none named 'time'; name the times [s] so."
             + unit_hint(table)
         )
-    return Signals(
-        name=name, time=table["time"], columns={n: v for n, v in table.items() if n != "time"}
-    )
+    columns = {n: values for n, values in table.items() if n != "time"}
+    return Signals(name=name, time=table["time"], columns=columns)
 
 
 def unit_hint(names: Iterable[str]) -> str:
@@ -197,9 +191,3 @@ def _read(path: Path) -> Signals:
                 problems.add(f"{path}: row {k + 2}: '{field}' is no number; write it as 1.5e-3.")
     problems.raise_if_any()
     return _of_table(dict(zip(names, values.T, strict=True)), path.stem)
-
-
-def _frozen(values: npt.ArrayLike) -> FloatArray:
-    array = np.array(values, dtype=np.float64)
-    array.flags.writeable = False
-    return array

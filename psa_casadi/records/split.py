@@ -245,12 +245,19 @@ def _held_out(record: Record, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
     """
     voltage = record.voltage
     rate = np.r_[0.0, np.diff(voltage) / np.diff(record.time)]
-    extremes = [_reaching(s, record.mask, index) for v in (voltage, rate) for s in (v, -v)]
+    extremes = []  # the blocks in which a signal comes up to its largest value
+    for signal in (voltage, -voltage, rate, -rate) if record.mask.any() else ():
+        known = signal[record.mask]
+        reached = signal >= np.max(known) - _REACHED * np.ptp(known)
+        extremes.append(set(index[record.mask & reached].tolist()))
     groups = [range(g, g + HELD_OUT_EVERY) for g in range(0, BLOCKS, HELD_OUT_EVERY)]
-    shares, near = _shares_of_kinds(record, index)
+    kinds, which = stretches(record, float(np.ptp(voltage)))
+    shares = np.zeros((len(kinds), BLOCKS))
+    np.add.at(shares, (which[record.mask], index[record.mask]), 1.0 / max(1, record.mask.sum()))
+    near = np.array([[float(k.near(other)) for other in kinds] for k in kinds])
 
     def missed(choice: tuple[int, ...]) -> int:
-        return sum(found <= set(choice) for found in extremes if found)
+        return sum(found <= set(choice) for found in extremes)
 
     def unlike(choice: tuple[int, ...]) -> float:
         whole = np.sum(shares, axis=1)
@@ -260,25 +267,6 @@ def _held_out(record: Record, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
 
     choices = (c for c in product(*groups) if 0 not in c)
     return min(choices, key=lambda c: (missed(c), unlike(c), -sum(c), c))
-
-
-def _shares_of_kinds(record: Record, index: npt.NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """Return the share of a record's samples in each kind of stretch and block, (kinds, blocks).
-
-    And which kinds are near each other, (kinds, kinds).
-    """
-    kinds, which = stretches(record, float(np.ptp(record.voltage)))
-    shares = np.zeros((len(kinds), BLOCKS))
-    np.add.at(shares, (which[record.mask], index[record.mask]), 1.0 / max(1, record.mask.sum()))
-    return shares, np.array([[float(k.near(other)) for other in kinds] for k in kinds])
-
-
-def _reaching(values: FloatArray, valid: BoolArray, index: npt.NDArray[np.int64]) -> set[int]:
-    """Return the blocks in which the valid values come up to the largest of them."""
-    if not valid.any():
-        return set()
-    top, span = float(np.max(values[valid])), float(np.ptp(values[valid]))
-    return set(index[valid & (values >= top - _REACHED * span)].tolist())
 
 
 def in_one_order(records: Iterable[Record]) -> list[Record]:
@@ -302,7 +290,6 @@ def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Exper
 MOST = 200_000
 #: Parts that stand for one record, and the samples that it may have however many records there are.
 PARTS, LEAST = 4, 20_000
-#: What comes this close to the highest or the lowest voltage, over its range, reaches it.
 
 
 def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
@@ -314,7 +301,10 @@ def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     that the parts so far do not, as far from these as it can be. A part begins as a record does,
     with a state that nobody knows.
     """
-    shares = _shares([r.n for r in records])
+    shares, left = [0] * len(records), MOST
+    for done, k in enumerate(sorted(range(len(records)), key=lambda k: records[k].n)):
+        shares[k] = min(records[k].n, max(LEAST, left // (len(records) - done)))
+        left -= shares[k]  # what short ones leave is the others'
     found: list[Record] = []
     said: list[str] = []
     for record, share in zip(records, shares, strict=True):
@@ -335,18 +325,16 @@ def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     return found, said
 
 
-def _shares(counts: Sequence[int]) -> list[int]:
-    """Return how many samples each record may have: what short ones leave is the others'."""
-    shares, left = [0] * len(counts), MOST
-    for done, k in enumerate(sorted(range(len(counts)), key=lambda k: counts[k])):
-        shares[k] = min(counts[k], max(LEAST, left // (len(counts) - done)))
-        left -= shares[k]
-    return shares
-
-
 def _chosen(record: Record, length: int) -> list[int]:
     """Return which of the parts of a length stand for a record, in the order of time."""
-    shown = _kinds(record, length)
+    v, span = record.voltage, float(np.ptp(record.voltage))
+    kinds, which = stretches(record, span)
+    shown = np.zeros((record.n // length, len(kinds) + 2), dtype=np.bool_)  # and the two ends
+    last = len(shown) * length
+    part = np.arange(last) // length
+    shown[part, which[:last]] = True
+    shown[part[v[:last] >= np.max(v) - _REACHED * span], -2] = True
+    shown[part[v[:last] <= np.min(v) + _REACHED * span], -1] = True
     chosen = [0]
     while len(chosen) < PARTS:
         new = np.sum(shown & ~np.any(shown[chosen], axis=0), axis=1)
@@ -354,19 +342,3 @@ def _chosen(record: Record, length: int) -> list[int]:
         new[chosen] = -1
         chosen.append(int(np.lexsort((away, new))[-1]))
     return sorted(chosen)
-
-
-def _kinds(record: Record, length: int) -> npt.NDArray[np.bool_]:
-    """Return which kinds of stretch each part of a record shows, and ends of the voltage's range.
-
-    Shape (parts, kinds + 2).
-    """
-    v, span = record.voltage, float(np.ptp(record.voltage))
-    kinds, which = stretches(record, span)
-    shown = np.zeros((record.n // length, len(kinds) + 2), dtype=np.bool_)
-    last = len(shown) * length
-    part = np.arange(last) // length
-    shown[part, which[:last]] = True
-    shown[part[v[:last] >= np.max(v) - _REACHED * span], -2] = True
-    shown[part[v[:last] <= np.min(v) + _REACHED * span], -1] = True
-    return shown

@@ -54,18 +54,19 @@ def equal_runs(
     for start, stop in zip(starts, stops, strict=True):
         if stop - start <= SPIKE:
             continue
-        jumps = _jumps(y, start, stop)
+        before = float(y[start] - y[start - 1]) if start > 0 else 0.0
+        after = float(y[stop - 1] - y[stop]) if stop < y.size else 0.0
+        sign = np.sign(before) or 1.0
+        into, out = sign * before, sign * after  # both positive where it is off to one side
         expected = slope * float(np.ptp(voltage[start:stop]))
         near = swing[max(0, start - AFTER[0][1]) : stop + BEFORE]
-        off = min(jumps) > max(floor, 3.0 * float(np.max(near)))
-        if off and _returns(y, start, stop, expected):
+        off, sudden = max(floor, 3.0 * float(np.max(near))), 0.5 * MISSED * span
+        returns = abs(into - out) < 0.5 * min(into, out) + 1.5 * expected
+        rests = stop - start >= max(EQUAL, 4.0 * usual) and expected > floor
+        if (min(into, out) > off and returns) or (rests and abs(into) > sudden):
             dropped[start:stop] = True
-        elif stop - start >= max(EQUAL, 4.0 * usual) and expected > floor:
-            sudden = np.abs(jumps) > 0.5 * MISSED * span
-            if sudden[0]:
-                dropped[start:stop] = True
-            elif sudden[1] or (usual <= 1.0 and quantum is None):
-                stuck[start + 1 : stop] = True
+        elif rests and (abs(out) > sudden or (usual <= 1.0 and quantum is None)):
+            stuck[start + 1 : stop] = True
     return stuck, dropped
 
 
@@ -85,7 +86,7 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
     same = _repeated(y)
     fast = np.abs(slope * np.diff(voltage)) > least
     by_chance = float(np.mean(same)) ** np.arange(same.size + 1) * float(np.count_nonzero(fast))
-    for start, stop in zip(*(ends.tolist() for ends in runs_of(same)), strict=True):
+    for start, stop in runs_of(same):
         # y[start] ... y[stop] are equal, y[stop + 1] is the first new one
         if stop + 1 >= y.size or by_chance[stop - start] > CHANCE:
             continue
@@ -109,8 +110,12 @@ def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None)
     found = np.zeros(y.size, dtype=np.bool_)
     span, noise, same = float(np.ptp(y)), high_frequency_noise(y), _repeated(y)
     same &= np.diff(voltage) != 0.0
-    chance = max(quantum or 0.0, _digit(y)) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
-    if noise <= NOISY * span or not _rough(y) or not same.any():
+    bands = np.array_split(np.unique(np.abs(y)), BANDS)
+    digit = max((float(np.min(np.diff(b))) for b in bands if b.size > 1), default=0.0)
+    chance = max(quantum or 0.0, digit) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
+    third, fourth = (float(np.median(np.abs(np.diff(y, k)))) for k in (3, 4))
+    is_rough = fourth > ROUGH * third > 0.0  # noise, not the bends of a smooth motion
+    if noise <= NOISY * span or not is_rough or not same.any():
         return found
     unlikely = scipy.special.pdtrc(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
     if chance < BY_NOISE and unlikely and np.mean(same) < RARELY:
@@ -118,35 +123,9 @@ def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None)
     return found
 
 
-def _digit(y: FloatArray) -> float:
-    """Return the last digit of readings: the largest of what parts of them, by size, show."""
-    parts = np.array_split(np.unique(np.abs(y)), BANDS)
-    return max((float(np.min(np.diff(p))) for p in parts if p.size > 1), default=0.0)
-
-
-def _rough(y: FloatArray) -> bool:
-    """Whether the fast part of a signal is noise, not the bends of a smooth motion."""
-    third, fourth = (float(np.median(np.abs(np.diff(y, k)))) for k in (3, 4))
-    return fourth > ROUGH * third > 0.0
-
-
 def _repeated(y: FloatArray) -> BoolArray:
     """Return which samples but the first repeat the one before, (n - 1,)."""
     return np.asarray(np.abs(np.diff(y)) <= 1e-12 * float(np.ptp(y)), dtype=np.bool_)
-
-
-def _jumps(y: FloatArray, start: int, stop: int) -> tuple[float, float]:
-    """Return the jumps into and out of a run, both positive where it is off to one side."""
-    before = y[start] - y[start - 1] if start > 0 else 0.0
-    after = y[stop - 1] - y[stop] if stop < y.size else 0.0
-    sign = np.sign(before) or 1.0
-    return float(sign * before), float(sign * after)
-
-
-def _returns(y: FloatArray, start: int, stop: int, expected: float) -> bool:
-    """Whether the values before and after a run agree, but for what the voltage explains."""
-    into, out = _jumps(y, start, stop)
-    return abs(into - out) < 0.5 * min(into, out) + 1.5 * expected
 
 
 #: Readings at an end of the range that are few enough for a turn, and samples of a run that counts.
@@ -186,7 +165,7 @@ def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
     for upper, where in at.items():
         if where.sum() < FEWEST:
             continue
-        runs = [(a, b) for a, b in zip(*(e.tolist() for e in runs_of(where)), strict=True)]
+        runs = runs_of(where)
         moved = slope * np.array(
             [float(np.ptp(voltage[a:b])) * (b - a >= LONGEST) for a, b in runs]
         )
@@ -211,7 +190,7 @@ def _slope(y: FloatArray, voltage: FloatArray, inside: BoolArray) -> float:
     if inside.sum() < FEWEST:
         inside = np.ones(y.size, dtype=np.bool_)
     power = product = 0.0
-    for start, stop in zip(*(e.tolist() for e in runs_of(inside)), strict=True):
+    for start, stop in runs_of(inside):
         v, x = (s[start:stop] - np.mean(s[start:stop]) for s in (voltage, y))
         power += float(v @ v)
         product += float(v @ x)
@@ -248,7 +227,8 @@ class Suspects:
     def sentences(self, name: str) -> tuple[str, ...]:
         """Return what was found in the record of that name, one sentence for each kind."""
         said = [
-            f"{name}: {_samples(count)} {_WHAT[kind]}; masked, so that they count for nothing."
+            f"{name}: {count} sample{'s' * (count > 1)} {_WHAT[kind]}; masked, so that they count"
+            " for nothing."
             for kind, count in self.counts.items()
             if count and kind != "saturated"
         ]
@@ -263,7 +243,7 @@ class Suspects:
         """Say at which values the sensor was saturated, one sentence for each."""
         scale, unit = (1e6, "um") if self.unit == "m" else (1.0, self.unit)
         return tuple(
-            f"{name}: {_samples(int(end.where.sum()))} ({100.0 * float(end.where.mean()):.0f} %)"
+            f"{name}: {int(end.where.sum())} samples ({100.0 * float(end.where.mean()):.0f} %)"
             f" stay at {scale * end.value:.6g} {unit}, the {'largest' if end.upper else 'smallest'}"
             " value, while the voltage moves the stack: the sensor is saturated there; masked, so"
             " that they count for nothing."
@@ -288,24 +268,21 @@ def suspects(record: Record) -> Suspects:
     valid = np.flatnonzero(record.mask)
     if record.displacement is None or valid.size < 2 * BLOCK:
         return Suspects(mask, counts, None)
-    y = record.displacement[valid]
-    span = float(np.ptp(y))
-    if span <= 0:
+    y, voltage = record.displacement[valid], record.voltage[valid]
+    if float(np.ptp(y)) <= 0:
         return Suspects(mask, counts, None)
     quantum = quantum_of(y)
-    stuck, dropped = equal_runs(y, record.voltage[valid], quantum)
-    stuck |= missed_a_move(y, record.voltage[valid], quantum) & ~dropped
-    stuck |= repeated_in_noise(y, record.voltage[valid], quantum) & ~dropped
-    ends = flat_ends(y, record.voltage[valid]) if quantum is None else ()
+    stuck, dropped = equal_runs(y, voltage, quantum)
+    again = missed_a_move(y, voltage, quantum) | repeated_in_noise(y, voltage, quantum)
+    stuck |= again & ~dropped
+    ends = flat_ends(y, voltage) if quantum is None else ()
     flat = np.any([np.zeros(valid.size, dtype=np.bool_), *(e.where for e in ends)], axis=0)
     stuck, dropped = stuck & ~flat, dropped & ~flat
     rest = ~(stuck | dropped)
     outlying = np.zeros(valid.size, dtype=np.bool_)
     outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
-    outlying &= ~flat
-    kinds: dict[Kind, NDArray[np.bool_]]
-    kinds = {"outlier": outlying, "drop-out": dropped, "stuck": stuck, "saturated": flat}
-    for kind, found in kinds.items():
+    kinds = (outlying & ~flat, dropped, stuck, flat)
+    for kind, found in zip(counts, kinds, strict=True):
         counts[kind] = int(found.sum())
         mask[valid[found]] = True
     return Suspects(mask, counts, quantum, record.displacement_unit, ends)
@@ -332,7 +309,7 @@ def _outliers(
     allowed = np.maximum(LIMIT * scale, SMALLEST * float(np.ptp(y)))
     allowed = np.maximum(allowed, _explained(record)[valid])
     found = np.abs(away) > allowed
-    for start, stop in zip(*(ends.tolist() for ends in runs_of(found)), strict=True):
+    for start, stop in runs_of(found):
         sign = np.sign(away[start])
         around = -sign * np.r_[away[max(0, start - SPIKE) : start], away[stop : stop + SPIKE]]
         swings = around.size > 0 and float(np.max(around)) > 0.4 * abs(away[start])
@@ -381,14 +358,13 @@ def _explained(record: Record) -> FloatArray:
     if record.load_force is not None:
         limits[_sudden(record.load_force) > 0] = np.inf
     limits[0] = max(limits[0], slope * reach)  # a record may begin while the stack still moves
-    fading = [share * _highest(limits, after) for share, after in AFTER]
+    fading = [
+        share * scipy.ndimage.maximum_filter1d(
+            limits, BEFORE + after + 1, mode="nearest", origin=(after - BEFORE) // 2
+        )
+        for share, after in AFTER
+    ]  # fmt: skip
     return np.asarray(np.max(fading, axis=0), dtype=float)
-
-
-def _highest(limits: FloatArray, after: int) -> FloatArray:
-    """Return the largest limit from `after` samples before each one to BEFORE after it, (n,)."""
-    width, origin = BEFORE + after + 1, (after - BEFORE) // 2
-    return scipy.ndimage.maximum_filter1d(limits, width, mode="nearest", origin=origin)
 
 
 def _sudden(signal: FloatArray) -> FloatArray:
@@ -397,7 +373,3 @@ def _sudden(signal: FloatArray) -> FloatArray:
     bend[1:-1] = np.abs(np.diff(signal, 2))
     around = _scale(bend) / 1.4826
     return np.where(bend > np.maximum(6.0 * around, 1e-6 * np.ptp(signal)), bend, 0.0)
-
-
-def _samples(count: int) -> str:
-    return "1 sample" if count == 1 else f"{count} samples"

@@ -1,7 +1,6 @@
 """Models: MODEL.json, the independent reference, effects, parts, and models of one's own."""
 
 import json
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -392,30 +391,6 @@ def test_a_closed_loop_follows_its_reference() -> None:
     position = found[:, model.output_names.index("stage_position")]
     assert position[-1] == pytest.approx(4e-6, rel=1e-3)
     assert position.max() < 4.2e-6
-
-
-@pytest.mark.parametrize("kind", ["model", "own model", "record", "trajectory", "error"])
-def test_what_is_pickled_answers_as_before(kind: str) -> None:
-    time, voltage, _ = reference_run()
-    stack = psa.stack_model(STACK)
-    run = psa.simulate(stack, time, voltage)
-    made: dict[str, tuple[Any, Callable[[Any], Any]]] = {
-        "model": (stack, lambda m: psa.simulate(m, time, voltage).displacement),
-        "own model": (
-            van_der_pol(),
-            lambda m: psa.run(m, time, np.empty((time.size, 0)), np.array([2.0, 0.0])).y,
-        ),
-        "record": (
-            psa.Record(name="r", time=time, voltage=voltage, displacement=run.displacement),
-            lambda r: r.displacement,
-        ),
-        "trajectory": (run, lambda t: t.states["f_H"]),
-        "error": (psa.InputError("a"), lambda e: np.array([len(e.problems), str(e) == "a"])),
-    }
-    original, answer = made[kind]
-    expected = answer(original)
-    assert np.size(expected) > 1
-    np.testing.assert_array_equal(answer(pickle.loads(pickle.dumps(original))), expected)
 
 
 def test_blocks_for_a_control_loop_take_the_hysteresis_off() -> None:

@@ -1,9 +1,6 @@
 """Records: units, layouts, formats, missing readings, several files, and mistakes told by place."""
 
-import gzip
 import hashlib
-import re
-import shlex
 from pathlib import Path
 
 import h5py
@@ -64,42 +61,6 @@ def test_a_unit_in_the_header_becomes_si_in_any_order_of_columns(
     np.testing.assert_allclose(getattr(record, column), factor * numbers + shift, rtol=1e-12)
 
 
-LAYOUTS: dict[str, list[str]] = {
-    "other brackets": ["Time (s);voltage_V;pos [um]", *(r.replace(",", ";") for r in ROWS)],
-    "decimal commas": [
-        HEADER.replace(",", ";"), *(r.replace(",", ";").replace(".", ",") for r in ROWS)
-    ],
-    "units in their row": ["time,voltage,displacement", "s,V,um", *ROWS],
-    "a preamble and remarks": ["Rig 4, test 7", "operator: none", "", HEADER, *ROWS],
-    "tabs": [HEADER.replace(",", "\t"), *(r.replace(",", "\t") for r in ROWS)],
-    "units alone tell": ["Elapsed (s),PZT cmd (V),Probe/um", *ROWS],
-    "Excel's first line": ["sep=;", HEADER.replace(",", ";"), *(r.replace(",", ";") for r in ROWS)],
-    "Fortran's exponents": [
-        HEADER, *(f"{t:.3E},{v:.6E},{x:.6E}".replace("E", "D")
-                  for t, v, x in zip(T, V, X, strict=True))
-    ],
-    "clock times": [
-        "time,voltage [V],displacement [um]",
-        *(f"2026-03-01 23:59:59.{980 + k:03d},{r.split(',', 1)[1]}" if k < 20
-          else f"2026-03-02 00:00:00.{k - 20:03d},{r.split(',', 1)[1]}"
-          for k, r in enumerate(ROWS)),
-    ],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_what_laboratories_write_is_read_as_it_is(layout: str, tmp_path: Path) -> None:
-    assert_same(psa.read_record(lines(tmp_path / "r.csv", *LAYOUTS[layout])), 2e-6)
-
-
-@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "gzip"])
-def test_text_is_read_in_its_encoding(encoding: str, tmp_path: Path) -> None:
-    text = "\n".join([HEADER, *ROWS])
-    path = tmp_path / ("r.csv.gz" if encoding == "gzip" else "r.csv")
-    path.write_bytes(gzip.compress(text.encode()) if encoding == "gzip" else text.encode(encoding))
-    assert_same(psa.read_record(path))
-
-
 def test_binary_formats_hold_the_same_record(tmp_path: Path) -> None:
     frame, names = pd.DataFrame(PLAIN), ("time", "voltage", "displacement")
     frame.to_excel(tmp_path / "r.xlsx", index=False)
@@ -118,15 +79,6 @@ def test_binary_formats_hold_the_same_record(tmp_path: Path) -> None:
         assert_same(psa.read_record(tmp_path / f"r.{kind}", columns=columns))
 
 
-@pytest.mark.parametrize("hole", ["", "nan", "n/a", "---", "OVLD", "9.9E37"])
-def test_a_missing_reading_is_masked_and_never_filled(hole: str, tmp_path: Path) -> None:
-    rows = [f"{r.rsplit(',', 1)[0]},{hole}" if k in (7, 8) else r for k, r in enumerate(ROWS)]
-    record = psa.read_record(lines(tmp_path / "r.csv", HEADER, *rows))
-    assert np.flatnonzero(~record.mask).tolist() == [7, 8]
-    assert np.isnan(moved(record)[7:9]).all()
-    np.testing.assert_allclose(moved(record)[record.mask], 1e-6 * np.delete(X, [7, 8]))
-
-
 def test_options_say_what_a_file_does_not(tmp_path: Path) -> None:
     bare = lines(tmp_path / "bare.csv", *ROWS)
     assert_same(psa.read_record(bare, columns="time=1:s,voltage=2:V,displacement=3:um"))
@@ -136,17 +88,6 @@ def test_options_say_what_a_file_does_not(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved(told), 1e-5 * X)
     timeless = write(tmp_path / "none.csv", {k: v for k, v in PLAIN.items() if "time" not in k})
     assert_same(psa.read_record(timeless, sample_time=1e-3))
-
-
-def test_the_option_that_a_message_offers_reads_the_file(tmp_path: Path) -> None:
-    path = lines(tmp_path / "r.csv", "t,V,x", *ROWS)
-    with pytest.raises(psa.InputError) as told:
-        psa.read_record(path)
-    offered = re.search(r"--columns (\S+)", str(told.value))
-    assert offered is not None
-    filled = shlex.split(offered[1])[0].rstrip(".")
-    assert filled == "time=t:s,voltage=V:V,displacement=x:um"
-    assert_same(psa.read_record(path, columns=filled))
 
 
 def test_several_files_are_several_experiments_and_channels_are_joined(tmp_path: Path) -> None:
@@ -171,35 +112,6 @@ def test_of_several_tables_in_a_file_one_is_chosen(tmp_path: Path) -> None:
     assert_same(psa.read_record(path, columns="table=1"))
     np.testing.assert_allclose(moved(psa.read_record(path, columns="table=2")), 2e-6 * X)
     assert len(psa.read_records([path], columns="table=all")) == 2
-
-
-@pytest.mark.parametrize(
-    ("row", "said"),
-    [
-        ("0.004,abc,1", r"r\.csv: line 6, column 'voltage'.*'abc'"),
-        ("nan,1,1", r"r\.csv: line 6, column 'time'"),
-        ("0.001,1,1", r"r\.csv: line 6.*time goes back"),
-        ("0.004,1", r"r\.csv: line 6"),
-    ],
-)
-def test_a_mistake_is_told_with_file_line_and_column(row: str, said: str, tmp_path: Path) -> None:
-    path = lines(tmp_path / "r.csv", HEADER, *ROWS[:4], row, *ROWS[5:])
-    told = refused("identify", path, "-o", tmp_path / "m.json", folder=tmp_path)
-    assert re.search(said, told), told
-
-
-@pytest.mark.parametrize(
-    ("header", "said"),
-    [
-        ("time [s],voltage [N],displacement [um]", "'N' does not measure"),
-        ("time [s],voltage [vlots],displacement [um]", "'vlots' is unknown"),
-        ("time [s],voltage [V],displacement [kg]", "'kg' does not measure"),
-        ("time [s],voltage [V],voltage [V]", "voltage"),
-    ],
-)
-def test_a_wrong_header_is_told(header: str, said: str, tmp_path: Path) -> None:
-    path = lines(tmp_path / "r.csv", header, *ROWS)
-    assert said in refused("diagnose", path, "--json", tmp_path / "d.json", folder=tmp_path)
 
 
 def test_every_mistake_of_all_files_is_told_at_once(tmp_path: Path) -> None:

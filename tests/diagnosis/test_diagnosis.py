@@ -8,7 +8,7 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.diagnosis.colour import colour_of, omnibus
 from psa_casadi.diagnosis.held_out import gain_of, lost_elsewhere
-from psa_casadi.records.drive import among_harmonics, mains_line
+from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -63,12 +63,12 @@ def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> No
     triangle = Record(
         name="triangle", time=time, voltage=np.arcsin(np.sin(2.0 * np.pi * 4.0 * time))
     )
-    assert among_harmonics(49.97, triangle)
-    assert mains_line(49.97, triangle)
-    assert mains_line(60.02, triangle) is False  # the drive's fifteenth harmonic
-    assert not mains_line(47.0, triangle)
+    assert tells_tone(49.97, triangle, hum=True)
+    assert not tells_tone(49.97, triangle, hum=False)
+    assert not tells_tone(60.02, triangle, hum=True)  # the drive's fifteenth harmonic
+    assert not tells_tone(47.0, triangle, hum=True)
     noise = Record(name="noise", time=time, voltage=np.random.default_rng(0).standard_normal(5000))
-    assert mains_line(60.02, noise)
+    assert tells_tone(60.02, noise, hum=False)
 
 
 @slow

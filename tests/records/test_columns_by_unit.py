@@ -9,11 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from psa_casadi.records import Record, read_record
-from psa_casadi.records.read.columns import (
-    parse_columns,
-    stated_unit,
-    understood,
-)
+from psa_casadi.records.read.columns import parse_columns
 from tests.records.record_files import T, V, X, assert_is, offered, refused
 
 
@@ -200,27 +196,3 @@ def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
     path = recorded(tmp_path / "c.mat", *names, clocks=2)
     both = "voltage=exp001.Model Root/cmd:V,displacement=exp001.Model Root/Out1:um"
     assert suggestion(path) == both  # the two clocks are the same
-
-
-@pytest.mark.parametrize(
-    ("cell", "column", "unit"),
-    [
-        ("U_amp", None, None),
-        ("V_min", None, None),
-        ("t_ms", "time", "ms"),
-        ("pos_mV", "displacement", "mV"),
-        ("V/um", None, "V/um"),
-        ("s/um", "displacement", "um"),
-        ("um/s", None, "um/s"),
-        ("s", None, None),
-        ("mV", None, "mV"),
-        ("Channel A", None, None),
-        ("Drive volts", None, None),
-        ("Drive [mV]", None, "mV"),
-        ("Untitled 1", None, None),
-    ],
-)
-def test_the_unit_of_a_cell(cell: str, column: str | None, unit: str | None) -> None:
-    found = understood(cell)
-    assert (None if found is None else found.column) == column
-    assert stated_unit(cell) == unit

@@ -16,7 +16,6 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification import prepare
 from psa_casadi.identification.identify import identify
-from psa_casadi.identification.prepare import averaged
 from psa_casadi.records import Record, hold, sine, split, steps, time_grid
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.split import LEAST, MOST, PARTS, excerpts
@@ -86,15 +85,6 @@ def test_a_tone_below_the_noise_is_kept(frequency: float) -> None:
     small, q = decimated(replace(base, displacement=base.displacement + tone), NOISE, SLOPE)
     assert frequency < 0.5 / small.sample_time
     assert q < decimated(base, NOISE, SLOPE)[1]
-
-
-def test_a_step_in_a_slow_record_is_kept() -> None:
-    base = loop()
-    u = base.voltage.copy()
-    u[150_001] += 5.0
-    assert decimated(replace(base, voltage=u), NOISE, SLOPE)[1] == 1
-    u[150_001:] += 5.0
-    assert decimated(replace(base, voltage=u), NOISE, SLOPE)[1] == 1
 
 
 def test_white_noise_of_the_voltage_is_no_reason_to_stop_and_fast_motion_is_none_to_go_on() -> None:
@@ -190,14 +180,6 @@ def test_short_records_stay_whole_beside_a_long_one() -> None:
     assert excerpts([short]) == ([short], [])
     many = [night(LEAST + k) for k in range(12)]
     assert [p.n for p in excerpts(many)[0][:2]] == [LEAST, LEAST // PARTS]
-
-
-def test_a_long_record_that_is_oversampled_is_averaged_and_stays_whole() -> None:
-    record = loop(time_grid(100.0, 1e-4))
-    (small,), said = averaged([record])
-    assert small.n < MOST
-    assert small.duration == pytest.approx(record.duration, rel=1e-2)
-    assert "averaged in blocks" in str(said[0])
 
 
 @slow

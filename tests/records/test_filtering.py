@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from psa_casadi.records.noise import convolved, filtered, peaks, without_line
+from psa_casadi.records.noise import convolved, filtered, peaks
 
 RANDOM = np.random.default_rng(7)
 
@@ -28,11 +28,6 @@ def test_convolved() -> None:
     kernel = np.concatenate([half[:0:-1], half])
     expected = signal.oaconvolve(x, kernel[:, None], mode="same", axes=0)
     np.testing.assert_allclose(convolved(x, kernel), expected, atol=1e-11)
-
-
-def test_without_line() -> None:
-    x = RANDOM.standard_normal((3, 64)) + 5.0 * np.arange(64)
-    np.testing.assert_allclose(without_line(x), signal.detrend(x, axis=1), atol=1e-10)
 
 
 def test_peaks() -> None:

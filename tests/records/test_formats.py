@@ -2,21 +2,25 @@
 
 import hashlib
 from collections.abc import Mapping
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pyarrow
+import pyarrow.parquet
 import pytest
+import pyuff
 from numpy.typing import NDArray
-from pyarrow import parquet
-from scipy.io import savemat
+from openpyxl import Workbook
 
 from psa_casadi.errors import InputError
-from psa_casadi.records import read_record, read_records
+from psa_casadi.records import Record, read_record, read_records
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import parse_columns
+from tests.records import laboratory_bytes
+from tests.records.laboratory_bytes import hdf5, parquet, tdms
+from tests.records.reading_here import here
 from tests.records.record_files import HEADER, ROWS, assert_is, problems_of, write
 
 N = 24
@@ -24,30 +28,22 @@ T = np.arange(N) / 8.0
 U = np.sin(T)
 Y = np.cos(T)
 COLUMNS = "time=t:ms,voltage=u:mV,displacement=y:nm"
+START = datetime(2024, 3, 5, 14, 11, 2)
 
 
-def mat(path: Path, content: Mapping[str, object], version: str = "5") -> Path:
+def mat(path: Path, content: Mapping[str, Any], version: str = "5") -> Path:
     """Write a MATLAB file as MATLAB does: vectors upright, v7.3 as transposed HDF5."""
-    if version != "7.3":
-        savemat(path, dict(content), format="5", do_compression=version == "7", oned_as="column")
-        return path
-    with h5py.File(path, "w", userblock_size=512) as file:
-        _fill(file, content)
-    with path.open("r+b") as stream:
-        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+    if version == "7.3":
+        arrays = {name: np.atleast_2d(values) for name, values in content.items()}
+        path.write_bytes(hdf5(arrays, {}, userblock_size=512))
+    else:
+        packed = version == "7"
+        path.write_bytes(laboratory_bytes.mat(content, do_compression=packed, oned_as="column"))
     return path
 
 
-def _fill(group: Any, content: Mapping[str, object]) -> None:
-    for name, value in content.items():
-        if isinstance(value, dict):
-            _fill(group.create_group(name), value)
-        else:
-            group[name] = np.atleast_2d(np.asarray(value))
-
-
 def table(path: Path, columns: Mapping[str, object]) -> Path:
-    parquet.write_table(pyarrow.table(dict(columns)), path)
+    path.write_bytes(parquet(columns))
     return path
 
 
@@ -73,14 +69,12 @@ def test_matlab_arrays_of_every_version_and_kind(
 def test_structures_matrices_lying_vectors_and_names_with_units(
     tmp_path: Path, version: str
 ) -> None:
-    content = {
-        "log": {"t": T, "deep": {"u": U}},
-        "m": np.column_stack([T, U, Y]) if version == "5" else np.vstack([T, U, Y]),
-        "lying": Y[None, :],
+    content: dict[str, Any] = {
+        "log": {"t": T, "deep": {"u": U}}, "m": np.column_stack([T, U, Y]), "lying": Y[None, :],
         "note": "rig 3",
-    }
+    }  # fmt: skip
     if version == "7.3":
-        del content["note"]
+        content = {"log/t": T, "log/deep/u": U, "m": np.vstack([T, U, Y]), "lying": Y[None, :]}
     path = mat(tmp_path / "a.mat", content, version)
     record = read_record(path, columns="time=log.t,voltage=log.deep.u,displacement=lying:um")
     assert_is(record, T, U, Y / 1e6)
@@ -213,20 +207,80 @@ def test_a_missing_optional_package_is_named(
     assert "reading it needs pyarrow, which is not installed; run `pip install pyarrow`" in problem
 
 
-@pytest.mark.parametrize("delimiter", [";", "\t"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
-def test_decimal_commas_are_read(tmp_path: Path, delimiter: str, encoding: str) -> None:
-    rows = [row.replace(",", delimiter).replace(".", ",") for row in ROWS]
-    rows[3] = delimiter.join(["0,003", "-1,5e-1", ""])
-    rows = [f"{row}{delimiter}12.03.2024 10:00" for row in rows]
-    header = delimiter.join(["time [s]", "voltage [V]", "displacement [µm]", "stamp"])
-    path = write(tmp_path / "a.csv", "# Prüfstand 3", "", header, *rows, encoding=encoding)
-    record = read_record(path)
-    plain = ROWS.copy()
-    plain[3] = "0.003,-0.15,"
-    expected = read_record(write(tmp_path / "b.csv", HEADER, *plain))
-    assert expected.displacement is not None
-    assert_is(record, expected.time, expected.voltage, expected.displacement)
-    quoted = [row.replace(";", '";"').replace("\t", '"\t"') for row in rows]
-    again = read_record(write(tmp_path / "c.csv", header, *(f'"{row}"' for row in quoted)))
-    assert_is(again, expected.time, expected.voltage, expected.displacement)
+def is_read(record: Record, accuracy: float = 1e-12) -> None:
+    assert_is(record, T, U, 1e-6 * Y, accuracy)
+
+
+@pytest.mark.parametrize("binary", [0, 1])
+def test_universal_files_have_an_even_time_and_units(
+    binary: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here(monkeypatch)
+    file = pyuff.UFF(str(tmp_path / "a.uff"))
+    for name, values, unit in (("voltage", U, "V"), ("displacement", Y, "um")):
+        one = pyuff.prepare_58(
+            binary=binary, func_type=1, rsp_node=1, rsp_dir=1, ref_dir=1, ref_node=1, data=values,
+            x=T, id1=name, ord_data_type=4, num_pts=N, abscissa_spacing=1, abscissa_min=0.0,
+            abscissa_inc=T[1], abscissa_spec_data_type=17, ordinate_spec_data_type=8,
+            orddenom_spec_data_type=0, z_axis_spec_data_type=0, ordinate_axis_units_lab=unit,
+        )  # fmt: skip
+        file.write_sets(one, mode="add")
+    is_read(read_record(tmp_path / "a.uff"), accuracy=1e-5)
+
+
+def test_the_result_of_a_modelica_tool_has_names_and_units(tmp_path: Path) -> None:
+    def texts(words: list[str]) -> Any:
+        width = max(map(len, words))
+        return np.array([list(w.ljust(width)) for w in words]).T.copy()
+
+    lines = ["".join(row) for row in texts(["time", "drive.v", "tip.s"])]
+    about = ["".join(row) for row in texts(["time [s]", "drive [V]", "tip [um]"])]
+    content = {
+        "Aclass": np.array([w.ljust(11) for w in ("Atrajectory", "1.1", "", "binTrans")]),
+        "name": np.array(lines), "description": np.array(about),
+        "dataInfo": np.array([[0, 2, 2], [1, 2, -3], [0, 0, 0], [-1, -1, -1]], dtype="i4"),
+        "data_1": np.zeros((1, 2)), "data_2": np.stack([T, U, -Y]),
+    }  # fmt: skip
+    (tmp_path / "result.mat").write_bytes(laboratory_bytes.mat(content, "4"))
+    columns = "voltage=drive.v,displacement=tip.s:um"
+    is_read(read_record(tmp_path / "result.mat", columns=columns))
+
+
+@pytest.mark.parametrize("kind", ["timestamp", "duration", "text"])
+def test_instants_and_units_of_parquet(kind: str, tmp_path: Path) -> None:
+    since = pyarrow.array((1e9 * T).astype("timedelta64[ns]"))
+    stamps = pyarrow.array([START + timedelta(seconds=t) for t in T.tolist()])
+    text = pyarrow.array([(START + timedelta(seconds=t)).isoformat() for t in T.tolist()])
+    time = {"timestamp": stamps, "duration": since, "text": text}[kind]
+    numbers = [pyarrow.array(U), pyarrow.array([None if k == 3 else y for k, y in enumerate(Y)])]
+    fields = [
+        pyarrow.field("Timestamp", time.type),
+        pyarrow.field("drive", pyarrow.float64(), metadata={"unit": "V"}),
+        pyarrow.field("tip", pyarrow.float64(), metadata={"units": "um"}),
+    ]
+    found = pyarrow.Table.from_arrays([time, *numbers], schema=pyarrow.schema(fields))
+    pyarrow.parquet.write_table(found, tmp_path / "a.parquet")
+    asked: dict[str, Any] = {"columns": "time=Timestamp:s"} if kind == "text" else {}
+    record = read_record(tmp_path / "a.parquet", **asked)
+    np.testing.assert_allclose(record.time, T, atol=1e-9)
+    assert list(np.flatnonzero(~record.mask)) == [3]
+
+
+def test_dates_in_workbooks_and_instants_of_tdms(tmp_path: Path) -> None:
+    book = Workbook()
+    sheet = book.worksheets[0]
+    sheet.append(["Datum", "U [V]", "Weg [um]"])
+    for t, v, x in zip(T.tolist(), U.tolist(), Y.tolist(), strict=True):
+        sheet.append([START + timedelta(seconds=8000 * t), v, x])
+    book.save(tmp_path / "a.xlsx")
+    record = read_record(tmp_path / "a.xlsx", columns="time=Datum")
+    np.testing.assert_allclose(record.time, 8000 * T, atol=1e-3)
+    instants = np.datetime64(START, "us") + (1e6 * T).astype("timedelta64[us]")
+    channels = {"Timestamp": instants, "voltage": U, "displacement [um]": Y}
+    (tmp_path / "a.tdms").write_bytes(tdms(channels, {}))
+    is_read(read_record(tmp_path / "a.tdms"))
+
+
+def test_a_sample_rate_beside_the_arrays_is_their_clock(tmp_path: Path) -> None:
+    rate = {"voltage_V": U, "displacement_um": Y, "fs": 8.0}
+    is_read(read_record(mat(tmp_path / "a.mat", rate)))

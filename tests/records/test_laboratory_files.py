@@ -62,6 +62,17 @@ READ: dict[str, bytes] = {
     "UTF-16": text("Time (s),Voltage (V),Position (µm)").decode().encode("utf-16"),
     "gzip": gzip.compress(text("time [s],voltage [V],displacement [um]")),
     "Windows line ends": text("time [s],voltage [V],displacement [um]").replace(b"\n", b"\r\n"),
+    "old line ends": text("time [s],voltage [V],displacement [um]").replace(b"\n", b"\r"),
+    "UTF-8 with a mark": text("\ufefftime [s],voltage [V],displacement [µm]"),
+    "Western Europe": text(
+        "# Pr\xfcfstand 3", "time [s];voltage [V];displacement [µm]", delimiter=";"
+    )
+    .decode()
+    .encode("cp1252"),
+    "German, all quoted": "\n".join(
+        '"' + line.replace(";", '";"') + '"'
+        for line in ("Zeit [s];Spannung [V];Weg [um]", *rows(";", point=","))
+    ).encode(),
     "a column more": "\n".join(
         ["time_s,voltage_V,displacement_um,comment", *(f"{r},ok" for r in rows()), ""]
     ).encode(),

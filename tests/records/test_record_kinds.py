@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
-from tests.records.laboratory_bytes import Cell, npz, xlsx
+from tests.records.laboratory_bytes import Cell, hdf5, mat, npz, parquet, tdms, xlsx
 from tests.records.reading_here import here
 from tests.records.record_files import HEADER as HEAD
 from tests.records.record_files import assert_is, offered, refused
@@ -300,47 +300,24 @@ def test_any_unit_of_the_right_dimension_is_read(unit: str, size: float, tmp_pat
     np.testing.assert_allclose(np.asarray(record.displacement), size * X, rtol=1e-12)
 
 
-def csv_of(path: Path, columns: Mapping[str, Any]) -> None:
+def csv(columns: Mapping[str, Any]) -> bytes:
     rows = (",".join(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True))
-    path.write_text("\n".join([",".join(columns), *rows, ""]))
-
-
-def xlsx_of(path: Path, columns: Mapping[str, Any]) -> None:
-    rows = ([float(c) for c in row] for row in zip(*columns.values(), strict=True))
-    path.write_bytes(xlsx([list(columns), *rows]))
+    return "\n".join([",".join(columns), *rows, ""]).encode()
 
 
 def named(columns: Mapping[str, Any]) -> dict[str, Any]:
     return {re.sub(r"\W+", "_", name).strip("_"): values for name, values in columns.items()}
 
 
-def hdf5_of(path: Path, columns: Mapping[str, Any]) -> None:
-    with h5py.File(path, "w") as file:
-        for name, values in named(columns).items():
-            file.create_dataset(
-                name, data=values, chunks=(min(len(values), 64),), compression="lzf"
-            )
-
-
-def parquet_of(path: Path, columns: Mapping[str, Any]) -> None:
-    import pyarrow  # noqa: PLC0415
-    from pyarrow import parquet  # noqa: PLC0415
-
-    parquet.write_table(pyarrow.table(dict(columns)), path, row_group_size=64)
-
-
-def tdms_of(path: Path, columns: Mapping[str, Any]) -> None:
-    from nptdms import ChannelObject, TdmsWriter  # noqa: PLC0415
-
-    with TdmsWriter(path) as writer:
-        writer.write_segment([ChannelObject("g", n, np.asarray(v)) for n, v in columns.items()])
-
-
-WRITERS: dict[str, Callable[[Path, Mapping[str, Any]], object]] = {
-    ".csv": csv_of, ".xlsx": xlsx_of, ".h5": hdf5_of, ".parquet": parquet_of, ".tdms": tdms_of,
-    ".npz": lambda path, columns: path.write_bytes(npz(columns)),
-    ".mat": lambda path, columns: savemat(path, named(columns)),
-}  # fmt: skip
+WRITERS: dict[str, Callable[[Mapping[str, Any]], bytes]] = {
+    ".csv": csv,
+    ".xlsx": lambda c: xlsx([list(c), *np.column_stack(list(c.values())).tolist()]),
+    ".h5": lambda c: hdf5(named(c), {}, compression="lzf"),
+    ".parquet": lambda c: parquet(c, row_group_size=64),
+    ".tdms": lambda c: tdms(c, {}),
+    ".npz": npz,
+    ".mat": lambda c: mat(named(c)),
+}
 
 
 @pytest.mark.parametrize("width", [3, 12])
@@ -356,7 +333,7 @@ def test_every_row_is_read_bit_for_bit(
     names = [*HEAD.replace("um", "m").split(","), *(f"extra {k}" for k in range(width - 3))]
     columns = dict(zip(names, [np.cumsum(steps).round(12), *others], strict=True))
     path = tmp_path / f"a{suffix}"
-    WRITERS[suffix](path, columns)
+    path.write_bytes(WRITERS[suffix](columns))
     record = read_record(path)
     np.testing.assert_array_equal(record.time, columns["time [s]"])
     np.testing.assert_array_equal(record.voltage, columns["voltage [V]"])

@@ -17,22 +17,6 @@ from tests.tiers import slow
 T = np.arange(24) / 8.0
 
 
-@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
-def test_what_spreadsheets_write_is_read(
-    tmp_path: Path, end: str, delimiter: str, encoding: str
-) -> None:
-    lines = ["time [s],voltage [V],displacement [µm],remark", *(f"{row},ok" for row in ROWS)]
-    lines = [line.replace(",", delimiter) for line in lines]
-    path = write(tmp_path / "a.csv", *lines, end=end, encoding=encoding)
-    plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
-    record = read_record(path)
-    assert record.displacement is not None
-    np.testing.assert_array_equal(record.time, plain.time)
-    np.testing.assert_array_equal(record.displacement, plain.displacement)
-
-
 def test_comments_quotes_blank_lines_and_capitals_are_tolerated(tmp_path: Path) -> None:
     quoted = [f'"{row.split(",")[0]}",{row.split(",", 1)[1]}' for row in ROWS]
     header = '"Time [s]", Voltage [V] ,"Load Force [N]"'
@@ -43,13 +27,6 @@ def test_comments_quotes_blank_lines_and_capitals_are_tolerated(tmp_path: Path) 
     assert record.load_force is not None
     assert not record.mask.any()
     assert record.mask.shape == (20,)
-
-
-def test_counts_stay_counts(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.csv", "time [s],voltage [V],displacement [counts]", *ROWS)
-    record = read_record(path)
-    assert record.displacement_unit == "counts"
-    assert record.range_m == pytest.approx(0.6)
 
 
 @given(

@@ -78,13 +78,6 @@ def test_missing_samples_change_nothing(correlation: float) -> None:
     assert found.autocovariance[1] / found.autocovariance[0] == pytest.approx(correlation, abs=0.05)
 
 
-def test_a_period_of_no_whole_number_of_samples() -> None:
-    v = sine(30_000, 777.3)
-    found = repeats(record(v, 1e-7 * v + loop_error(v) * 0.1 + noise(v.size, 0.0)))
-    assert found is not None
-    assert found.level == pytest.approx(LEVEL, rel=0.05)
-
-
 def segment() -> FloatArray:
     t = np.arange(6_000) / 6_000
     v: FloatArray = 50.0 + 40.0 * np.sin(2 * np.pi * 7 * t) * np.cos(2 * np.pi * 1.5 * t)

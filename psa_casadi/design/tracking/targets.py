@@ -48,11 +48,11 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     """
     outcome, _ = apart.read(str(path), Request(voltage=False))
     outcome.problems.raise_if_any()
-    if outcome.samples is None:
+    if not outcome.units:
         raise InputError(
             f"{path}: holds no path; name its columns as 'time [s],displacement [um]'."
         )
-    units, values = outcome.samples.units, outcome.samples.values
+    units, values = outcome.units, outcome.values
     if parse_unit(units["displacement"]).counts:
         raise InputError(
             f"{path}: line 1: the displacement is in counts of a sensor, which is no length;"
@@ -411,7 +411,7 @@ def binding(response: Response, limits: AmplifierLimits) -> tuple[str, ...]:
 def _runs(stands: BoolArray) -> list[tuple[int, int]]:
     """Return first and last sample of every run of True; short gaps do not end one."""
     spans: list[tuple[int, int]] = []
-    for first, stop in zip(*(ends.tolist() for ends in runs_of(stands)), strict=True):
+    for first, stop in runs_of(stands):
         if spans and first - spans[-1][1] <= _GAP:
             spans[-1] = (spans[-1][0], stop - 1)
         else:

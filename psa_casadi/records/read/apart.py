@@ -11,8 +11,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from itertools import zip_longest
 from pathlib import Path
-from typing import cast
 
 import msgspec
 import numpy as np
@@ -20,12 +20,12 @@ import numpy as np
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
-from psa_casadi.records.read.choose import choose
+from psa_casadi.records.read.choose import Choice
 from psa_casadi.records.read.columns import Field, stated_unit
-from psa_casadi.records.read.file_bytes import check_there, read_text, reason_of
+from psa_casadi.records.read.file_bytes import check_there, read_text
 from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
-from psa_casadi.records.read.samples import Outcome, Request, Samples, samples_of
-from psa_casadi.records.read.table import Cells, Table, parts_of_file
+from psa_casadi.records.read.samples import Outcome, Request, samples_of
+from psa_casadi.records.read.table import Table, parts_of_file
 from psa_casadi.records.read.text import decoded, text_tables
 
 #: The columns that a diagnosis needs; a cell that may be one of them is a guess worth showing.
@@ -64,11 +64,10 @@ class Asked:
 
 @dataclass(frozen=True)
 class Answer:
-    """What the other process tells of a file: why it is `refused`, its head, or its numbers."""
+    """What the other process tells of a file: what is wrong, its head, or what its numbers are."""
 
-    refused: tuple[str, ...] = ()
-    head: Head | None = None
     problems: tuple[str, ...] = ()
+    head: Head | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
@@ -81,7 +80,7 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -
         raise InputError(f"{path}: holds no header and no data; export the record again.")
     parts = parts_of_file(tables)
     one = parts.get(table, tables[0])
-    choice = choose(one, NEEDED, {}, Problems())
+    choice = Choice(one, NEEDED, {}, Problems())
     guess = dict(choice.fields)
     labels = list(one.labels)
     for name, source in choice.sources.items() if not one.headless else ():
@@ -89,17 +88,14 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -
             guess[name] = Field(labels.index(source.array), source.unit or "")
     units = tuple(stated_unit(text) or "" for text in one.header)
     names = tuple("" if set(label) & _MARKS else label for label in one.labels)
-    columns = [_texts(cells, count) for cells in one.glance]
-    longest = max(map(len, columns), default=0)
-    rows = tuple(tuple(c[k] if k < len(c) else "" for c in columns) for k in range(longest))
+    shown = [
+        [f"{c:.9g}" for c in cells[:count]]
+        if isinstance(cells, np.ndarray) and cells.dtype.kind in "biuf"
+        else [str(c)[:40] for c in cells[:count]]
+        for cells in one.glance
+    ]
+    rows = tuple(zip_longest(*shown, fillvalue=""))
     return Head(names, units, rows, guess, tuple(parts) if len(parts) > 1 else ())
-
-
-def _texts(cells: Cells, count: int) -> list[str]:
-    """Return the first cells as a table shows them."""
-    if isinstance(cells, np.ndarray) and cells.dtype.kind in "biuf":
-        return [f"{value:.9g}" for value in cells[:count]]
-    return [str(cell)[:40] for cell in cells[:count]]
 
 
 #: Time [s] that any file may take, and more for each MiB of it; memory [bytes], and more for each
@@ -121,14 +117,13 @@ def read(path: str, request: Request) -> tuple[Outcome, str]:
         tables, digest = text_of(path)
         return samples_of(path, tables, request), digest
     with temporary_folder() as folder:
-        told = _told(Asked(path, request, str(folder)))
-        problems = Problems()
+        told = answered_apart(Asked(path, request, str(folder)))
+        outcome = Outcome(units=told.units, notes=told.notes, tables=told.tables)
         for sentence in told.problems:
-            problems.add(sentence)
-        samples = None
+            outcome.problems.add(sentence)
         if told.units:
-            samples = Samples(told.units, np.load(folder / "values.npy"), told.notes)
-        return Outcome(samples, problems, told.tables), told.sha256
+            outcome.values = np.load(folder / "values.npy")
+        return outcome, told.sha256
 
 
 def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
@@ -140,8 +135,10 @@ def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
     place = str(path)
     if not ending_of(place):
         return head_of_tables(place, text_of(place)[0], count, table)
-    head = _told(Asked(place, count=count, table=table)).head
-    return cast("Head", head)
+    told = answered_apart(Asked(place, count=count, table=table))
+    if told.head is None:
+        raise InputError(told.problems)
+    return told.head
 
 
 def text_of(path: str) -> tuple[Sequence[Table], str]:
@@ -159,23 +156,11 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
     return text_tables(path, text.split("\n"), "line"), digest
 
 
-def _told(asked: Asked) -> Answer:
-    """Return what the process tells of a file.
-
-    Raises:
-        InputError: it refuses the file.
-    """
-    answer = answered_apart(asked)
-    if answer.refused:
-        raise InputError(answer.refused)
-    return answer
-
-
 def answered_apart(asked: Asked) -> Answer:
     """Return what `answered` does in a process of its own."""
     path = asked.path
     check_there(path)
-    _, package = READERS[ending_of(path)]
+    _, package, _ = READERS[ending_of(path)]
     if find_spec(package) is None:
         raise InputError(
             f"{path}: reading it needs {package}, which is not installed; run"
@@ -200,11 +185,7 @@ def answered_apart(asked: Asked) -> Answer:
 
 def _unreadable(path: str, why: str) -> Answer:
     """Return that a file is damaged."""
-    ending = ending_of(path)
-    excel = ending in (".xlsx", ".xlsm", ".xls", ".xlsb", ".ods")
-    kinds = {".mat": "MATLAB", ".h5": "HDF5", ".hdf5": "HDF5", ".hdf": "HDF5", ".npy": "NumPy",
-             ".npz": "NumPy", ".pq": "Parquet", ".parquet": "Parquet", ".tdms": "TDMS"}  # fmt: skip
-    kind = "Excel" if excel else kinds.get(ending, ending.lstrip("."))
+    *_, kind = READERS[ending_of(path)]
     return Answer((
         f"{path}: is no readable {kind} file ({why}); save it again, or export the record as CSV.",
     ))  # fmt: skip
@@ -223,17 +204,15 @@ def answered(asked: Asked) -> Answer:
     except MemoryError:
         return Answer((f"{path}: needs more memory than a record may; split it.",))
     except Exception as error:  # noqa: BLE001 - a library may raise anything on a damaged file
-        return _unreadable(path, reason_of(error))
+        said = str(error).splitlines()
+        return _unreadable(path, said[0][:120] if said else type(error).__name__)
     with Path(path).open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    found, problems = outcome.samples, outcome.problems.sentences()
-    if found is None:
-        return Answer(problems=problems, tables=tuple(outcome.tables), sha256=digest)
-    np.save(Path(asked.out) / "values.npy", found.values)
+    if outcome.units:
+        np.save(Path(asked.out) / "values.npy", outcome.values)
     return Answer(
-        problems=problems, units=found.units, notes=tuple(found.notes),
-        tables=tuple(outcome.tables), sha256=digest,
-    )  # fmt: skip
+        outcome.problems.sentences(), None, outcome.units, outcome.notes, outcome.tables, digest
+    )
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ import difflib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from psa_casadi.records.read.columns import (
     usual_source,
     words_of,
 )
-from psa_casadi.records.read.table import Table, as_times, decimal_sign, evened, numbers_in
+from psa_casadi.records.read.table import Table, as_numbers, as_times, evened
 from psa_casadi.records.record import COLUMNS
 from psa_casadi.units import parse_unit
 
@@ -87,12 +87,6 @@ class Cell:
             return -1
         return 1 if meant or self.words & _FOR.get(column, set()) else 0
 
-    def is_alike(self, column: str) -> bool:
-        """Whether it has no known name, and a unit of the column's quantity."""
-        if self.column is not None or self.unit is None or self.speaks(column) < 0:
-            return False
-        return parse_unit(self.unit).quantity == QUANTITIES.get(column, "none")
-
     def rank(self, column: str) -> int | None:
         """Return how likely it is a column, 0 for the most likely; None where it is not."""
         says = self.speaks(column)
@@ -119,73 +113,27 @@ class Cell:
         return near[0] if near else ""
 
 
-def cell_of(text: str, label: str, index: int) -> Cell:
-    """Return the cell that a text is."""
-    name, unit, hint = understood(text), stated_unit(text), stated_unit(text, loosely=True)
-    is_near = hint is not None and parse_unit(hint).quantity in QUANTITIES.values()
-    column = None if name is None else name.column
-    return Cell(index, label, text, unit, hint if unit or is_near else None, column, words_of(text))
+#: What an option says that is offered for what is open.
+ASK_COLUMN, ASK_UNIT = "say which column it is", "say which, and in which unit"
+_ASK_SCALE = "say what 1 in the file is"
 
 
-class Ask(StrEnum):
-    """What an option says that is offered for what is open."""
-
-    COLUMN = "say which column it is"
-    UNIT = "say which, and in which unit"
-    SCALE = "say what 1 in the file is"
-
-
-@dataclass(frozen=True)
-class Question:
-    """Something that a table leaves open: what it is, and what to do in the file, if anything."""
+class Question(NamedTuple):
+    """Something that a table leaves open: what it is, what to say, and what to do in the file."""
 
     what: str
-    ask: Ask
+    ask: str
     cure: str = ""
 
 
-@dataclass(frozen=True)
 class Choice:
-    """The columns that a table has for sure; what is open, and suggested for it."""
+    """The columns that the header of a table names for sure: `fields`.
 
-    fields: Mapping[str, Field]
-    open: Sequence[Question]
-    sources: ColumnMap
-
-
-def choose(table: Table, required: Sequence[str], wanted: ColumnMap, problems: Problems) -> Choice:
-    """Return the columns that the header of a table names.
-
-    `wanted` says which name, or which column counted from 1, stands for which column where the
-    header does not use the columns' own names. Added to `problems`: columns misspelled or there
-    twice, units that are wrong, names in `wanted` that the table does not have.
+    `open` is what it leaves open, `sources` what is suggested for that. `wanted` says which name,
+    or which column counted from 1, stands for which column where the header does not use the
+    columns' own names. Added to `problems`: columns misspelled or there twice, units that are
+    wrong, names in `wanted` that the table does not have.
     """
-    if table.headless and not wanted:
-        return _numbered(table, required)
-    found = _Choosing(table, required, wanted, problems)
-    found.take_own_names()
-    unclear = found.take_other_names()
-    missing = found.complain()
-    found.ask(unclear, missing)
-    sources = {**wanted, **found.sources} if found.sources else {}
-    return Choice(found.fields, found.open, sources)
-
-
-def _numbered(table: Table, required: Sequence[str]) -> Choice:
-    """Return what can be said of a table without a header: its columns are counted."""
-    free = [k for k in range(len(table.header)) if not table.sizes or table.sizes[k] > 1]
-    time = next((k for k in free if rises(table, k)), None) if "time" in required else None
-    rest = iter(k for k in free if k != time)
-    places = {name: time if name == "time" else next(rest, None) for name in required}
-    sources = {n: usual_source(n, str(k + 1)) for n, k in places.items() if k is not None}
-    example = ",".join(COLUMNS[name].example for name in required)
-    told = f"{table.where}: found '{table.headless[:60]}', expected a header"
-    cure = f"write a first line such as '{example}'"
-    return Choice({}, [Question(told, Ask.UNIT, cure)], sources)
-
-
-class _Choosing:
-    """The columns of a table so far: `left` are cells that are none, `sources` what is offered."""
 
     def __init__(
         self, table: Table, required: Sequence[str], wanted: ColumnMap, problems: Problems
@@ -193,8 +141,27 @@ class _Choosing:
         self.table, self.required, self.wanted = table, required, wanted
         self.problems, self.fields = problems, dict[str, Field]()
         self.left, self.open, self.sources = list[Cell](), list[Question](), dict[str, Source]()
+        if table.headless and not wanted:
+            self._count()
+            return
+        self._take_own_names()
+        unclear = self._take_other_names()
+        self._ask(unclear, self._complain())
+        self.sources = {**wanted, **self.sources} if self.sources else {}
 
-    def take_own_names(self) -> None:
+    def _count(self) -> None:
+        """Say what can be said of a table without a header: its columns are counted."""
+        table, required = self.table, self.required
+        free = [k for k in range(len(table.header)) if not table.sizes or table.sizes[k] > 1]
+        time = next((k for k in free if rises(table, k)), None) if "time" in required else None
+        rest = iter(k for k in free if k != time)
+        places = {name: time if name == "time" else next(rest, None) for name in required}
+        self.sources = {n: usual_source(n, str(k + 1)) for n, k in places.items() if k is not None}
+        example = ",".join(COLUMNS[name].example for name in required)
+        told = f"{table.where}: found '{table.headless[:60]}', expected a header"
+        self.open.append(Question(told, ASK_UNIT, f"write a first line such as '{example}'"))
+
+    def _take_own_names(self) -> None:
         """Take the cells with the columns' own names and units, and those that were asked for."""
         table, wanted = self.table, self.wanted
         places = {_place(wanted[name].array, table): name for name in reversed(list(wanted))}
@@ -208,7 +175,7 @@ class _Choosing:
             second = name == "displacement_2" and first
             known = match is not None and name in COLUMNS
             if not known or (not asked and (bare or second or name in wanted)):
-                self.left.append(cell_of(last(text), table.labels[index], index))
+                self.left.append(_cell_of(last(text), table.labels[index], index))
             elif name in self.fields:
                 self.problems.add(
                     f"{table.where}, column {index + 1}: '{name}' stands twice in the header (first"
@@ -228,7 +195,7 @@ class _Choosing:
                     unit = self._agreed_unit(name, unit, f"{table.where}, {place}")
                 self.fields[name] = Field(index, unit or "")
 
-    def take_other_names(self) -> dict[str, list[Cell]]:
+    def _take_other_names(self) -> dict[str, list[Cell]]:
         """Take the cells with a laboratory's name for a column, or the unit that only one has.
 
         What has a column's own name misspelled is nothing else. Returns the cells that may be a
@@ -243,7 +210,7 @@ class _Choosing:
             if not may_be or not (is_sure or column in self.required):
                 continue
             cell = may_be[0]
-            if not is_sure and not (column == "time" and self._are_equal(may_be)):
+            if not is_sure and not (column == "time" and self._is_one_clock(may_be)):
                 unclear[column] = may_be
             else:
                 if cell.unit is not None and not measures(column, cell.unit):
@@ -254,7 +221,7 @@ class _Choosing:
         self.left = [cell for cell in self.left if cell not in taken]
         return unclear
 
-    def complain(self) -> list[str]:
+    def _complain(self) -> list[str]:
         """Complain of columns misspelled or not there; return the others that are missing."""
         for name, source in self.wanted.items():
             if _place(source.array, self.table) is None:
@@ -273,7 +240,7 @@ class _Choosing:
             )
         return [n for n in absent if n in self.required and n not in {*self.wanted, *near}]
 
-    def ask(self, unclear: Mapping[str, Sequence[Cell]], missing: Sequence[str]) -> None:
+    def _ask(self, unclear: Mapping[str, Sequence[Cell]], missing: Sequence[str]) -> None:
         """Ask for the columns that are unclear or missing, and suggest what they may be."""
         where, told = self.table.where, []
         in_header = not self.table.sizes
@@ -285,18 +252,21 @@ class _Choosing:
             )
             examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
             cure = f"write {examples} in the header" if in_header else ""
-            told.append(Question(f"{where}: {which}", Ask.UNIT, cure))
+            told.append(Question(f"{where}: {which}", ASK_UNIT, cure))
         listed = self._listed([name for name in self.fields if name not in unclear])
         for name in missing:
             cure = f"add it to the header as '{COLUMNS[name].example}'" if in_header else ""
             what = f"{where}: the column '{name}' is missing (found: {listed})"
-            told.append(Question(what, Ask.COLUMN, cure))
+            told.append(Question(what, ASK_COLUMN, cure))
         self.open = [*told, *self.open]
         chosen = self._suggested([*unclear, *missing])
         self.sources |= {name: cell.source(name) for name, cell in chosen.items()}
         length = chosen.get("displacement")
-        if length is not None and length.hint is None:
-            unit = _usual_length(self.table, length.index)
+        if length is not None and length.hint is None:  # a stroke that a stack may have
+            cells = as_numbers(self.table.glance[length.index])
+            finite = cells[np.isfinite(cells)]
+            span = float(np.ptp(finite)) if finite.size else 0.0
+            unit = "m" if 1e-9 <= span < 1e-3 else "nm" if span > 3e3 else "um"
             self.sources["displacement"] = Source(length.label, unit)
 
     def _suggested(self, columns: Collection[str]) -> Mapping[str, Cell]:
@@ -325,7 +295,7 @@ class _Choosing:
     def _ask_scale(self, column: str, unit: str, place: str, source: Source) -> None:
         """Ask what 1 in the file is, where the unit measures something else."""
         what, cure = mismatch(COLUMNS[column], unit)
-        self.open.append(Question(f"{self.table.where}, {place}: {what}", Ask.SCALE, cure))
+        self.open.append(Question(f"{self.table.where}, {place}: {what}", _ASK_SCALE, cure))
         self.sources[column] = source
 
     def _agreed_unit(self, name: str, own: str | None, where: str) -> str:
@@ -343,7 +313,7 @@ class _Choosing:
             )
         return unit or ""
 
-    def _are_equal(self, cells: Sequence[Cell]) -> bool:
+    def _is_one_clock(self, cells: Sequence[Cell]) -> bool:
         """Whether several clocks with units are the same one, as channels may have one each."""
         first, *others = cells
         glance = self.table.glance
@@ -358,6 +328,14 @@ class _Choosing:
         return ", ".join(filter(None, names))[:120] or "nothing"
 
 
+def _cell_of(text: str, label: str, index: int) -> Cell:
+    """Return the cell that a text is."""
+    name, unit, hint = understood(text), stated_unit(text), stated_unit(text, loosely=True)
+    is_near = hint is not None and parse_unit(hint).quantity in QUANTITIES.values()
+    column = None if name is None else name.column
+    return Cell(index, label, text, unit, hint if unit or is_near else None, column, words_of(text))
+
+
 def _decided(column: str, cells: Sequence[Cell], *, by_unit: bool) -> tuple[list[Cell], bool]:
     """Return the cells that may be a column, and whether the only one of them is it for sure.
 
@@ -366,7 +344,12 @@ def _decided(column: str, cells: Sequence[Cell], *, by_unit: bool) -> tuple[list
     it. A voltage that is called a command is a rival of one with another name.
     """
     named = [c for c in cells if c.column == column]
-    alike = [c for c in cells if by_unit and c.is_alike(column)]
+    quantity = QUANTITIES.get(column, "none") if by_unit else "none"
+    alike = [
+        c for c in cells
+        if c.column is None and c.unit is not None and c.speaks(column) >= 0
+        and parse_unit(c.unit).quantity == quantity
+    ]  # fmt: skip
     stating = [c for c in named if c.unit is not None]
     stating = [c for c in stating if measures(column, c.unit or "")] or stating
     commanded = [c for c in alike if column == "voltage" and c.words & _COMMANDED]
@@ -384,11 +367,8 @@ def rises(table: Table, index: int) -> bool:
     cells = table.glance[index]
     times = as_times(cells, "s")
     if times is None:
-        is_array = isinstance(cells, np.ndarray)
-        texts = [] if is_array else [str(cell) for cell in cells]
-        sign = decimal_sign(texts)
-        times = np.asarray(cells) if is_array else numbers_in(texts, sign, "s")[0]
-    if times.size < 2 or times.dtype.kind not in "biuf":
+        times = as_numbers(cells, "s")
+    if times.size < 2:
         return False
     steps = np.diff(times)
     if evened(times):
@@ -418,16 +398,6 @@ def _last(label: str) -> str:
     """Return the name of an array without that of its group and its number in a matrix."""
     name = re.split(r"\.(?=[^\W\d])", label)[-1]
     return re.sub(r"(?<=\w\w)\.\d+(?=$| \[)", "", name)
-
-
-def _usual_length(table: Table, index: int) -> str:
-    """Return the unit in which numbers are a stroke that a stack may have: 1 nm to 1 mm."""
-    cells = table.glance[index]
-    if not isinstance(cells, np.ndarray):
-        cells = numbers_in(cells, decimal_sign(cells), "")[0]
-    finite = cells[np.isfinite(cells)] if cells.dtype.kind in "biuf" else np.zeros(0)
-    span = float(np.ptp(finite)) if finite.size else 0.0
-    return "m" if 1e-9 <= span < 1e-3 else "nm" if span > 3e3 else "um"
 
 
 def _same_unit(one: str, other: str) -> bool:

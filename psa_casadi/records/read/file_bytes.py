@@ -47,9 +47,15 @@ def read_text(path: str | os.PathLike[str]) -> tuple[bytes, str]:
         InputError: it is larger than `MOST_BYTES`, or damaged.
     """
     with Path(path).open("rb") as stream:
-        data = _most(stream.read)
+        data = content = _most(stream.read)
     check_size(path, len(data), "holds")
-    content = unpacked(data, path)
+    if data.startswith(b"\x1f\x8b"):
+        try:
+            with gzip.GzipFile(fileobj=io.BytesIO(data)) as unpacked:
+                content = _most(unpacked.read)
+        except (OSError, EOFError, zlib.error) as error:
+            raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
+        check_size(path, len(content), "holds")
     lines = max(content.count(b"\n"), content.count(b"\r"))
     check_size(path, _LEAST_ON_A_LINE * lines, "its lines need")
     return content, hashlib.sha256(data).hexdigest()
@@ -75,25 +81,3 @@ def check_size(path: str | os.PathLike[str], size: int, what: str) -> None:
             f"{path}: {what} more than {MOST_BYTES / 2**30:.3g} GiB, the most that is read as one "
             f"record; leave out arrays that are not needed, or split the record."
         )
-
-
-def unpacked(data: bytes, path: str | os.PathLike[str]) -> bytes:
-    """Return the content of a gzipped file, of any other the data itself.
-
-    Raises:
-        InputError: the file is damaged, or its content is larger than `MOST_BYTES`.
-    """
-    if not data.startswith(b"\x1f\x8b"):
-        return data
-    try:
-        with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
-            content = _most(stream.read)
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
-    check_size(path, len(content), "holds")
-    return content
-
-
-def reason_of(error: Exception) -> str:
-    """Return what a library says of a damaged file, in one short line."""
-    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__

@@ -9,8 +9,9 @@ import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import date, datetime, time, timedelta
+from datetime import timedelta
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from psa_casadi.records.read.table import Cells, Columns, Table, unit_of_times
 from psa_casadi.records.read.text import text_tables
 
 #: The attributes and properties that state a unit, in lower case.
-UNITS = ("units", "unit", "unit_string")
+_UNITS = ("units", "unit", "unit_string")
 _BRACKETED = re.compile(r"(?P<name>.+?)\s*\[(?P<unit>[^\[\]]+)\]")
 
 
@@ -43,12 +44,22 @@ class Series:
     name: str
     size: int
     values: Callable[[], Cells]
-    unit: str | None = None
+    unit: object = None
 
-
-def unit_stated(unit: object) -> str | None:
-    """Return the unit that a file states beside an array, None where it is none."""
-    return unit_named(unit, common=False) if isinstance(unit, str) else None
+    @property
+    def text(self) -> str:
+        """The name with its unit: the stated one, or that of a name of its own."""
+        last = self.name.rpartition(".")[2]
+        own = last if re.match(r"\w*[^\W\d]", last) else self.name
+        unit = self.unit
+        if unit is None and not stated_unit(own):
+            name = understood(own)
+            values = self.values()[:9] if name and name.column == "time" and self.size > 1 else []
+            if isinstance(values, np.ndarray) and len(values):
+                is_instant = values.dtype.kind in "mM"
+                unit = "s" if is_instant else unit_of_times(values.astype(np.float64))
+            unit = unit or SI_UNITS.get(own.lower())
+        return f"{self.name} [{unit}]" if unit else self.name
 
 
 def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator[Series]:
@@ -62,16 +73,13 @@ def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator
         return
     if numbers.dtype.kind not in "biufmM":
         return
-    stated = unit_stated(unit)
     numbers = np.atleast_1d(np.squeeze(numbers)) if numbers.size else numbers.ravel()
     if numbers.ndim == 1:
-        yield Series(name or "1", numbers.size, lambda: numbers, stated)
+        yield Series(name or "1", numbers.size, lambda: numbers, unit)
     elif numbers.ndim == 2:
-        upright = numbers if numbers.shape[0] >= numbers.shape[1] else numbers.T
-        for k in range(upright.shape[1]):
-            column = upright[:, k]
-            own = f"{name}.{k + 1}" if name else f"{k + 1}"
-            yield Series(own, column.size, lambda c=column: c, stated)  # type: ignore[misc]
+        for k, column in enumerate(numbers.T if len(numbers) >= len(numbers.T) else numbers, 1):
+            own = f"{name}.{k}" if name else f"{k}"
+            yield Series(own, column.size, lambda c=column: c, unit)  # type: ignore[misc]
 
 
 def array_tables(
@@ -84,31 +92,15 @@ def array_tables(
 
     The first of a name counts. `stated` are lines such as "fs = 1000" that a file has beside them.
     """
-    series: dict[str, Series] = {}
+    named: dict[str, Series] = {}
     for one in found:
         match = _BRACKETED.fullmatch(one.name.strip())
         name = MARKS.sub("_", match["name"] if match else one.name.strip())
-        unit = one.unit or (match["unit"].strip() if match else None)
-        series.setdefault(name, replace(one, name=name, unit=unit))
-    scalars = {n.rpartition(".")[2]: s.values() for n, s in series.items() if s.size == 1}
-    step = stated_step([*stated, *statements(scalars)])
-    texts = {name: _text(one) for name, one in series.items()}
-    whole = _table(path, "", list(series.values()), texts, step, place)
-    groups: dict[str, list[Series]] = {}
-    for name, one in series.items():
-        group, _, last = name.rpartition(".")
-        groups.setdefault(last if last.isdecimal() else group, []).append(one)
-    shared = groups.get("", [])
-    several = {n: [*shared, *own] for n, own in groups.items() if n and len(own) > 1}
-    parts = [_table(path, name, own, texts, step, place) for name, own in several.items()]
-    return [whole, *(parts if len(parts) > 1 else [])]
-
-
-def _table(
-    path: str, name: str, series: Sequence[Series], texts: Mapping[str, str], step: float | None,
-    place: str,
-) -> Table:  # fmt: skip
-    """Return the table of some series; `texts` are their names with units."""
+        unit = unit_named(one.unit, common=False) if isinstance(one.unit, str) else None
+        unit = unit or (match["unit"].strip() if match else None)
+        named.setdefault(name, replace(one, name=name, unit=unit))
+    series, labels = list(named.values()), list(named)
+    scalars = {n.rpartition(".")[2]: s.values() for n, s in named.items() if s.size == 1}
 
     def load(asked: Sequence[int], most: int | None, _: Problems) -> Columns:
         check_size(path, 8 * sum(series[k].size for k in asked if most is None), "its columns hold")
@@ -116,30 +108,19 @@ def _table(
         longest = max(map(len, cells), default=0)
         return Columns(cells, np.arange(1, longest + 1))
 
-    numbered = all(one.name.isdecimal() for one in series) and bool(series)
-    kind = "column" if place == "row" else "array"
-    labels = [one.name for one in series]
-    return Table(
-        path=path, name=name, header=[texts[label] for label in labels], labels=labels,
-        where=f"{path}: {kind} names", place=place, load=load, step=step,
-        sizes=[one.size for one in series],
-        headless=", ".join(labels) if numbered else "",
+    whole = Table(
+        path=path, name="", header=[one.text for one in series], labels=labels,
+        where=f"{path}: {'column' if place == 'row' else 'array'} names", place=place, load=load,
+        step=stated_step([*stated, *statements(scalars)]), sizes=[one.size for one in series],
+        headless=", ".join(labels) if all(map(str.isdecimal, labels)) else "",
     )  # fmt: skip
-
-
-def _text(series: Series) -> str:
-    """Return the name of a series with its unit: the stated one, or that of a name of its own."""
-    last = series.name.rpartition(".")[2]
-    own = last if re.match(r"\w*[^\W\d]", last) else series.name
-    unit = series.unit
-    if unit is None and not stated_unit(own):
-        name = understood(own)
-        values = series.values()[:9] if name and name.column == "time" and series.size > 1 else []
-        if isinstance(values, np.ndarray) and len(values):
-            is_instant = values.dtype.kind in "mM"
-            unit = "s" if is_instant else unit_of_times(values.astype(np.float64))
-        unit = unit or SI_UNITS.get(own.lower())
-    return f"{series.name} [{unit}]" if unit else series.name
+    groups: dict[str, list[int]] = {}
+    for k, name in enumerate(labels):
+        group, _, last = name.rpartition(".")
+        groups.setdefault(last if last.isdecimal() else group, []).append(k)
+    shared = groups.pop("", [])
+    parts = [whole.part(n, [*shared, *own]) for n, own in groups.items() if len(own) > 1]
+    return [whole, *(parts if len(parts) > 1 else [])]
 
 
 def statements(attributes: Mapping[str, Any]) -> Iterator[str]:
@@ -148,6 +129,11 @@ def statements(attributes: Mapping[str, Any]) -> Iterator[str]:
         if np.size(value) == 1:
             name = "sample rate" if key.lower() == "rate" else key
             yield f"{name} = {np.asarray(value).reshape(-1)[0]}"
+
+
+def _unit_in(properties: Mapping[str, Any]) -> object:
+    """Return what properties state as the unit of an array, None without one."""
+    return next((value for key, value in properties.items() if key.lower() in _UNITS), None)
 
 
 def hdf5_tables(path: str) -> list[Table]:
@@ -170,7 +156,7 @@ def _of_dataset(path: str, item: Any) -> Iterator[Series]:
     import h5py  # noqa: PLC0415
 
     name = item.name.strip("/").replace("/", ".")
-    unit = next((u for k, u in _attributes(item).items() if k in UNITS), None)
+    unit = _unit_in(_attributes(item))
     place, size = item.name, max(item.shape or (0,))
 
     def read() -> Any:
@@ -178,12 +164,14 @@ def _of_dataset(path: str, item: Any) -> Iterator[Series]:
             found = file[place]
             return found.asstr()[()].ravel().tolist() if found.dtype.kind == "O" else found[()]
 
-    if item.shape and sum(n != 1 for n in item.shape) == 1 and item.dtype.kind in "biuf":
-        yield Series(name, size, lambda: np.ravel(read()), unit_stated(unit))
-    elif item.shape and item.dtype.kind in "biufV":
+    if not item.shape:
+        return
+    if sum(n != 1 for n in item.shape) == 1 and item.dtype.kind in "biuf":
+        yield Series(name, size, lambda: np.ravel(read()), unit)
+    elif item.dtype.kind in "biufV":
         check_size(path, item.size * item.dtype.itemsize, "its arrays hold")
         yield from series_in(name, read(), unit)
-    elif item.shape and h5py.check_string_dtype(item.dtype):
+    elif h5py.check_string_dtype(item.dtype):
         yield Series(name, size, read)
 
 
@@ -284,29 +272,24 @@ def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]]:
     Where there are several times, or signals of one name, they are counted.
     """
     found: list[tuple[str, Any, str | None]] = []
-    for axis in ("X", "Y"):
+    for axis, usual in (("X", "s"), ("Y", "")):
         own = _elements(value.get(axis))
         several = own if isinstance(own, list) else [own]
         data = [s.get("Data") if isinstance(s, Mapping) else None for s in several]
         if not all(isinstance(numbers, np.ndarray) for numbers in data):
             return []
-        texts, units = ([_text_of(s.get(key)) for s in several] for key in ("Name", "Unit"))
-        names = [name_without_unit(text) for text in texts]
-        if axis == "X":
-            names, usual = ["time"] * len(several), "s"
-        elif any(names):
-            usual = ""
-        else:
+        texts, units = (
+            [t.strip() if isinstance(t := s.get(key), str) else "" for s in several]
+            for key in ("Name", "Unit")
+        )
+        names = [name_without_unit(t) if axis == "Y" else "time" for t in texts]
+        if not any(names):
             return []
         if "" in names or len(set(names)) < len(names):
             names = [f"{axis}.{k}" for k in range(1, len(names) + 1)]
         for name, text, unit, numbers in zip(names, texts, units, data, strict=True):
             found.append((name, numbers, unit or stated_unit(text) or usual))
     return found
-
-
-def _text_of(value: object) -> str:
-    return value.strip() if isinstance(value, str) else ""
 
 
 def _modelica(path: str) -> Iterator[Series]:
@@ -347,10 +330,10 @@ def excel_tables(path: str) -> list[Table]:
     found = []
     for sheet in shown:
         rows = book.get_sheet_by_name(sheet.name).to_python(skip_empty_area=False)
-        lines = [
-            "\t".join(map(_cell_text, row)) if any(c != "" for c in row) else "" for row in rows
-        ]
-        found += text_tables(path, _without_empty(lines), "row", sheet.name)
+        cells = [list(map(_cell_text, row)) for row in rows]
+        kept = [k for k, column in enumerate(zip_longest(*cells)) if any(column)]
+        lines = ["\t".join(row[k] for k in kept) if any(row) else "" for row in cells]
+        found += text_tables(path, lines, "row", sheet.name)
     return found
 
 
@@ -358,19 +341,9 @@ def _cell_text(cell: object) -> str:
     """Return a cell as text without the marks that separate cells of a table."""
     if isinstance(cell, float | int) and not isinstance(cell, bool):
         return repr(float(cell))
-    if isinstance(cell, datetime | date | time):
-        return cell.isoformat(sep=" ") if isinstance(cell, datetime) else cell.isoformat()
     if isinstance(cell, timedelta):
         return f"{cell.total_seconds()!r} s"
     return " ".join(str(cell).translate(_MARKS).split())
-
-
-def _without_empty(lines: list[str]) -> list[str]:
-    """Return rows of tab-separated cells without the columns that are empty in all of them."""
-    width = max((line.count("\t") + 1 for line in lines), default=0)
-    rows = [line.split("\t") + [""] * (width - 1 - line.count("\t")) for line in lines]
-    kept = [k for k in range(width) if any(row[k] for row in rows)]
-    return ["\t".join(row[k] for k in kept) if any(row) else "" for row in rows]
 
 
 def tdms_tables(path: str) -> list[Table]:
@@ -392,13 +365,12 @@ def tdms_tables(path: str) -> list[Table]:
         if channel.dtype.kind not in "biufM":
             continue
         name = f"{channel.group_name}.{channel.name}" if several else channel.name
-        unit = next((u for k, u in channel.properties.items() if k.lower() in UNITS), None)
 
         def read(group: str = channel.group_name, own: str = channel.name) -> Cells:
             with nptdms.TdmsFile.open(path) as whole:
                 return np.asarray(whole[group][own][:])
 
-        found.append(Series(name, len(channel), read, unit_stated(unit)))
+        found.append(Series(name, len(channel), read, _unit_in(channel.properties)))
         stated += statements({k: v for k, v in channel.properties.items() if k == "wf_increment"})
     return array_tables(path, found, stated)
 
@@ -420,9 +392,8 @@ def parquet_tables(path: str) -> list[Table]:
 
     found = []
     for field in schema:
-        about = {k.decode().lower(): v.decode() for k, v in (field.metadata or {}).items()}
-        unit = next((u for k, u in about.items() if k in UNITS), None)
-        found.append(Series(field.name, rows, partial(read, field.name), unit))
+        about = {k.decode(): v.decode() for k, v in (field.metadata or {}).items()}
+        found.append(Series(field.name, rows, partial(read, field.name), _unit_in(about)))
     return array_tables(path, found, place="row")
 
 
@@ -439,11 +410,7 @@ def _arrow_cells(column: Any, rows: int) -> Cells:
         column = column.cast(pyarrow.duration(column.type.unit)).cast(pyarrow.duration("ns"))
     elif kinds.is_integer(column.type) and not column.null_count:
         pass
-    elif (
-        kinds.is_integer(column.type)
-        or kinds.is_floating(column.type)
-        or kinds.is_decimal(column.type)
-    ):
+    elif any(of(column.type) for of in (kinds.is_integer, kinds.is_floating, kinds.is_decimal)):
         column = column.cast(pyarrow.float64(), safe=False)
     else:
         return ["" if v is None else str(v) for v in column.to_pylist()]
@@ -483,15 +450,20 @@ def universal_tables(path: str) -> list[Table]:
     return array_tables(path, found, stated)
 
 
-#: What reads a file, by its ending, and the package that it needs.
-READERS: dict[str, tuple[Callable[[str], list[Table]], str]] = {
-    **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".xlsb", ".ods"), (excel_tables, "python_calamine")),
-    ".mat": (matlab_tables, "pymatreader"),
-    **dict.fromkeys((".h5", ".hdf5", ".hdf"), (hdf5_tables, "h5py")),
-    ".tdms": (tdms_tables, "nptdms"),
-    **dict.fromkeys((".npy", ".npz"), (numpy_tables, "numpy")),
-    **dict.fromkeys((".parquet", ".pq", ".feather", ".arrow"), (parquet_tables, "pyarrow")),
-    **dict.fromkeys((".uff", ".unv", ".uf", ".bunv"), (universal_tables, "pyuff")),
+#: What reads a file, by its ending, the package that it needs, and what messages call it.
+READERS: dict[str, tuple[Callable[[str], list[Table]], str, str]] = {
+    ending: (reader, package, kind)
+    for reader, package, kind, endings in (
+        (excel_tables, "python_calamine", "Excel", ".xlsx .xlsm .xls .xlsb .ods"),
+        (matlab_tables, "pymatreader", "MATLAB", ".mat"),
+        (hdf5_tables, "h5py", "HDF5", ".h5 .hdf5 .hdf"),
+        (tdms_tables, "nptdms", "TDMS", ".tdms"),
+        (numpy_tables, "numpy", "NumPy", ".npy .npz"),
+        (parquet_tables, "pyarrow", "Parquet", ".parquet .pq"),
+        (parquet_tables, "pyarrow", "Feather", ".feather .arrow"),
+        (universal_tables, "pyuff", "universal", ".uff .unv .uf .bunv"),
+    )
+    for ending in endings.split()
 }
 #: Files whose makers' programs write something that is read, by their ending.
 EXPORTS = {

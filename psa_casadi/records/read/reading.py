@@ -10,6 +10,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -39,9 +40,8 @@ from psa_casadi.records.read.table import (
     Cells,
     Columns,
     Table,
-    decimal_sign,
+    as_numbers,
     is_stamp,
-    numbers_in,
     seconds_of,
 )
 from psa_casadi.records.read.text import label_of
@@ -92,14 +92,12 @@ def joined(
         found.append(Series(label, kept.size, partial(np.asarray, kept), unit))
     together = "+".join(path for path, *_ in files)
     outcome = samples_of(together, array_tables(together, found)[:1], request)
-    if outcome.samples is not None:
-        notes = [f"the channels of {len(files)} files are one record."]
-        if resampled:
-            notes.append(
-                f"{', '.join(resampled)} has another clock: it is interpolated at the instants of"
-                f" {Path(files[0][0]).name}."
-            )
-        outcome.samples = replace(outcome.samples, notes=(*outcome.samples.notes, *notes))
+    outcome.notes += (f"the channels of {len(files)} files are one record.",)
+    if resampled:
+        outcome.notes += (
+            f"{', '.join(resampled)} has another clock: it is interpolated at the instants of"
+            f" {Path(files[0][0]).name}.",
+        )
     digest = hashlib.sha256("".join(sha for *_, sha in files).encode()).hexdigest()
     return outcome, digest
 
@@ -117,7 +115,7 @@ def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
     if any(are_stamps):
         named = ", ".join(path for path, *_ in times)
         raise InputError(f"{named}: some have dates or clock times, others numbers; give all one.")
-    return [to_si(_numbers(cells), unit) for _, cells, unit in times]
+    return [to_si(as_numbers(cells), unit) for _, cells, unit in times]
 
 
 def _channels(
@@ -132,19 +130,12 @@ def _channels(
     columns = table.load(range(len(table.header)), None, problems)
     problems.raise_if_any()
     units = [stated_unit(text) for text in table.header]
-    numbers = {k: _numbers(cells) for k, cells in enumerate(columns.cells) if k != at}
-    own = [
-        (table.labels[k], units[k], values)
-        for k, values in numbers.items()
-        if np.isfinite(values).any()
+    rows = zip(table.labels, units, columns.cells, strict=True)
+    channels = [
+        (label, unit, as_numbers(own)) for k, (label, unit, own) in enumerate(rows) if k != at
     ]
-    return columns.cells[at], units[at] or "s", own
-
-
-def _numbers(cells: Cells) -> FloatArray:
-    if isinstance(cells, np.ndarray):
-        return cells.astype(np.float64)
-    return numbers_in(cells, decimal_sign(cells), "")[0]
+    channels = [channel for channel in channels if np.isfinite(channel[-1]).any()]
+    return columns.cells[at], units[at] or "s", channels
 
 
 _NAME = re.compile(r"[a-z]\w*(?:\.\w+)* \[(?P<unit>[^\[\]]+)\]", re.IGNORECASE)
@@ -171,31 +162,22 @@ def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, Ar
         problems.add(f"{path}: there are no columns to write; give at least one.")
     shape = next(iter(arrays.values())).shape if arrays else (0,)
     for name, array in arrays.items():
-        _check_name(name, problems)
+        match = _NAME.fullmatch(name)
+        if match is None:
+            problems.add(f"the column name '{name}' is not of the form 'name [unit]'; correct it.")
+        else:
+            try:
+                parse_unit(match["unit"])
+            except InputError as error:
+                problems.add(f"column '{name}': {error}")
         if array.ndim != 1 or array.shape != shape:
             problems.add(
                 f"column '{name}' has shape {array.shape}, the first has {shape}; give every "
                 f"column one value for each instant."
             )
     problems.raise_if_any()
-    cells = [map(_cell, array.tolist()) for array in arrays.values()]
-    lines = [",".join(arrays), *map(",".join, zip(*cells, strict=True)), ""]
-    atomic_write(path, "\n".join(lines))
-
-
-def _check_name(name: str, problems: Problems) -> None:
-    match = _NAME.fullmatch(name)
-    if match is None:
-        problems.add(f"the column name '{name}' is not of the form 'name [unit]'; correct it.")
-        return
-    try:
-        parse_unit(match["unit"])
-    except InputError as error:
-        problems.add(f"column '{name}': {error}")
-
-
-def _cell(value: float) -> str:
-    return "" if math.isnan(value) else repr(value)
+    cells = [["" if math.isnan(v) else repr(v) for v in own.tolist()] for own in arrays.values()]
+    atomic_write(path, "\n".join([",".join(arrays), *map(",".join, zip(*cells, strict=True)), ""]))
 
 
 AnyPath = str | os.PathLike[str]
@@ -278,15 +260,20 @@ def read_records(
             excitation=need_excitation,
         )  # fmt: skip
         try:
-            each = _each(path, request) if request.table == ALL else (request,)
-            records += [_record(path, *_read(path, one), table=one.table) for one in each]
+            each = [request.table]
+            if request.table == ALL:
+                each = [*_read(path, replace(request, table=""))[0].tables] or [""]
+            for table in each:
+                found = _read(path, replace(request, table=table))
+                records.append(_record(path, *found, table=table))
         except InputError as error:
             failed += 1
             problems.extend(error.problems)
-    if failed == len(places) > 1 and (
-        pair := _joined(places, wanted, sample_time, need_excitation)
-    ):
-        return pair
+    if failed == len(places) > 1:  # they may hold a channel each
+        request = _request(wanted, "", sample_time, displacement=True, excitation=need_excitation)
+        with suppress(InputError):
+            pair = joined([(p, *apart.text_of(p)) for p in places], request, alone=True)
+            return (_record("+".join(places), *pair),)
     if not places:
         problems.append("no record was named; name at least one CSV file.")
     if problems:
@@ -312,29 +299,20 @@ def record_from(
         InputError: every mistake found, one sentence each.
     """
     request = _request(columns, name, sample_time, displacement=need_displacement)
-    held = _table_of(table, name)
-    outcome = samples_of(name, [held], request)
-    digest = hashlib.sha256()
-    if outcome.samples is not None:
-        for (column, unit), values in zip(
-            outcome.samples.units.items(), outcome.samples.values.T, strict=True
-        ):
-            digest.update(f"{column} [{unit}]".encode() + np.ascontiguousarray(values).tobytes())
-    return _record(name, outcome, digest.hexdigest(), source="")
-
-
-def _table_of(table: TableLike, name: str) -> Table:
-    """Return a table in memory as the tables of files are."""
     own = list(table if isinstance(table, Mapping) else table.columns)
 
     def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
-        cells = [_cells(name, own[k], table[own[k]], problems) for k in asked]
-        longest = max(map(len, cells), default=0)
-        return Columns([c[:most] for c in cells], np.arange(1, longest + 1))
+        cells = [_cells(name, own[k], table[own[k]], problems)[:most] for k in asked]
+        return Columns(cells, np.arange(1, 1 + max(map(len, cells), default=0)))
 
     header = [str(text) for text in own]
     labels = [label_of(text) for text in header]
-    return Table(name, "", header, labels, f"{name}: column names", "row", load)
+    held = Table(name, "", header, labels, f"{name}: column names", "row", load)
+    outcome = samples_of(name, [held], request)
+    digest = hashlib.sha256()
+    for (column, unit), values in zip(outcome.units.items(), outcome.values.T, strict=True):
+        digest.update(f"{column} [{unit}]".encode() + np.ascontiguousarray(values).tobytes())
+    return _record(name, outcome, digest.hexdigest(), source="")
 
 
 def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
@@ -378,34 +356,14 @@ def _read(path: str, request: Request) -> tuple[Outcome, str]:
     return joined([(part, *apart.text_of(part)) for part in parts], request)
 
 
-def _each(path: str, request: Request) -> Sequence[Request]:
-    """Return the requests for each table of a file, one where it holds one."""
-    whole = replace(request, table="")
-    outcome, _ = _read(path, whole)
-    return [replace(request, table=key) for key in outcome.tables] or [whole]
-
-
-def _joined(
-    paths: Sequence[str], wanted: ColumnMap | None, sample_time: float | None, excitation: bool
-) -> tuple[Record, ...]:
-    """Return the record of files of one channel each, none where they are not such files."""
-    request = _request(wanted, "", sample_time, displacement=True, excitation=excitation)
-    try:
-        outcome, digest = joined(
-            [(path, *apart.text_of(path)) for path in paths], request, alone=True
-        )
-    except InputError:
-        return ()
-    return (_record("+".join(paths), outcome, digest),)
-
-
 def records_given(given: Records) -> tuple[Record, ...]:
     """Return what was given as records: one or several records, paths of files, tables.
 
     Raises:
         InputError: the mistakes of all of them together.
     """
-    several = [given] if _is_one(given) else list(cast("Iterable[OneRecord]", given))
+    is_one = isinstance(given, Record | str | os.PathLike) or _is_table(given)
+    several = [given] if is_one else list(cast("Iterable[OneRecord]", given))
     found: list[Record] = []
     problems: list[str] = []
     for k, one in enumerate(several, 1):
@@ -415,9 +373,8 @@ def records_given(given: Records) -> tuple[Record, ...]:
             elif isinstance(one, str | os.PathLike):
                 found.append(read_record(one))
             elif _is_table(one):
-                found.append(
-                    record_from(one, name="record" if len(several) == 1 else f"record {k}")
-                )
+                name = f"record {k}" if several[1:] else "record"
+                found.append(record_from(one, name=name))
             else:
                 problems.append(
                     f"{type(one).__name__} is no record; give a Record, the path of a file, a data"
@@ -430,10 +387,6 @@ def records_given(given: Records) -> tuple[Record, ...]:
     return tuple(found)
 
 
-def _is_one(given: Records) -> TypeGuard[OneRecord]:
-    return isinstance(given, Record | str | os.PathLike) or _is_table(given)
-
-
 def _is_table(given: object) -> TypeGuard[TableLike]:
     return isinstance(given, Mapping) or hasattr(given, "columns")
 
@@ -443,12 +396,11 @@ def _record(
 ) -> Record:
     """Return the record in SI units; one of several is named and hashed with its table."""
     outcome.problems.raise_if_any()
-    samples = outcome.samples
-    if samples is None:
+    if not outcome.units:
         raise InputError(f"{path}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
     columns = {
-        name: to_si(samples.values[:, k], unit)
-        for k, (name, unit) in enumerate(samples.units.items())
+        name: to_si(values, unit)
+        for (name, unit), values in zip(outcome.units.items(), outcome.values.T, strict=True)
     }
     for array in columns.values():
         array.flags.writeable = False  # a record need not copy it
@@ -457,7 +409,7 @@ def _record(
             f"{path}: instants are the same in seconds; give the time from the start of"
             " the record, in a unit in which neighbours differ by more than the last digit."
         )
-    in_counts = "displacement" in columns and parse_unit(samples.units["displacement"]).counts
+    in_counts = "displacement" in columns and parse_unit(outcome.units["displacement"]).counts
     stem = "+".join(Path(part).stem for part in parts_of(path)) if source is None else path
     return Record(
         name=plain(f"{stem}_{table}" if table else stem),
@@ -465,5 +417,5 @@ def _record(
         sha256=hashlib.sha256(f"{digest} {table}".encode()).hexdigest() if table else digest,
         source=path if source is None else source,
         displacement_unit="counts" if in_counts else "m",
-        notes=tuple(f"{path}: {note}" for note in samples.notes),
+        notes=tuple(f"{path}: {note}" for note in outcome.notes),
     )

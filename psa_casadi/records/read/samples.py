@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.choose import Ask, Choice, Question, choose
+from psa_casadi.records.read.choose import ASK_UNIT, Choice, Question
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.table import (
@@ -68,36 +68,27 @@ class Request:
         return tuple(name for name, is_needed in needed.items() if is_needed)
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """The columns of one record in the units of the file, checked; nan where there is no reading.
-
-    `units` names the columns in the order of `values`, shape (rows, columns). `notes` are sentences
-    on what was taken for what.
-    """
-
-    units: Mapping[str, str]
-    values: FloatArray
-    notes: Sequence[str] = ()
-
-
 @dataclass
 class Outcome:
-    """The samples, or what is wrong.
+    """The columns of one record in the units of the file, checked, or what is wrong.
 
+    `units` names the columns in the order of `values`, shape (rows, columns), nan where there is no
+    reading; there are none where nothing is read. `notes` are sentences on what was taken for what.
     `tables` are the choices where there are several records, `offer` the columns and the sample
     time [s] with which the file is read.
     """
 
-    samples: Samples | None = None
     problems: Problems = field(default_factory=Problems)
-    tables: Sequence[str] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    values: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    notes: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ()
     offer: tuple[ColumnMap, float | None] | None = None
 
     @property
     def is_read(self) -> bool:
         """Whether there are samples and nothing is wrong."""
-        return self.samples is not None and not self.problems
+        return bool(self.units) and not self.problems
 
 
 def samples_of(path: str, tables: Sequence[Table], request: Request) -> Outcome:
@@ -130,11 +121,9 @@ def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
     """Return the samples of the only record among several tables, or list those that can be one."""
     read = [key for key, outcome in found.items() if outcome.is_read]
     if len(read) == 1:
-        outcome = found[read[0]]
-        if outcome.samples is not None:
-            note = f"of {len(found)} tables '{read[0]}' is read, the only one that is a record."
-            outcome.samples = replace(outcome.samples, notes=(*outcome.samples.notes, note))
-        return outcome
+        note = f"of {len(found)} tables '{read[0]}' is read, the only one that is a record."
+        found[read[0]].notes += (note,)
+        return found[read[0]]
     some = read or [key for key, outcome in found.items() if outcome.offer] or list(found)
     if len(some) == 1:
         return found[some[0]]
@@ -146,7 +135,7 @@ def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
         f" them, such as {ready_line(*(found[some[0]].offer or ({}, None)), some[0])}"
         f"{f', or each as a record: {ready_line({}, None, ALL)}' if read else ''}."
     )
-    return Outcome(None, problems, tuple(some))
+    return Outcome(problems, tables=tuple(some))
 
 
 def _of_one(table: Table, request: Request, segment: str) -> Outcome:
@@ -173,15 +162,16 @@ def _offer(
     table: Table, request: Request, choice: Choice, segment: str
 ) -> tuple[tuple[ColumnMap, float | None] | None, str]:
     """Return the first options with which the table is read, and the part of it that they take."""
+    given = request.sample_time
     without = {name: source for name, source in choice.sources.items() if name != "time"}
-    trials = [(choice.sources, None), (without, _EXAMPLE_STEP)] if choice.sources else []
-    if request.sample_time is None:
+    trials: list[tuple[ColumnMap, float | None]] = []
+    if choice.sources:
+        trials = [(choice.sources, given), (without, given or _EXAMPLE_STEP)]
+    if given is None:
         trials.append((request.columns, _EXAMPLE_STEP))
-    for sources, own in trials:
-        step = request.sample_time if own is None else request.sample_time or own
+    for sources, step in trials:
         trial = replace(request, columns=sources, sample_time=step)
-        shown = sources if sources != request.columns else {}
-        offer = (shown, None if request.sample_time is not None else step)
+        offer = (sources if sources != request.columns else {}, step if given is None else None)
         found = _Try(table, trial, segment)
         if found.open:
             continue
@@ -197,22 +187,22 @@ class _Try:
 
     def __init__(self, table: Table, request: Request, segment: str) -> None:
         self.table, self.segment, self.notes = table, segment, list[str]()
-        self.problems, self.outcome = Problems(), Outcome()
-        self.choice = choose(table, request.required, request.columns, self.problems)
+        self.outcome, self.problems = Outcome(), Problems()
+        self.choice = Choice(table, request.required, request.columns, self.problems)
         if table.step and "time" not in self.choice.fields and request.sample_time is None:
             step = table.step
             self.notes.append(
                 f"the time is that of the sample time that the file states, {step:g} s."
             )
             request, self.problems = replace(request, sample_time=step), Problems()
-            self.choice = choose(table, request.required, request.columns, self.problems)
-        self.request, self.open = request, list(self.choice.open)
-        self.outcome = Outcome(None, self.problems)
+            self.choice = Choice(table, request.required, request.columns, self.problems)
+        self.request, self.open = request, self.choice.open
         if self.choice.fields:
-            self.outcome.samples = self._converted(dict(self.choice.fields))
+            self._convert(dict(self.choice.fields))
+        self.outcome.problems = self.problems
 
-    def _converted(self, fields: dict[str, Field]) -> Samples | None:
-        """Return the samples of chosen columns, checked; None where they make no record."""
+    def _convert(self, fields: dict[str, Field]) -> None:
+        """Take the samples of chosen columns, checked, where they make a record."""
         table, request = self.table, self.request
         step = request.sample_time
         if step is not None and fields.pop("time", None) is not None:
@@ -221,7 +211,7 @@ class _Try:
             )
         columns = table.load([f.index for f in fields.values()], None, self.problems)
         if self._lengths_differ(fields, columns):
-            return None
+            return
         texts = [cells for cells in columns.cells if not isinstance(cells, np.ndarray)]
         point = decimal_sign(c for row in zip(*texts, strict=False) for c in row)
         found = {
@@ -235,16 +225,15 @@ class _Try:
         elif "time" in found:
             part = self._timed(found)
             if part is None:
-                return None
+                return
             found = {n: c.part(part) for n, c in found.items()}
         check_size(table.path, 8 * len(columns.lines) * len(found), "its columns hold")
         self._check(found)
-        scales = [request.columns[n].scale if n in request.columns else None for n in found]
-        values = np.column_stack([
-            c.values if scale is None else c.values * scale
-            for c, scale in zip(found.values(), scales, strict=True)
-        ])  # fmt: skip
-        return Samples(units, values, tuple(self.notes))
+        scales = {n: source.scale for n, source in request.columns.items() if source.scale}
+        self.outcome.values = np.column_stack(
+            [c.values * scales[n] if n in scales else c.values for n, c in found.items()]
+        )
+        self.outcome.units, self.outcome.notes = units, tuple(self.notes)
 
     def _even_time(self, step: float, lines: NDArray[np.int64]) -> Located:
         if not 0.0 < step < 1e9:
@@ -311,9 +300,18 @@ class _Try:
             numbers = [str(k) for k in range(1, len(starts) + 1)]
             if self.segment not in numbers:
                 keys = [f"{table.name}.{k}".strip(".") for k in numbers]
-                self._tell_segments(
-                    keys, [(lines[a], lines[b - 1]) for a, b in zip(starts, ends, strict=True)]
+                listed = ", ".join(
+                    f"{key} ({table.place}s {lines[a]} to {lines[b - 1]})"
+                    for key, a, b in list(zip(keys, starts, ends, strict=True))[:MOST_NAMED]
                 )
+                self.outcome.tables = tuple(keys)
+                if not self.open:  # which is asked first, as of no part
+                    self.problems.add(
+                        f"{table.path}: the time begins anew {len(keys) - 1} times, so it holds"
+                        f" {len(keys)} records: {listed}; take one of them, such as"
+                        f" {ready_line({}, None, keys[0])}, or each as a record:"
+                        f" {ready_line({}, None, ALL)}."
+                    )
                 return None
             k = int(self.segment) - 1
             part = slice(int(starts[k]), ends[k])
@@ -323,7 +321,7 @@ class _Try:
                     f"{table.path}: the time begins anew every {sizes[0]} {table.place}s: these"
                     " packets have no time of their own"
                 )
-                self.open.append(Question(told, Ask.UNIT))
+                self.open.append(Question(told, ASK_UNIT))
                 return None
         elif self.segment not in ("", "1"):
             raise InputError(f"{table.path}: there is no table '{self.segment}'; it holds one.")
@@ -338,23 +336,6 @@ class _Try:
                 f" steps of {even[1]:.6g} of its unit."
             )
         return part
-
-    def _tell_segments(
-        self, keys: Sequence[str], ends: Sequence[tuple[np.int64, np.int64]]
-    ) -> None:
-        """Name the parts of a time that begins anew; what is open is asked first, as of no part."""
-        self.outcome.tables = tuple(keys)
-        if self.open:
-            return
-        listed = ", ".join(
-            f"{key} ({self.table.place}s {first} to {last})"
-            for key, (first, last) in list(zip(keys, ends, strict=True))[:MOST_NAMED]
-        )
-        self.problems.add(
-            f"{self.table.path}: the time begins anew {len(keys) - 1} times, so it holds"
-            f" {len(keys)} records: {listed}; take one of them, such as"
-            f" {ready_line({}, None, keys[0])}, or each as a record: {ready_line({}, None, ALL)}."
-        )
 
     def _lengths_differ(self, fields: Mapping[str, Field], columns: Columns) -> bool:
         sizes = [len(cells) for cells in columns.cells]

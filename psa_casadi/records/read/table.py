@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from decimal import Decimal
 from fractions import Fraction
@@ -66,6 +66,16 @@ class Table:
         """The first rows of all columns."""
         found = self.load(range(len(self.header)), GLANCE, Problems())
         return [cells[:GLANCE] for cells in found.cells]
+
+    def part(self, name: str, columns: Sequence[int]) -> "Table":
+        """Return the table of some of the columns."""
+
+        def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
+            return self.load([columns[k] for k in asked], most, problems)
+
+        header, labels = ([own[k] for k in columns] for own in (self.header, self.labels))
+        sizes = [self.sizes[k] for k in columns] if self.sizes else ()
+        return replace(self, name=name, header=header, labels=labels, sizes=sizes, load=load)
 
 
 def parts_of_file(tables: Sequence[Table]) -> dict[str, Table]:
@@ -159,6 +169,13 @@ def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray,
     return without_overload(numbers), np.array([v is None for v in found], dtype=np.bool_)
 
 
+def as_numbers(cells: Cells, unit: str = "") -> FloatArray:
+    """Return the numbers in cells (n,) in a unit, nan where there is none."""
+    if isinstance(cells, np.ndarray):
+        return cells.astype(np.float64)
+    return numbers_in(cells, decimal_sign(cells), unit)[0]
+
+
 def _number(cell: str, point: str, unit: str) -> float | None:
     """Return the number of a cell, nan where it says that there is none, else None."""
     text = _FORTRAN.sub("e", cell.strip())
@@ -173,18 +190,15 @@ def _number(cell: str, point: str, unit: str) -> float | None:
         match = _WITH_UNIT.fullmatch(text)
     own = unit_named(match["unit"], common=False) if match else None
     value = _number(match["number"], point, unit) if match and own else None
-    return None if value is None or own is None else _in_unit(value, own, unit)
-
-
-def _in_unit(value: float, own: str, unit: str) -> float | None:
-    """Return a cell's number in the unit of its column."""
+    if value is None or own is None:
+        return None
     try:
         one, other = parse_unit(own), parse_unit(unit)
     except InputError:
         return None
-    if one.dimension != other.dimension:
-        return None
-    return value if one == other else value * float(one.ratio / other.ratio)
+    if one == other:
+        return value
+    return value * float(one.ratio / other.ratio) if one.dimension == other.dimension else None
 
 
 _DAY = 86400.0
@@ -235,7 +249,8 @@ def seconds_of(cells: Sequence[str]) -> FloatArray | None:
     if not found or any(m is None or (m["h"] is None and m["a"] is None) for m in found):
         return None
     stamps = [m for m in found if m is not None]
-    clock = _since_first([_clock(m) for m in stamps])
+    exact = [_clock(m) for m in stamps]
+    clock = np.array([float(t - exact[0]) for t in exact])
     if stamps[0]["a"] is None:
         back = np.diff(clock, prepend=clock[0])
         return clock + _DAY * np.cumsum((back < -0.5 * _DAY).astype(float))
@@ -257,10 +272,6 @@ def _clock(stamp: re.Match[str]) -> Fraction:
     return 3600 * h + 60 * (m - shift) + s + Fraction(int(digits), 10 ** len(digits))
 
 
-def _since_first(times: Sequence[Fraction]) -> FloatArray:
-    return np.array([float(t - times[0]) for t in times])
-
-
 def _days(stamps: Sequence[re.Match[str]], *, day_first: bool) -> FloatArray | None:
     """Return the days from the first date, None where there is no such date."""
     known: dict[tuple[str, str, str], int] = {}
@@ -269,12 +280,11 @@ def _days(stamps: Sequence[re.Match[str]], *, day_first: bool) -> FloatArray | N
             a, b, c = key
             month = None if b.isdecimal() else _MONTHS[b[:3].lower()]
             if len(a) == 4:
-                year, middle, last = int(a), month or int(b), int(c)
-                known[key] = date(year, middle, last).toordinal()
+                year, middle, day = int(a), month or int(b), int(c)
             else:
                 year = int(c) + 2000 * (len(c) < 3)
                 day, middle = (int(a), month or int(b)) if day_first or month else (int(b), int(a))
-                known[key] = date(year, middle, day).toordinal()
+            known[key] = date(year, middle, day).toordinal()
     except (ValueError, KeyError):
         return None
     days = np.array([float(known[m["a"], m["b"], m["c"]]) for m in stamps])
@@ -288,7 +298,14 @@ def as_times(cells: Cells, unit: str) -> FloatArray | None:
     """
     if not isinstance(cells, np.ndarray):
         stamps = seconds_of(cells)
-        return _large(cells) if stamps is None else stamps / float(to_si(1.0, unit))
+        if stamps is not None:
+            return stamps / float(to_si(1.0, unit))
+        texts = [c.strip().strip('"').replace(",", ".") for c in cells]
+        with suppress(ValueError, ArithmeticError):
+            if texts and abs(float(texts[0])) > _LARGE:
+                exact = [Decimal(text) for text in texts]
+                return np.array([float(one - exact[0]) for one in exact])
+        return None
     if cells.dtype.kind in "mM":
         since = (cells - cells[:1]).astype("timedelta64[ns]").astype(np.int64)
         return np.asarray(since / 1e9 / float(to_si(1.0, unit)))
@@ -297,17 +314,6 @@ def as_times(cells: Cells, unit: str) -> FloatArray | None:
     ):
         return np.asarray((cells - cells[:1]).astype(np.float64))
     return None
-
-
-def _large(cells: Sequence[str]) -> FloatArray | None:
-    texts = [c.strip().strip('"').replace(",", ".") for c in cells]
-    try:
-        if not texts or abs(float(texts[0])) <= _LARGE:
-            return None
-        exact = [Decimal(text) for text in texts]
-        return np.array([float(one - exact[0]) for one in exact])
-    except (ValueError, ArithmeticError):
-        return None
 
 
 def evened(time: FloatArray) -> tuple[FloatArray, float] | None:

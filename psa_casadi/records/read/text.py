@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +85,10 @@ def _with_header(lines: Sequence[str], place: int, mark: str) -> Layout:
         if _numbers(line, mark):  # below remarks, as Origin has them under its units
             below += k
             break
-        if not _is_remark(line, delimiter):
+        cells = [c for c in cells_of(line, delimiter) if c.strip()]
+        if not cells or any(
+            is_number(c) or is_stamp(c) or is_missing(c) or unit_in([c]) for c in cells
+        ):
             break
     while len(header) > 1 and not header[-1].strip():
         header.pop()
@@ -114,27 +118,6 @@ def further_layouts(lines: Sequence[str], mark: str, first: Layout) -> Iterator[
             if found.delimiter == first.delimiter:
                 begin = found.first
                 yield found
-
-
-def end_of_rows(lines: Sequence[str], layout: Layout, end: int) -> int:
-    """Return where the rows of a table end: above the preamble of the next one."""
-    if end == len(lines):
-        return end
-    while end > layout.first and not (
-        (cells := cells_of(lines[end - 1], layout.delimiter))
-        and len(cells) >= len(layout.header)
-        and (is_number(cells[0]) or is_stamp(cells[0]))
-    ):
-        end -= 1
-    return end
-
-
-def _is_remark(line: str, delimiter: str) -> bool:
-    """Whether a line below a header holds words and no number."""
-    cells = [c for c in cells_of(line, delimiter) if c.strip()]
-    return bool(cells) and not any(
-        is_number(c) or is_stamp(c) or is_missing(c) or unit_in([c]) for c in cells
-    )
 
 
 def cells_of(line: str, delimiter: str, *, spaced: bool = False) -> list[str]:
@@ -199,22 +182,15 @@ def _named(
     """
     for k in places:
         line = lines[k].lstrip("#% ")
-        for delimiter in [mark] if mark else dict.fromkeys((delimiter_of(line), " ")):
-            known = columns_known(cells_of(line, delimiter))
-            if known >= 2 and (
-                not (sure or lines[k].startswith(("#", "%"))) or _follow(lines, k, mark)
-            ):
-                return k
+        marks = [mark] if mark else dict.fromkeys((delimiter_of(line), " "))
+        if all(columns_known(cells_of(line, delimiter)) < 2 for delimiter in marks):
+            continue
+        below = [b for b in lines[k + 1 : k + 4] if b.strip()]
+        if not (sure or lines[k].startswith(("#", "%"))) or any(
+            is_number(cells_of(b, mark or delimiter_of(b))[0]) for b in below
+        ):
+            return k
     return None
-
-
-def _follow(lines: Sequence[str], k: int, mark: str) -> bool:
-    """Whether a line that begins with a number comes within three lines of line k."""
-    return any(
-        is_number(cells_of(line, mark or delimiter_of(line))[0])
-        for line in lines[k + 1 : k + 4]
-        if line.strip()
-    )
 
 
 #: The most lines below a table that are told as no samples: sums, means, an end mark.
@@ -250,13 +226,19 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
         return [replace(first, path=path, where=f"{path}: {place} 1", name=name)]
     found = [first, *further_layouts(lines, mark, first)]
     ends = [*(layout.header_line for layout in found[1:]), len(lines)]
-    parts = [
-        _Part(path, place, layout, lines[layout.first : end_of_rows(lines, layout, end)])
-        for layout, end in zip(found, ends, strict=True)
-        if len(found) == 1 or end - layout.first >= FEWEST_SAMPLES
-    ]
     step = step or stated_step(lines[: first.first])
-    tables = [side for part in parts for side in _side_by_side(part.table(name, step))]
+    tables: list[Table] = []
+    for layout, stop in zip(found, ends, strict=True):
+        end = stop
+        if len(found) > 1 and stop - layout.first < FEWEST_SAMPLES:
+            continue
+        while layout.first < end < len(lines):  # above the preamble of the next one
+            cells = cells_of(lines[end - 1], layout.delimiter)
+            if len(cells) >= len(layout.header) and (is_number(cells[0]) or is_stamp(cells[0])):
+                break
+            end -= 1
+        part = _Part(path, place, layout, lines[layout.first : end])
+        tables += _side_by_side(part.table(name, step))
     if len(tables) == 1:
         return tables
     return [replace(t, name=f"{name}.{k}" if name else "") for k, t in enumerate(tables, 1)]
@@ -267,26 +249,12 @@ def _side_by_side(table: Table) -> list[Table]:
     header = list(table.header)
     first = next((text for text in header if text.strip()), None)
     starts = [k for k, text in enumerate(header) if text == first]
-    ends = [*starts[1:], len(header)] if starts else []
-    widths = {len([t for t in header[a:b] if t.strip()]) for a, b in zip(starts, ends, strict=True)}
-    if (
-        len(starts) < 2
-        or len(set(header)) == 1
-        or table.headless
-        or len(widths) > 1
-        or widths == {1}
-    ):
+    parts = [range(a, b) for a, b in pairwise([*starts, len(header)])]
+    widths = {len([k for k in part if header[k].strip()]) for part in parts}
+    is_one = len(starts) < 2 or len(set(header)) == 1 or len(widths) > 1 or widths == {1}
+    if is_one or table.headless:
         return [table]
-
-    def part(first: int, end: int) -> Table:
-        def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
-            return table.load([first + k for k in asked], most, problems)
-
-        return replace(
-            table, header=header[first:end], labels=list(table.labels)[first:end], load=load
-        )
-
-    return [part(a, b) for a, b in zip(starts, ends, strict=True)]
+    return [table.part(table.name, part) for part in parts]
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +302,13 @@ class _Part:
             if (spare > 0 and any(c.strip() for c in cells[width:])) or (
                 spare < 0 and len(cells) <= max(asked, default=0)
             ):
-                problems.add(self._wrong_count(line, cells, width))
+                hint = f"complete or remove the {self.place}"
+                if self.layout.delimiter == "," and len(cells) == 2 * width:
+                    hint = "where numbers have decimal commas, separate the cells by semicolons"
+                problems.add(
+                    f"{self.path}: {self.place} {line}: found {len(cells)} cells, expected"
+                    f" {width} as in the header; {hint}."
+                )
                 continue
             split.append(cells)
             whole.append(line)
@@ -343,23 +317,19 @@ class _Part:
 
     @cached_property
     def _kept(self) -> list[int]:
-        """Return the indices of the rows that hold cells, up to what stands below the numbers."""
+        """Return the indices of the rows that hold cells, up to what stands below the numbers.
+
+        That begins with a word and is not as the rows above it.
+        """
         marks = tuple(m for m in _COMMENTS if m != self.layout.delimiter)
         kept = [k for k, row in enumerate(self.rows) if row.strip() and not row.startswith(marks)]
-        below = 0
-        while below < min(_MOST_BELOW, len(kept) - FEWEST_SAMPLES) and self._is_below(
-            kept[-1 - below]
-        ):
+        most, below = min(_MOST_BELOW, len(kept) - FEWEST_SAMPLES), 0
+        while below < most and not WORDY.match(self.rows[0]):
+            wordy = self._cells(self.rows[kept[-1 - below]])[0].strip()
+            if not WORDY.match(wordy) or is_missing(wordy) or is_stamp(wordy):
+                break
             below += 1
         return kept[: len(kept) - below] if below < _MOST_BELOW else kept
-
-    def _is_below(self, k: int) -> bool:
-        """Whether a row is no sample: it begins with a word and is not as the rows above it."""
-        cells = self._cells(self.rows[k])
-        wordy = cells[0].strip() if cells else ""
-        return bool(WORDY.match(wordy)) and not (
-            is_missing(wordy) or is_stamp(wordy) or WORDY.match(self.rows[0])
-        )
 
     def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> NDArray[np.float64] | None:
         """Let NumPy read all rows; None if any of them needs a closer look."""
@@ -381,15 +351,6 @@ class _Part:
         except ValueError:
             return None
         return None if np.any((np.abs(values) > 1e8) & np.isfinite(values)) else values
-
-    def _wrong_count(self, line: int, cells: Sequence[str], width: int) -> str:
-        hint = f"complete or remove the {self.place}"
-        if self.layout.delimiter == "," and len(cells) == 2 * width:
-            hint = "where numbers have decimal commas, separate the cells by semicolons"
-        return (
-            f"{self.path}: {self.place} {line}: found {len(cells)} cells, expected {width} as in"
-            f" the header; {hint}."
-        )
 
 
 def label_of(text: str) -> str:
