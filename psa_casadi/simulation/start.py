@@ -359,12 +359,6 @@ class LinearPart:
         right = np.broadcast_to(self.b[:, None].astype(complex), (len(omega), len(self.b), 1))
         return np.asarray(np.linalg.solve(systems, right)[:, :, 0] @ self.c)
 
-    def first_resonance(self) -> float:
-        """Return the lowest natural frequency of the oscillating parts [Hz]; 0 if none rings."""
-        poles = np.linalg.eigvals(self.a)
-        ringing = poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)]
-        return float(np.min(np.abs(ringing)) / (2.0 * np.pi)) if ringing.size else 0.0
-
 
 def linear_part(model: Model) -> LinearPart:
     """Linearise a stack at rest at 0 V; states that rest at any value (hysteresis) are left out."""
