@@ -165,14 +165,18 @@ class _Problem:
                     best = (np.clip(p, wave.lower, wave.upper), points[key].value)
             return points[key]
 
-        def slope(p: FloatArray) -> Any:
-            return -self.gradient(wave, p, at(p))
+        def cost(p: FloatArray) -> float:
+            return -at(p).value
 
-        constraints = []
+        def slope(p: FloatArray) -> FloatArray:
+            downhill: FloatArray = -self.gradient(wave, p, at(p))
+            return downhill
+
+        constraints: Any = []
         if wave.slack(wave.start).size > 0:
             constraints = [scipy.optimize.NonlinearConstraint(wave.slack, 0.0, np.inf)]
         scipy.optimize.minimize(
-            lambda p: -at(p).value,
+            cost,
             wave.start,
             jac=slope,
             method="SLSQP",
