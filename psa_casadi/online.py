@@ -1,6 +1,6 @@
 """For use sample by sample in a control loop: observers, feed-forward, identification online."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,23 +71,18 @@ class Block:
         given, shown = np.zeros(s.u.numel()), np.zeros(s.y.numel())
         self._given: Any = given.data
         self._out: Any = shown.data
-        self._buffers = tuple(self._bound(k) for k in (0, 1))
-        self._evaluate = tuple(evaluate for _, evaluate in self._buffers)
+        # bound to memory twice: each reads from one copy and writes to the other
+        self._bound: Any = [self._function.buffer() for _ in self._kept]
+        for source, (buffer, _) in enumerate(self._bound):
+            for k, memory in enumerate((self._kept[source].data, self._given)):
+                buffer.set_arg(k, memory)
+            for k, memory in enumerate((self._kept[1 - source].data, self._out)):
+                buffer.set_res(k, memory)
         self._turn = 0
-
-    def _bound(self, source: int) -> tuple[Any, Callable[[], None]]:
-        """Return the function bound to memory, reading from one copy and writing to the other."""
-        bound: Any = self._function.buffer()
-        buffer, evaluate = bound
-        buffer.set_arg(0, self._kept[source].data)
-        buffer.set_arg(1, self._given)
-        buffer.set_res(0, self._kept[1 - source].data)
-        buffer.set_res(1, self._out)
-        return buffer, evaluate
 
     def _advance(self) -> float:
         """Advance by one sample, for which `_given` has been written; return the first output."""
-        self._evaluate[self._turn]()
+        self._bound[self._turn][1]()
         self._turn = 1 - self._turn
         return float(self._out[0])
 
@@ -252,16 +247,12 @@ class _Learning(Block):
         kept, p = self.kept, self.model.values
         c = constants(p)
         found = [float(v) for v in estimates(c, [kept[f"z_{n}"] for n in TRACKED])]
-        left = variances(
-            [
-                [*(kept[f"U_{i + 1}_{j + 1}"] for i in range(j)), kept[f"D_{j + 1}"]]
-                for j in range(COUNT)
-            ]
-        )
-        names = tuple(TRACKED)
-        return Estimate(
-            dict(zip(names, found, strict=True)), kept["f_H"], dict(zip(names, left, strict=True))
-        )
+        factors = [
+            [*(kept[f"U_{i + 1}_{j + 1}"] for i in range(j)), kept[f"D_{j + 1}"]]
+            for j in range(COUNT)
+        ]
+        parameters, left = (dict(zip(TRACKED, v, strict=True)) for v in (found, variances(factors)))
+        return Estimate(parameters, kept["f_H"], left)
 
 
 class OnlineIdentification(_Learning):

@@ -75,12 +75,12 @@ def mechanism(
     """
     from psa_casadi.cli.inputs import Given
     from psa_casadi.design.mechanism.mechanism import (
-        Limits,
         check_goals,
         design_mechanism,
         mechanism_model,
         port_model,
     )
+    from psa_casadi.design.mechanism.search import Limits
     from psa_casadi.model.model_file import save_model
     from psa_casadi.report.page.designs import write_mechanism_page
 

@@ -7,6 +7,7 @@ steps. Every sample takes the same operations.
 """
 
 from dataclasses import replace
+from itertools import islice
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.components.online_recursion import (
@@ -24,8 +25,6 @@ from psa_casadi.components.online_recursion import (
 from psa_casadi.scales import voltage_scale
 from psa_casadi.variables import Input, Output, Parameter, State, Values
 
-_SHAPED = tuple(TRACKED)[:SHAPES]
-
 
 def force_scale(p: Values) -> float:
     """Return the size of a hysteresis force [N]."""
@@ -37,39 +36,33 @@ def stroke(p: Values) -> float:
     return abs(p["k_L"]) * p["u_rated"] / p["stiffness"]
 
 
-def estimate_outputs() -> tuple[Output, ...]:
-    """Return the outputs that show the estimates."""
-    return tuple(
-        Output(f"{name}_hat", unit, f"estimate of {name}", 1.0 if unit != "N" else force_scale)
-        for name, unit in TRACKED.items()
-    )
-
-
-def _sampled() -> tuple[State, ...]:
-    """Return what the block keeps between instants, in the order of `flattened`."""
-    z = [State(f"z_{n}", "1", f"deviation of {n} from its start, in spreads", 1.0) for n in TRACKED]
-    meaning = "of the covariance U D U' of the deviations"
-    factors = [
-        State(f"D_{j + 1}", "1", f"variance {meaning}", 1.0, start=1.0)
+_ESTIMATES = tuple(
+    Output(f"{name}_hat", unit, f"estimate of {name}", 1.0 if unit != "N" else force_scale)
+    for name, unit in TRACKED.items()
+)
+_FORCE = Output("hysteresis_force", "N", "estimated hysteresis force", force_scale)
+_CORRECTION = Output("correction", "V", "voltage to add so that the stack is linear", voltage_scale)
+_VOLTAGE_IN = Input("voltage", "V", "voltage at the stack", nominal=voltage_scale)
+_POSITION = Input("position", "m", "measured displacement", 0.0, stroke, "um")
+_UNITS = {"A": "V", "beta": "V", "gamma": "V", "delta": "V.s", "n": "N"}
+_MEANING = "of the covariance U D U' of the deviations"
+#: What the block keeps between instants, in the order of `flattened`.
+SAMPLED = (
+    *(State(f"z_{n}", "1", f"deviation of {n} from its start, in spreads", 1.0) for n in TRACKED),
+    *(
+        State(f"D_{j + 1}", "1", f"variance {_MEANING}", 1.0, start=1.0)
         if i == j
-        else State(f"U_{i + 1}_{j + 1}", "1", f"factor {meaning}", 1.0)
+        else State(f"U_{i + 1}_{j + 1}", "1", f"factor {_MEANING}", 1.0)
         for j in range(COUNT)
         for i in range(j + 1)
-    ]
-    units = {"A": "V", "beta": "V", "gamma": "V", "delta": "V.s", "n": "N"}
-    return (
-        *z,
-        *factors,
-        State("u_last", "V", "voltage at the last instant", voltage_scale),
-        State("f_H", "N", "estimated hysteresis force", force_scale),
-        *(State(f"s_{n}", units[n], f"derivative of f_H by {n}", 1.0) for n in _SHAPED),
-        State("u_lag", "V", "voltage behind the lag", voltage_scale),
-        State("f_lag", "N", "estimated hysteresis force behind the lag", force_scale),
-        *(State(f"l_{n}", units[n], f"s_{n} behind the lag", 1.0) for n in _SHAPED),
-    )
-
-
-SAMPLED = _sampled()
+    ),
+    State("u_last", "V", "voltage at the last instant", voltage_scale),
+    State("f_H", "N", "estimated hysteresis force", force_scale),
+    *(State(f"s_{n}", unit, f"derivative of f_H by {n}", 1.0) for n, unit in _UNITS.items()),
+    State("u_lag", "V", "voltage behind the lag", voltage_scale),
+    State("f_lag", "N", "estimated hysteresis force behind the lag", force_scale),
+    *(State(f"l_{n}", unit, f"s_{n} behind the lag", 1.0) for n, unit in _UNITS.items()),
+)
 
 
 def flattened(m: Memory) -> list[Expression]:
@@ -78,41 +71,38 @@ def flattened(m: Memory) -> list[Expression]:
     return [*m.z, *factors, m.u, m.f, *m.sigma, m.nu, m.phi, *m.psi]
 
 
-def gathered(values: list[Expression]) -> Memory:
-    """Return the memory from a list, the inverse of `flattened`."""
-    left = iter(values)
+def _memory(s: Symbols) -> Memory:
+    """Return the memory that the sampled states hold, the inverse of `flattened`."""
+    left = iter([getattr(s, state.name) for state in SAMPLED])
+    z = list(islice(left, COUNT))
+    factors = [list(islice(left, j + 1)) for j in range(COUNT)]
+    u, f, sigma = next(left), next(left), list(islice(left, SHAPES))
+    return Memory(z, factors, u, f, sigma, next(left), next(left), list(islice(left, SHAPES)))
 
-    def take(count: int) -> list[Expression]:
-        return [next(left) for _ in range(count)]
 
-    return Memory(
-        z=take(COUNT),
-        factors=[take(j + 1) for j in range(COUNT)],
-        u=next(left),
-        f=next(left),
-        sigma=take(SHAPES),
-        nu=next(left),
-        phi=next(left),
-        psi=take(SHAPES),
+def _learnt(
+    s: Symbols, c: Constants, voltage: Expression
+) -> tuple[Memory, Memory, Equations, dict[str, Expression]]:
+    """Return the memory now and after a sample, what that says, and the estimates now."""
+    now = _memory(s)
+    after = advance(c, now, voltage, s.position)
+    found = dict(zip(TRACKED, estimates(c, now.z), strict=True))
+    shown = {**{f"{name}_hat": value for name, value in found.items()}, "hysteresis_force": now.f}
+    names = [state.name for state in SAMPLED]
+    return (
+        now,
+        after,
+        Equations(next=dict(zip(names, flattened(after), strict=True)), out=shown),
+        found,
     )
 
 
 def _online_identification(s: Symbols) -> Equations:
-    c = constants({p.name: getattr(s, p.name) for p in _PARAMETERS})
-    now = gathered([getattr(s, state.name) for state in SAMPLED])
-    after = advance(c, now, s.voltage, s.position)
-    names = [state.name for state in SAMPLED]
-    found = dict(zip(TRACKED, estimates(c, now.z), strict=True))
-    return Equations(
-        next=dict(zip(names, flattened(after), strict=True)),
-        out={
-            **{f"{name}_hat": value for name, value in found.items()},
-            "hysteresis_force": now.f,
-            "correction": -now.f / found["k_L"],
-            "prediction_error": s.position
-            - (found["k_L"] * now.nu + now.phi + found["offset"]) / c.stiffness,
-        },
-    )
+    c = _constants(s, _PARAMETERS)
+    now, _, said, found = _learnt(s, c, s.voltage)
+    predicted = (found["k_L"] * now.nu + now.phi + found["offset"]) / c.stiffness
+    more = {"correction": -now.f / found["k_L"], "prediction_error": s.position - predicted}
+    return replace(said, out={**said.out, **more})
 
 
 _PARAMETERS = (
@@ -153,14 +143,11 @@ ONLINE_IDENTIFICATION = Component(
     parameters=_PARAMETERS,
     sampled=SAMPLED,
     sample_period="period",
-    inputs=(
-        Input("voltage", "V", "voltage at the stack", nominal=voltage_scale),
-        Input("position", "m", "measured displacement", 0.0, stroke, "um"),
-    ),
+    inputs=(_VOLTAGE_IN, _POSITION),
     outputs=(
-        *estimate_outputs(),
-        Output("hysteresis_force", "N", "estimated hysteresis force", force_scale),
-        Output("correction", "V", "voltage to add so that the stack is linear", voltage_scale),
+        *_ESTIMATES,
+        _FORCE,
+        _CORRECTION,
         Output("prediction_error", "m", "measured minus predicted displacement", stroke, "um"),
     ),
 )
@@ -172,15 +159,15 @@ _OBSERVING = tuple(
     for p in ONLINE_IDENTIFICATION.parameters
     if p.name not in _LEARNING
 )
-_FORCE = Output("hysteresis_force", "N", "estimated hysteresis force", force_scale)
 _VOLTAGE = Output("voltage", "V", "voltage at which the stack is where it is wanted", voltage_scale)
 _WANTED = Input("wanted", "m", "displacement that is wanted", 0.0, stroke, "um")
 _LAST = (
     State("u_last", "V", "voltage at the last instant", voltage_scale),
     State("f_H", "N", "estimated hysteresis force", force_scale),
 )
-_WANTED_LAST = State("wanted_last", "m", "wanted displacement of the last instant", stroke,
-                     display_unit="um")  # fmt: skip
+_WANTED_LAST = State(
+    "wanted_last", "m", "wanted displacement of the last instant", stroke, 0.0, "um"
+)
 _PAPER = "Yang and Zhu 2015, section 5.1:"
 
 
@@ -220,22 +207,11 @@ def _feed_forward(s: Symbols) -> Equations:
 def _adaptive(s: Symbols) -> Equations:
     """The voltage that was returned last has been applied when the displacement is measured."""
     c = _constants(s, ONLINE_IDENTIFICATION.parameters)
-    now = gathered([getattr(s, state.name) for state in SAMPLED])
-    after = advance(c, now, s.applied, s.position)
+    _, after, said, _ = _learnt(s, c, s.applied)
     u = _next_voltage(c, s, estimates(c, after.z), after.f, after.u)
-    names = [state.name for state in SAMPLED]
-    found = dict(zip(TRACKED, estimates(c, now.z), strict=True))
     return Equations(
-        next={
-            **dict(zip(names, flattened(after), strict=True)),
-            "applied": u,
-            "wanted_last": s.wanted,
-        },
-        out={
-            "voltage": s.applied,
-            **{f"{name}_hat": value for name, value in found.items()},
-            "hysteresis_force": now.f,
-        },
+        next={**said.next, "applied": u, "wanted_last": s.wanted},
+        out={"voltage": s.applied, **said.out},
     )
 
 
@@ -249,11 +225,8 @@ HYSTERESIS_OBSERVER = Component(
     parameters=_OBSERVING,
     sampled=_LAST,
     sample_period="period",
-    inputs=(Input("voltage", "V", "voltage at the stack", nominal=voltage_scale),),
-    outputs=(
-        _FORCE,
-        Output("correction", "V", "voltage to add so that the stack is linear", voltage_scale),
-    ),
+    inputs=(_VOLTAGE_IN,),
+    outputs=(_FORCE, _CORRECTION),
 )
 
 FEED_FORWARD = Component(
@@ -284,6 +257,6 @@ ADAPTIVE_FEED_FORWARD = Component(
         _WANTED_LAST,
     ),
     sample_period="period",
-    inputs=(_WANTED, Input("position", "m", "measured displacement", 0.0, stroke, "um")),
-    outputs=(_VOLTAGE, *estimate_outputs(), _FORCE),
+    inputs=(_WANTED, _POSITION),
+    outputs=(_VOLTAGE, *_ESTIMATES, _FORCE),
 )

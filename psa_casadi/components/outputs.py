@@ -14,18 +14,6 @@ from psa_casadi.scales import stroke_scale, voltage_scale
 from psa_casadi.variables import Output, Parameter, Values
 
 
-def _monitor(s: Symbols) -> Equations:
-    return Equations(out={"monitor_voltage": s.monitor_scale * s.u})
-
-
-def _second(s: Symbols) -> Equations:
-    return Equations(out={"displacement_2": s.sensor_2_scale * s.displacement})
-
-
-def _gauge(s: Symbols) -> Equations:
-    return Equations(out={"strain": s.strain_scale * s.displacement})
-
-
 def _monitored(p: Values) -> float:
     return abs(p["monitor_scale"]) * voltage_scale(p) or 1.0
 
@@ -39,7 +27,7 @@ MONITOR = Component(
     description="monitor of the voltage that the amplifier puts on the stack",
     source="monitor outputs of piezo amplifiers, a share of the output voltage",
     belongs_to="drive",
-    equations=_monitor,
+    equations=lambda s: Equations(out={"monitor_voltage": s.monitor_scale * s.u}),
     equation_text="v_mon = monitor_scale u",
     parameters=(
         Parameter(
@@ -56,7 +44,7 @@ SECOND_SENSOR = Component(
     description="a second displacement sensor, straight, with a scale of its own",
     source="definition",
     belongs_to="sensor",
-    equations=_second,
+    equations=lambda s: Equations(out={"displacement_2": s.sensor_2_scale * s.displacement}),
     equation_text="x_2 = sensor_2_scale x",
     parameters=(
         Parameter("sensor_2_scale", 1.0, "1", (-1e6, 1e6), "second reading over displacement"),
@@ -73,7 +61,7 @@ STRAIN_GAUGE = Component(
     description="a strain gauge on the stack, straight, with a scale of its own",
     source="definition",
     belongs_to="sensor",
-    equations=_gauge,
+    equations=lambda s: Equations(out={"strain": s.strain_scale * s.displacement}),
     equation_text="strain = strain_scale x",
     parameters=(
         Parameter("strain_scale", 50.0, "1/m", (-1e9, 1e9), "strain per displacement", scale=50.0),

@@ -60,10 +60,6 @@ DRIVE = Component(
 )
 
 
-def _linear_force(s: Symbols) -> Equations:
-    return Equations(add={"free_force": s.k_L * s.u})
-
-
 def _bouc_wen(s: Symbols) -> Equations:
     ratio = s.f_H / s.h_ref
     rate = (
@@ -77,10 +73,6 @@ def _bouc_wen(s: Symbols) -> Equations:
         add={"hysteresis_rate": rate, "free_force": s.f_H},
         switches={"voltage_reversal": s.voltage_rate},
     )
-
-
-def _creep_lag(s: Symbols) -> Equations:
-    return Equations(der={"f_out": (s.free_force - s.f_out) / s.tau}, add={"wafer_force": s.f_out})
 
 
 def _hysteresis_scale(p: Values) -> float:
@@ -100,19 +92,15 @@ LINEAR_FORCE = Component(
     description="force proportional to the voltage at the electrodes",
     source="Yang and Zhu 2015, eq. 7 with f_0 = 0",
     equation_text="f_L = k_L u",
-    equations=_linear_force,
+    equations=lambda s: Equations(add={"free_force": s.k_L * s.u}),
     parameters=(Parameter("k_L", 10.0, "N/V", (1e-6, 1e6), "linear force per volt", log=True),),
 )
 
 #: Of every form of the hysteresis, which rests while the voltage is held.
 HOLD_RATE = Parameter(
-    "hold_rate",
-    0.1,
-    "V/s",
-    (1e-9, 1e6),
-    "voltage rate below which the voltage counts as held",
+    "hold_rate", 0.1, "V/s", (1e-9, 1e6), "voltage rate below which the voltage counts as held",
     fitted=False,
-)
+)  # fmt: skip
 
 BOUC_WEN = Component(
     name="bouc_wen",
@@ -146,7 +134,9 @@ CREEP_LAG = Component(
     description="first-order lag of the generated force (the paper's creep)",
     source="Yang and Zhu 2015, eq. 9 in the causal form that its eq. 13 uses",
     equation_text="tau f_out' + f_out = f_L + f_H",
-    equations=_creep_lag,
+    equations=lambda s: Equations(
+        der={"f_out": (s.free_force - s.f_out) / s.tau}, add={"wafer_force": s.f_out}
+    ),
     parameters=(
         Parameter("tau", 1e-4, "s", (1e-7, 1.0), "time constant of the force", "ms", log=True),
     ),
@@ -155,10 +145,7 @@ CREEP_LAG = Component(
 
 
 _LOAD = Input(
-    "load_force",
-    "N",
-    "external force on the output mass, positive outward",
-    nominal=force_scale,
+    "load_force", "N", "external force on the output mass, positive outward", 0.0, force_scale
 )
 _OUTPUTS = (
     Output("displacement", "m", "displacement of the stack's output", stroke_scale, "um"),
@@ -169,16 +156,17 @@ _OUTPUTS = (
 )
 
 
-def _mass(name: str, value: float, what: str) -> Parameter:
-    return Parameter(name, value, "kg", (1e-9, 1e3), f"equivalent mass of {what}", log=True)
-
-
-def _damping(name: str, value: float, what: str) -> Parameter:
-    return Parameter(name, value, "N.s/m", (1e-6, 1e9), f"equivalent damping of {what}", log=True)
-
-
-def _stiffness(name: str, value: float, what: str) -> Parameter:
-    return Parameter(name, value, "N/m", (1.0, 1e12), f"equivalent stiffness of {what}", log=True)
+def _oscillator(suffix: str, what: str, *values: float) -> tuple[Parameter, ...]:
+    """Return mass [kg], damping [N.s/m] and stiffness [N/m] of a part of a stack."""
+    kinds = (
+        ("m", "kg", (1e-9, 1e3), "mass"),
+        ("c", "N.s/m", (1e-6, 1e9), "damping"),
+        ("k", "N/m", (1.0, 1e12), "stiffness"),
+    )
+    return tuple(
+        Parameter(letter + suffix, value, unit, bounds, f"equivalent {kind} of {what}", log=True)
+        for value, (letter, unit, bounds, kind) in zip(values, kinds, strict=True)
+    )
 
 
 def _cascade(s: Symbols) -> Equations:
@@ -233,12 +221,8 @@ CASCADE_MECHANICS = Component(
     ),
     equations=_cascade,
     parameters=(
-        _mass("m_P", 5e-3, "the wafers"),
-        _damping("c_P", 100.0, "the wafers"),
-        _stiffness("k_P", 1.2e8, "the wafers"),
-        _mass("m_B", 5e-3, "the bonding layers"),
-        _damping("c_B", 300.0, "the bonding layers"),
-        _stiffness("k_B", 6e8, "the bonding layers"),
+        *_oscillator("_P", "the wafers", 5e-3, 100.0, 1.2e8),
+        *_oscillator("_B", "the bonding layers", 5e-3, 300.0, 6e8),
     ),
     states=(
         State("y", "m", "displacement of the wafers", stroke_scale, display_unit="um"),
@@ -255,23 +239,11 @@ SINGLE_MASS = Component(
     source="Yang and Zhu 2015, eq. 6 (the simplified comprehensive model)",
     equation_text="m x'' + c x' + k x = f_out + f_load",
     equations=_single_mass,
-    parameters=(
-        _mass("m", 1e-2, "the stack"),
-        _damping("c", 200.0, "the stack"),
-        _stiffness("k", 1e8, "the stack"),
-    ),
+    parameters=_oscillator("", "the stack", 1e-2, 200.0, 1e8),
     states=_OUTPUT_STATES,
     inputs=(_LOAD,),
     outputs=_OUTPUTS,
 )
-
-
-def _sensor(s: Symbols) -> Equations:
-    """The displacement sensor: shows the displacement, plus whatever the sensor's effects add."""
-    return Equations(
-        add={"measured_displacement": s.displacement},
-        out={"measured_displacement": s.measured_displacement},
-    )
 
 
 SENSOR = Component(
@@ -280,7 +252,10 @@ SENSOR = Component(
     source="definition",
     equation_text="x_m = x",
     belongs_to="sensor",
-    equations=_sensor,
+    equations=lambda s: Equations(
+        add={"measured_displacement": s.displacement},
+        out={"measured_displacement": s.measured_displacement},
+    ),
     outputs=(
         Output(
             "measured_displacement", "m", "displacement as the sensor shows it", stroke_scale, "um"
@@ -319,10 +294,7 @@ MEMORY_SPECTRUM = Component(
         "z_i' = u' - (|u'| sgn(z_i) + u')/2 (|z_i|/r_i)^4,  r_i = u_rated 2^(i-1)/80,  "
         "a_i = sum_k play_k cos(pi k (i - 1/2)/8),  b_i and c_i of square_k and cube_k likewise"
     ),
-    parameters=(
-        *spectrum_parameters("", _COUNTS, (-0.03,)),
-        HOLD_RATE,
-    ),
+    parameters=(*spectrum_parameters("", _COUNTS, (-0.03,)), HOLD_RATE),
     states=stop_states("z_", [f"{r:g} of the rated voltage" for r in _THRESHOLDS]),
     equations=_memory_spectrum,
 )

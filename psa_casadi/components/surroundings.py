@@ -8,6 +8,8 @@ f_H_hat are states, so there is no algebraic loop. With the stack's own paramete
 force is k_L G v after the lag, without hysteresis.
 """
 
+from dataclasses import replace
+
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
@@ -42,16 +44,8 @@ FLEXURE = Component(
         State("v_f", "m/s", "velocity of the stage", 1e-2, display_unit="um/s"),
     ),
     inputs=(
-        Input(
-            "tip_position", "m", "position of the stack's output", display_unit="um", nominal=1e-5
-        ),
-        Input(
-            "tip_velocity",
-            "m/s",
-            "velocity of the stack's output",
-            display_unit="um/s",
-            nominal=1e-2,
-        ),
+        Input("tip_position", "m", "position of the stack's output", 0.0, 1e-5, "um"),
+        Input("tip_velocity", "m/s", "velocity of the stack's output", 0.0, 1e-2, "um/s"),
     ),
     outputs=(
         Output("reaction_force", "N", "force of the stage on the stack", 100.0),
@@ -171,13 +165,7 @@ CHARGE_AMPLIFIER = Component(
         Parameter("gain", 10.0, "1", (1e-3, 1e4), "volts out per volt of command at rest"),
         Parameter("bandwidth", 3e3, "Hz", (1e-2, 1e9), "bandwidth of the loop", "kHz", log=True),
         Parameter(
-            "sense_capacitance",
-            15e-6,
-            "F",
-            (1e-12, 1.0),
-            "charge per volt of command",
-            "uF",
-            log=True,
+            "sense_capacitance", 15e-6, "F", (1e-12, 1.0), "charge per volt of command", "uF", True
         ),
         Parameter("leak_time", 1.0, "s", (1e-4, 1e5), "time constant of the leakage", log=True),
         *_LIMITS,
@@ -205,14 +193,9 @@ def _mechanism(s: Symbols) -> Equations:
     )
 
 
-def _port(s: Symbols) -> Equations:
-    return Equations(
-        add={"wafer_force": s.prestress_force},
-        out={
-            "tip_velocity": s.v_x,
-            "tip_acceleration": (s.transmitted_force + s.tip_force - _pull(s)) / s.m_B,
-        },
-    )
+def _acceleration(s: Symbols) -> Expression:
+    """Acceleration of the output mass [m/s^2]."""
+    return (s.transmitted_force + s.tip_force - _pull(s)) / s.m_B
 
 
 def _pull(s: Symbols) -> Expression:
@@ -221,8 +204,7 @@ def _pull(s: Symbols) -> Expression:
 
 
 def _on_wafers(s: Symbols) -> Equations:
-    acceleration = (s.transmitted_force + s.tip_force - _pull(s)) / s.m_B
-    force = s.m_m * acceleration + s.c_m * s.v_x + s.k_m * s.x
+    force = s.m_m * _acceleration(s) + s.c_m * s.v_x + s.k_m * s.x
     return Equations(add={"wafer_force": -s.mounted * force})
 
 
@@ -241,7 +223,6 @@ _MOUNTED = Parameter(
     "mounted", 0.0, "1", (0.0, 1.0), "share of the mechanism that is there: 0 the free stack",
     scale=1.0,
 )  # fmt: skip
-_COUPLED = "Yang and Zhu 2015, eq. 45: the mechanism is feedback around the stack's mechanics"
 
 PRESTRESS_MECHANISM = Component(
     name="prestress_mechanism",
@@ -268,7 +249,10 @@ PRESTRESS_PORT = Component(
     source="Yang and Zhu 2015, eq. 45 and figure 12: the mechanism is feedback around G_P",
     equation_text="f_out + F acts on the wafers;  x', x'' of the output go out",
     needs=("cascade_mechanics",),
-    equations=_port,
+    equations=lambda s: Equations(
+        add={"wafer_force": s.prestress_force},
+        out={"tip_velocity": s.v_x, "tip_acceleration": _acceleration(s)},
+    ),
     inputs=(
         Input("prestress_force", "N", "force of the mechanism on the stack", nominal=force_scale),
     ),
@@ -278,29 +262,26 @@ PRESTRESS_PORT = Component(
     ),
 )
 
+_ON_WAFERS = Component(
+    name="prestress_on_wafers",
+    description="prestress mechanism around a stack, whose force acts on the wafers",
+    source="Yang and Zhu 2015, eq. 45: the mechanism is feedback around the stack's mechanics",
+    equation_text="f_out - (m x'' + c x' + k x) acts on the wafers",
+    needs=("cascade_mechanics",),
+    gain="mounted",
+    equations=_on_wafers,
+    parameters=(_MOUNTED, *_MECHANISM),
+    looks_like="more damping, resonances elsewhere, and a share of the stroke that is lost",
+)
 #: A mechanism around a stack in one model: its force acts where the key says.
 PRESTRESS_MOUNTS = {
-    "wafers": Component(
-        name="prestress_on_wafers",
-        description="prestress mechanism around a stack, whose force acts on the wafers",
-        source=_COUPLED,
-        equation_text="f_out - (m x'' + c x' + k x) acts on the wafers",
-        needs=("cascade_mechanics",),
-        gain="mounted",
-        equations=_on_wafers,
-        parameters=(_MOUNTED, *_MECHANISM),
-        looks_like="more damping, resonances elsewhere, and a share of the stroke that is lost",
-    ),
-    "tip": Component(
+    "wafers": _ON_WAFERS,
+    "tip": replace(
+        _ON_WAFERS,
         name="prestress_on_tip",
         description="prestress mechanism that pushes on the output mass of a stack",
-        source=_COUPLED,
         equation_text="(m_B + m) x'' = F - c x' - k x,  F: all else that acts on the output mass",
-        needs=("cascade_mechanics",),
-        gain="mounted",
         equations=_on_tip,
-        parameters=(_MOUNTED, *_MECHANISM),
-        looks_like="more damping, resonances elsewhere, and a share of the stroke that is lost",
     ),
 }
 
@@ -372,13 +353,7 @@ POSITION_CONTROLLER = Component(
     parameters=(
         Parameter("sample_time", 5e-5, "s", (1e-7, 10.0), "period of the controller", "us"),
         Parameter(
-            "filter_time",
-            1.6e-5,
-            "s",
-            (1e-9, 10.0),
-            "lag of the anti-aliasing filter",
-            "us",
-            log=True,
+            "filter_time", 1.6e-5, "s", (1e-9, 10.0), "lag of the anti-aliasing filter", "us", True
         ),
         Parameter("proportional_gain", 1e4, "V/m", (0.0, 1e12), "command per error", scale=1e4),
         Parameter(
@@ -396,13 +371,11 @@ POSITION_CONTROLLER = Component(
             "anti_windup", 1.0, "1", (0.0, 1.0), "share of the excess that leaves the integral"
         ),
     ),
-    states=(
-        State("filtered_position", "m", "position behind the filter", 1e-5, display_unit="um"),
-    ),
+    states=(State("filtered_position", "m", "position behind the filter", 1e-5, 0.0, "um"),),
     sampled=(
-        State("notch_first", "m", "first memory of the notch", 1e-5, display_unit="um"),
-        State("notch_second", "m", "second memory of the notch", 1e-5, display_unit="um"),
-        State("last_error", "m", "filtered error of the last instant", 1e-5, display_unit="um"),
+        State("notch_first", "m", "first memory of the notch", 1e-5, 0.0, "um"),
+        State("notch_second", "m", "second memory of the notch", 1e-5, 0.0, "um"),
+        State("last_error", "m", "filtered error of the last instant", 1e-5, 0.0, "um"),
         State("integral", "V", "integral of the filtered error", _span),
         State("held_command", "V", "command held until the next instant", _span),
     ),

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 import psa_casadi as psa
 from psa_casadi.design.mechanism.loop import Mounting, step_response
 from psa_casadi.design.mechanism.mechanism import (
-    Limits,
     MechanismDesign,
     design_mechanism,
     mechanism_model,
     port_model,
     root_locus,
 )
+from psa_casadi.design.mechanism.search import Limits
 
 FloatArray = NDArray[np.float64]
 

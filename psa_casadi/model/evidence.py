@@ -156,36 +156,29 @@ def contradictions(e: Evidence, parameters: Mapping[str, Any]) -> Iterator[str]:
     for name, interval in intervals.items():
         if interval is not None and interval.low > interval.high:
             yield f"'evidence.{name}' is {shown(list(interval))}; give [low, high]."
-    yield from _bad_covariance(e.covariance, parameters)
-    for run in e.runs:
-        yield from _bad_run(run)
-    if e.reference is not None:
-        yield from _bad_reference(e.reference, [r.record for r in e.runs])
-
-
-def _bad_covariance(c: Covariance, parameters: Mapping[str, Any]) -> Iterator[str]:
+    c, rows = e.covariance, e.covariance.matrix
     unknown = [n for n in c.names if n not in parameters]
     if unknown or len(set(c.names)) < len(c.names):
         yield f"'evidence.covariance.names' must name parameters, none twice; not {shown(unknown)}."
-    rows = c.matrix
     if [len(c.names)] * len(c.names) != [len(row) for row in rows]:
         yield "'evidence.covariance.matrix' must have a row and a column for each name."
     elif any(row[i] < 0.0 for i, row in enumerate(rows)) or rows != tuple(zip(*rows, strict=True)):
         yield "'evidence.covariance.matrix' must be symmetric, with no variance below 0."
+    yield from _bad_runs(e.runs, e.reference)
 
 
-def _bad_run(run: RecordRun) -> Iterator[str]:
-    of, ends = f"'evidence.runs' of {shown(run.record)}", [k for s in run.held_out for k in s]
-    if run.averaged < 1 or run.samples < 2:
-        yield f"{of} must have samples, each of at least one."
-    if any(a >= b for a, b in pairwise([-1, *ends, run.samples + 1])):
-        yield f"{of} must have held-out stretches that follow each other within its samples."
-    if (run.held_out_m is None) != (not run.held_out):
-        yield f"{of} must have a held-out error and held-out samples, or neither."
-
-
-def _bad_reference(r: ReferenceRun, known: Sequence[str]) -> Iterator[str]:
-    if r.record not in known:
+def _bad_runs(runs: Sequence[RecordRun], r: ReferenceRun | None) -> Iterator[str]:
+    for run in runs:
+        of, ends = f"'evidence.runs' of {shown(run.record)}", [k for s in run.held_out for k in s]
+        if run.averaged < 1 or run.samples < 2:
+            yield f"{of} must have samples, each of at least one."
+        if any(a >= b for a, b in pairwise([-1, *ends, run.samples + 1])):
+            yield f"{of} must have held-out stretches that follow each other within its samples."
+        if (run.held_out_m is None) != (not run.held_out):
+            yield f"{of} must have a held-out error and held-out samples, or neither."
+    if r is None:
+        return
+    if r.record not in [run.record for run in runs]:
         yield f"'evidence.reference' is of {shown(r.record)}, which is not among the runs."
     if len(r.time) < 2 or any(a >= b for a, b in pairwise(r.time)):
         yield "'evidence.reference.time' must have two or more increasing times."

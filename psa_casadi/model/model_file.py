@@ -98,15 +98,15 @@ def dumps(model: Model) -> str:
             " model, or export the model as an FMU."
         )
     origin = model.provenance
-    parameters = {}
-    for p in model.structure.parameters:
-        interval = origin.intervals.get(p.name)
-        parameters[p.name] = {
+    parameters = {
+        p.name: {
             "value": model.values[p.name],
             "unit": p.unit,
-            "interval": list(interval) if interval else None,
+            "interval": list(i) if (i := origin.intervals.get(p.name)) else None,
             "free": p.name in origin.free,
         }
+        for p in model.structure.parameters
+    }
     starts, stated = model.own_starts(), model.publication.stated
     content = {
         "format": FORMAT,
@@ -114,7 +114,10 @@ def dumps(model: Model) -> str:
         "description": model.description,
         **({"publication": stated} if stated else {}),
         "components": [c.name for c in model.components if c.gain is None],
-        "effects": [_reference(c) for c in model.effects],
+        "effects": [
+            {"name": c.name, "module": c.home, "sha256": declaration_hash(c)} if c.home else c.name
+            for c in model.effects
+        ],
         "parameters": parameters,
         **({"starts": starts} if starts else {}),
         **({"interrupted": True} if origin.interrupted else {}),
@@ -137,12 +140,6 @@ def foreign_components(model: Model) -> tuple[str, ...]:
     """Return the names of a model's components that MODEL.json cannot name."""
     known = (*COMPONENTS.values(), *EFFECTS.values(), *_BESIDE.values())
     return tuple(c.name for c in model.components if c not in known and not c.home)
-
-
-def _reference(effect: Component) -> str | dict[str, str]:
-    if not effect.home:
-        return effect.name
-    return {"name": effect.name, "module": effect.home, "sha256": declaration_hash(effect)}
 
 
 def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = ()) -> Model:
@@ -168,12 +165,9 @@ def model_of(content: Any, source: str, effects: Iterable[Component] = ()) -> Mo
     components += [table[_name_of(effect)] for effect in file.effects]
     given = file.parameters
     try:
-        model = compose(
-            components,
-            {name: p.value for name, p in given.items()},
-            name=file.name,
-            description=file.description,
-        ).with_starts(file.starts)
+        values = {name: p.value for name, p in given.items()}
+        model = compose(components, values, name=file.name, description=file.description)
+        model = model.with_starts(file.starts)
     except InputError as error:
         _refuse(error.problems, source)
         raise

@@ -1,6 +1,5 @@
 """A closed-loop nanopositioner: controller, compensator, amplifier, stack and flexure stage."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -23,18 +22,13 @@ _DAMPED = 0.5
 
 @dataclass(frozen=True)
 class PlantResponse:
-    """The response of a plant with held command at the frequencies of a grid, and its modes."""
+    """The response of a plant with held command on a grid, also on the unit circle; its modes."""
 
     period: float
     frequencies: FloatArray
+    z: ComplexArray
     response: ComplexArray
     modes: tuple[tuple[float, float], ...]
-
-    @property
-    def z(self) -> ComplexArray:
-        """The grid on the unit circle."""
-        points: ComplexArray = np.exp(2j * np.pi * self.frequencies * self.period)
-        return points
 
     def resonance(self) -> tuple[float, float] | None:
         """Return frequency and damping of the mode that stands out most, or None."""
@@ -47,17 +41,26 @@ class PlantResponse:
 
 def plant_response(plant: Model, position: str | None, period: float, lag: float) -> PlantResponse:
     """Return the exactly discretised response of the plant, linearised, behind a lag [s]."""
-    A, B, C = _behind(lag, *_linearised(plant, position))
-    if np.max(np.linalg.eigvals(A).real) > 1e-6 / period:
+    s = plant.structure
+    row = plant.output_names.index(position) if position else 0
+    start = [v.start for v in s.states], [v.start for v in s.inputs]
+    found = s.slopes(0.0, *start, plant.parameter_vector())
+    A, B, C, _ = (np.array(m, dtype=float) for m in found)
+    size, n = plant.state_nominals(), len(A) + 1
+    A, B, C = A * size / size[:, None], B / size[:, None], C[[row]] * size
+    # the output behind a lag of first order
+    A = np.block([[A, np.zeros((n - 1, 1))], [C / lag, np.array([[-1.0 / lag]])]])
+    B, C = np.vstack([B, np.zeros((1, 1))]), np.append(np.zeros(n - 1), 1.0)[None, :]
+    poles = np.linalg.eigvals(A)
+    if np.max(poles.real) > 1e-6 / period:
         raise InputError(
             f"The plant '{plant.name}' is unstable at its start; a controller is tuned for stable"
             " plants: check its parameters."
         )
-    n = len(A)
     step = scipy.linalg.expm(period * np.block([[A, B], [np.zeros((1, n + 1))]]))
     modes = tuple(
         (float(abs(v) / (2.0 * np.pi)), float(-v.real / abs(v)))
-        for v in np.linalg.eigvals(A)
+        for v in poles
         if v.imag > 0.0 and 1e-6 < abs(v) * period < 0.9 * np.pi
     )
     nyquist = 0.5 / period
@@ -72,27 +75,7 @@ def plant_response(plant: Model, position: str | None, period: float, lag: float
         raise InputError(
             f"The output of '{plant.name}' does not follow its input; check the wires."
         )
-    return PlantResponse(period, grid, response, modes)
-
-
-def _linearised(plant: Model, position: str | None) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return A, B, C at the start, the states scaled by their usual sizes."""
-    s = plant.structure
-    row = plant.output_names.index(position) if position else 0
-    start = [v.start for v in s.states], [v.start for v in s.inputs]
-    found = s.slopes(0.0, *start, plant.parameter_vector())
-    A, B, C, _ = (np.array(m, dtype=float) for m in found)
-    size = plant.state_nominals()
-    return A * size / size[:, None], B / size[:, None], C[[row]] * size
-
-
-def _behind(
-    lag: float, A: FloatArray, B: FloatArray, C: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the linear plant with its output behind a lag of first order."""
-    n = len(A)
-    slow = np.block([[A, np.zeros((n, 1))], [C / lag, np.array([[-1.0 / lag]])]])
-    return slow, np.vstack([B, np.zeros((1, 1))]), np.append(np.zeros(n), 1.0)[None, :]
+    return PlantResponse(period, grid, z, response, modes)
 
 
 def notch_response(z: ComplexArray, period: float, frequency: float, floor: float, width: float
@@ -102,15 +85,6 @@ def notch_response(z: ComplexArray, period: float, frequency: float, floor: floa
     w = (z - 1.0) / (z + 1.0) / t
     ratio: ComplexArray = (w * w + 2.0 * floor * w + 1.0) / (w * w + 2.0 * width * w + 1.0)
     return np.where(np.abs(z + 1.0) < 1e-12, 1.0, ratio)
-
-
-def controller_response(p: Mapping[str, float], z: ComplexArray) -> ComplexArray:
-    """Return the controller's response without feed-forward on the unit circle [V/m]."""
-    period = p["sample_time"]
-    notch = notch_response(z, period, p["notch_frequency"], p["notch_floor"], p["notch_width"])
-    integral = 0.5 * p["integral_gain"] * period * (z + 1.0) / (z - 1.0)
-    loop: ComplexArray = notch * (p["proportional_gain"] + integral)
-    return loop
 
 
 _WIDTHS = (0.2, 0.35, 0.5, 0.7, 1.0)
@@ -166,14 +140,10 @@ def controller_for(
     rest = float(response.response[0].real)
     found = _search(response, np.sign(rest), sensitivity, resonance_tolerance)
     model = part_model(
-        "position_controller",
-        **found,
-        sample_time=sample_time,
-        filter_time=lag,
-        feed_forward=1.0 / rest if feed_forward else 0.0,
-        lowest_command=lowest_command,
+        "position_controller", **found, sample_time=sample_time, filter_time=lag,
+        feed_forward=1.0 / rest if feed_forward else 0.0, lowest_command=lowest_command,
         highest_command=highest_command,
-    )
+    )  # fmt: skip
     margins = margins_of(plant, model, position)
     note = (
         f"Tuned to {plant.name}: largest sensitivity {margins.sensitivity:.3g}, gain margin"
@@ -186,8 +156,12 @@ def controller_for(
 def margins_of(plant: Model, controller: Model, position: str | None = None) -> Margins:
     """Return the margins of a plant, linearised at its start, in the loop with a controller."""
     p = controller.values
-    response = plant_response(plant, position, p["sample_time"], p["filter_time"])
-    loop = response.response * controller_response(p, response.z)
+    period = p["sample_time"]
+    response = plant_response(plant, position, period, p["filter_time"])
+    z = response.z
+    notch = notch_response(z, period, p["notch_frequency"], p["notch_floor"], p["notch_width"])
+    integral = 0.5 * p["integral_gain"] * period * (z + 1.0) / (z - 1.0)
+    loop = response.response * (notch * (p["proportional_gain"] + integral))
     modulus = float(np.min(np.abs(1.0 + loop)))
     size, angle = np.abs(loop), np.unwrap(np.angle(loop))
     falling = np.flatnonzero((size[:-1] >= 1.0) & (size[1:] < 1.0))
@@ -310,13 +284,9 @@ def nanopositioner(
     """
     plant = positioner_plant(stack).model()
     controller = controller_for(
-        plant,
-        position="stage_position",
-        sample_time=sample_time,
-        sensitivity=sensitivity,
-        lowest_command=_LOWEST * _FULL_COMMAND,
-        highest_command=_FULL_COMMAND,
-    )
+        plant, position="stage_position", sample_time=sample_time, sensitivity=sensitivity,
+        lowest_command=_LOWEST * _FULL_COMMAND, highest_command=_FULL_COMMAND,
+    )  # fmt: skip
     open_loop = positioner_plant(
         stack, compensated=compensated, compensator_stack=compensator_stack
     )
@@ -347,12 +317,9 @@ def positioner_plant(
     actuator = (stack_model(stack) if isinstance(stack, str) else stack).plant()
     rated = actuator.values["u_rated"]
     amplifier = part_model(
-        "voltage_amplifier",
-        gain=rated / _FULL_COMMAND,
-        lowest_output=_LOWEST * rated,
-        highest_output=rated,
-        load_capacitance=actuator.values["C_p"],
-    )
+        "voltage_amplifier", gain=rated / _FULL_COMMAND, lowest_output=_LOWEST * rated,
+        highest_output=rated, load_capacitance=actuator.values["C_p"],
+    )  # fmt: skip
     parts = {"amplifier": amplifier, "stack": actuator, "flexure": part_model("flexure_stage")}
     wires: tuple[tuple[str, str], ...] = (
         ("amplifier.output_voltage", "stack.voltage"),

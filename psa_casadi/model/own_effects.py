@@ -48,7 +48,16 @@ def own_effects(module: str) -> Mapping[str, Component]:
 @cache
 def _effects_of(source: ModuleType) -> Mapping[str, Component]:
     module = source.__name__
-    found = _held_by(source, module)
+    listed = getattr(source, "EFFECTS", None)
+    values = listed.values() if isinstance(listed, Mapping) else listed
+    every = vars(source).values() if values is None else values
+    found = dict.fromkeys(c for c in every if isinstance(c, Component) and c.gain is not None)
+    if not found:
+        path = getattr(source, "__file__", None)
+        raise InputError(
+            f"The module '{module}'{f' ({path})' if path else ''} holds no effect: a variable that"
+            " is a `Component` with a gain, or a mapping EFFECTS of them."
+        )
     problems, series = Problems(), {c.name: c for c in MODAL_SERIES.values()}
     for component in found:
         if component.name in {**COMPONENTS, **EFFECTS, **series}:
@@ -121,21 +130,3 @@ def _imported(module: str, *, here: bool = False) -> ModuleType:
                 f" ({type(error).__name__}: {error}); name it as in `import {module or 'effects'}`,"
                 " from the folder that holds it."
             ) from error
-
-
-def _held_by(module: ModuleType, name: str) -> list[Component]:
-    listed = getattr(module, "EFFECTS", None)
-    values = listed.values() if isinstance(listed, Mapping) else listed
-    candidates = vars(module).values() if values is None else values
-    found = [c for c in candidates if isinstance(c, Component) and c.gain is not None]
-    if not found:
-        raise InputError(
-            f"The module '{name}'{_place(module)} holds no effect: a variable that is a `Component`"
-            " with a gain, or a mapping EFFECTS of them."
-        )
-    return list(dict.fromkeys(found))
-
-
-def _place(module: ModuleType) -> str:
-    path = getattr(module, "__file__", None)
-    return f" ({path})" if path else ""

@@ -20,60 +20,31 @@ class PartKind:
     components: tuple[str, ...]
 
 
-PARTS: dict[str, PartKind] = {
-    kind.name: kind
-    for kind in (
-        PartKind(
-            "flexure_stage",
-            "guided stage that a stack pushes through a contact stiffness",
-            ("flexure",),
-        ),
-        PartKind(
-            "position_controller",
-            "sampled position controller: PI behind a notch, saturation, anti-windup",
-            ("position_controller",),
-        ),
-        PartKind(
-            "hysteresis_compensator",
-            "observer of a stack's hysteresis force that takes it off the command",
-            ("hysteresis_compensator", "linear_force", "bouc_wen"),
-        ),
-        PartKind(
-            "voltage_amplifier",
-            "voltage amplifier of finite bandwidth, output range and current",
-            ("voltage_amplifier",),
-        ),
-        PartKind(
-            "charge_amplifier",
-            "charge amplifier with a leakage corner",
-            ("charge_amplifier",),
-        ),
-        PartKind(
-            "prestress_mechanism",
-            "mass, spring and damper that a stack's tip moves",
-            ("prestress_mechanism",),
-        ),
-        PartKind(
-            "online_identification",
-            "recursive least squares of a stack's hysteresis parameters, sampled",
-            ("online_identification",),
-        ),
-        PartKind(
-            "hysteresis_observer",
-            "observer of a stack's hysteresis force, sampled",
-            ("hysteresis_observer",),
-        ),
-        PartKind(
-            "feed_forward",
-            "voltage for a wanted displacement, the stack's hysteresis taken off, sampled",
-            ("feed_forward",),
-        ),
-        PartKind(
-            "adaptive_feed_forward",
-            "feed_forward that follows the measured displacement, sampled",
-            ("adaptive_feed_forward",),
-        ),
-    )
+#: What each part is, and its components where these are others than the one of its name.
+_PARTS: dict[str, tuple[str, ...]] = {
+    "flexure_stage": ("guided stage that a stack pushes through a contact stiffness", "flexure"),
+    "position_controller": (
+        "sampled position controller: PI behind a notch, saturation, anti-windup",
+    ),
+    "hysteresis_compensator": (
+        "observer of a stack's hysteresis force that takes it off the command",
+        "hysteresis_compensator", "linear_force", "bouc_wen",
+    ),
+    "voltage_amplifier": ("voltage amplifier of finite bandwidth, output range and current",),
+    "charge_amplifier": ("charge amplifier with a leakage corner",),
+    "prestress_mechanism": ("mass, spring and damper that a stack's tip moves",),
+    "online_identification": (
+        "recursive least squares of a stack's hysteresis parameters, sampled",
+    ),
+    "hysteresis_observer": ("observer of a stack's hysteresis force, sampled",),
+    "feed_forward": (
+        "voltage for a wanted displacement, the stack's hysteresis taken off, sampled",
+    ),
+    "adaptive_feed_forward": ("feed_forward that follows the measured displacement, sampled",),
+}  # fmt: skip
+PARTS = {
+    name: PartKind(name, text, tuple(components) or (name,))
+    for name, (text, *components) in _PARTS.items()
 }
 
 #: Effects on the generated force that the observer can run: those of u and of states. (The one of

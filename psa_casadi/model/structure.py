@@ -19,16 +19,8 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.variables import Input, Output, Parameter, State
 
 
-def symbol_names(component: Component) -> list[str]:
-    """Return the names of the symbols that a component declares."""
-    names = [p.name for p in component.parameters]
-    names += [s.name for s in (*component.states, *component.sampled)]
-    return names + [i.name for i in component.inputs]
-
-
-def refuse_duplicates(components: tuple[Component, ...]) -> None:
+def refuse_duplicates(components: tuple[Component, ...], symbols: list[str]) -> None:
     """Symbols share one name space with the balances and time, outputs have one of their own."""
-    symbols = [n for c in components for n in symbol_names(c)]
     outputs = [o.name for c in components for o in c.outputs]
     problems = Problems()
     for names in (symbols, outputs):
@@ -141,7 +133,7 @@ class Structure:
     @cached_property
     def balance_table(self) -> dict[str, Balance]:
         """The sums that components may add to, by name: those of every model, then its own."""
-        return balances_of(self.components)
+        return {**BALANCES, **{b.name: b for c in self.components for b in c.balances}}
 
     @cached_property
     def foreign(self) -> tuple[Foreign, ...]:
@@ -187,13 +179,9 @@ class Structure:
     @cached_property
     def g(self) -> ca.Function:
         """Casadi function `(time, x, u, p, z) -> z_next`: the sampled states after an instant."""
-        return ca.Function(
-            "g",
-            [self.time, self.x, self.u, self.p, self.z],
-            [self.znext],
-            ["time", "x", "u", "p", "z"],
-            ["z_next"],
-        )
+        arguments = [self.time, self.x, self.u, self.p, self.z]
+        names = ["time", "x", "u", "p", "z"]
+        return ca.Function("g", arguments, [self.znext], names, ["z_next"])
 
 
 @cache
@@ -204,25 +192,30 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     declares what it does not give, a loop among the balances, and for sampled components of
     different periods, or of a period that is no parameter or can be 0.
     """
-    parameters = tuple(p for c in components for p in c.parameters)
-    states = tuple(s for c in components for s in c.states)
-    inputs = tuple(i for c in components for i in c.inputs)
-    outputs = tuple(o for c in components for o in c.outputs)
-    sampled = tuple(s for c in components for s in c.sampled)
-    refuse_duplicates(components)
+    parameters, states, sampled, inputs, outputs = (
+        tuple(v for c in components for v in getattr(c, kind))
+        for kind in ("parameters", "states", "sampled", "inputs", "outputs")
+    )
+    names = [v.name for v in (*parameters, *states, *sampled, *inputs)]
+    refuse_duplicates(components, names)
     period = sample_period(components)
-    names = [n for c in components for n in symbol_names(c)]
     table = {n: ca.SX.sym(n) for n in (*names, "time")}
-    known = balances_of(components)
-    sums = {name: ca.SX.sym(name) for name in known}
+    sums = {n: ca.SX.sym(n) for n in (*BALANCES, *(b.name for c in components for b in c.balances))}
     parts = [_equations_of(c, Symbols({**table, **sums})) for c in components]
-    balances = _sum_terms(parts, components, known)
-    der = {k: v for e in parts for k, v in e.der.items()}
-    out = {k: v for e in parts for k, v in e.out.items()}
-    switches = {k: v for e in parts for k, v in e.switches.items()}
-    following = {k: v for e in parts for k, v in e.next.items()}
+    balances: dict[str, Expression] = {}
+    for component, part in zip(components, parts, strict=True):
+        for name, term in part.add.items():
+            if name not in sums:
+                raise InputError(
+                    f"Component '{component.name}' adds to '{name}', which is no balance;"
+                    f" the balances are {sorted(sums)}."
+                )
+            balances[name] = balances[name] + term if name in balances else ca.SX(term)
+    der, out, switches, following = (
+        {k: v for e in parts for k, v in getattr(e, kind).items()}
+        for kind in ("der", "out", "switches", "next")
+    )
     full = _substitute_in_order(balances, sums)
-
     by, instead = _column(sums.values()), _column(full)
 
     def resolved(expressions: Iterable[Expression]) -> Expression:
@@ -232,7 +225,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     xdot = resolved(der[s.name] for s in states)
     if "displacement" in balances:
         shown = full[list(sums).index("displacement")]
-        out["velocity"] = _time_derivative(shown, x, xdot, table["time"])
+        out["velocity"] = ca.jtimes(shown, x, xdot) + ca.jacobian(shown, table["time"])
     return Structure(
         components=components,
         parameters=parameters,
@@ -268,11 +261,6 @@ def _with_starts(components: tuple[Component, ...], starts: Mapping[str, float])
     )
 
 
-def balances_of(components: Iterable[Component]) -> dict[str, Balance]:
-    """Return the balances of every model, then those that components declare, by name."""
-    return {**BALANCES, **{b.name: b for c in components for b in c.balances}}
-
-
 def _column(parts: Iterable[Expression]) -> Expression:
     return ca.vertcat(ca.SX(0, 1), *parts)
 
@@ -289,37 +277,23 @@ def _equations_of(component: Component, symbols: Symbols) -> Equations:
     return equations
 
 
-def _sum_terms(
-    parts: list[Equations], components: tuple[Component, ...], known: Mapping[str, Balance]
-) -> dict[str, Expression]:
-    balances: dict[str, Expression] = {}
-    for component, part in zip(components, parts, strict=True):
-        for name, term in part.add.items():
-            if name not in known:
-                raise InputError(
-                    [
-                        f"Component '{component.name}' adds to '{name}', which is no balance; "
-                        f"the balances are {sorted(known)}."
-                    ]
-                )
-            balances[name] = balances[name] + term if name in balances else ca.SX(term)
-    return balances
-
-
 def _substitute_in_order(
     balances: Mapping[str, Expression], symbols: Mapping[str, Expression]
 ) -> list[Expression]:
     """Substitute balances into each other until none is left; name the loop if there is one."""
     resolved: dict[str, Expression] = {n: ca.SX(0) for n in symbols if n not in balances}
-    needed = {name: _names_in(expression) for name, expression in balances.items()}
+    needed = {name: {q.name() for q in ca.symvar(e)} for name, e in balances.items()}
     waiting = dict(balances)
     while waiting:
         ready = [name for name in waiting if needed[name].isdisjoint(waiting)]
-        if not ready:
-            loop = " -> ".join(_find_loop(waiting, symbols))
-            raise InputError(
-                [f"The balances form a loop: {loop}; put a state between two of them."]
-            )
+        if not ready:  # follow what each depends on until a name repeats
+            path = [next(iter(waiting))]
+            while path[-1] not in path[:-1]:
+                path.append(
+                    next(n for n in waiting if ca.depends_on(waiting[path[-1]], symbols[n]))
+                )
+            loop = " -> ".join(path[path.index(path[-1]) :])
+            raise InputError(f"The balances form a loop: {loop}; put a state between two of them.")
         for name in ready:
             known = [k for k in resolved if k in needed[name]]
             expression = waiting.pop(name)
@@ -328,24 +302,3 @@ def _substitute_in_order(
                 expression = ca.substitute(expression, by, instead)
             resolved[name] = expression
     return [resolved[name] for name in symbols]
-
-
-def _names_in(expression: Expression) -> set[str]:
-    return {symbol.name() for symbol in ca.symvar(expression)}
-
-
-def _find_loop(waiting: Mapping[str, Expression], symbols: Mapping[str, Expression]) -> list[str]:
-    """Follow dependencies until a name repeats; return the names from its first appearance on."""
-    path = [next(iter(waiting))]
-    while True:
-        following = next(n for n in waiting if ca.depends_on(waiting[path[-1]], symbols[n]))
-        if following in path:
-            return [*path[path.index(following) :], following]
-        path.append(following)
-
-
-def _time_derivative(
-    expression: Expression, x: Expression, xdot: Expression, time: Expression
-) -> Expression:
-    """Return d/dt of an expression in states and time."""
-    return ca.jtimes(expression, x, xdot) + ca.jacobian(expression, time)

@@ -7,8 +7,9 @@ gives one model, which simulates and exports like any other: its variables are n
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 
@@ -16,340 +17,10 @@ from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.units import parse_unit
-from psa_casadi.variables import Input, Nominal, Output, State, Values, nominal_value
+from psa_casadi.variables import Input, Nominal, Output, Values, nominal_value
 
 #: A port: the name of a part and of one of its inputs or outputs.
 Port = tuple[str, str]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Which output feeds each wired input; names outside by port; the parameter of the period."""
-
-    sources: Mapping[Port, Port]
-    inputs: Mapping[Port, str]
-    outputs: Mapping[Port, str]
-    period: str | None
-
-
-def port_text(port: Port) -> str:
-    """Return a port as it is written in a wire."""
-    return ".".join(port)
-
-
-def plan_of(
-    parts: Mapping[str, Model],
-    wires: Sequence[tuple[str, str]],
-    inputs: Mapping[str, str] | None,
-    outputs: Mapping[str, str] | None,
-) -> Plan:
-    """Check wires and names outside and return what they say.
-
-    Raises InputError with all mistakes: names that are no identifiers, ports that do not exist, an
-    input with two sources, units that differ, periods that differ.
-    """
-    problems = Problems()
-    _check_names([*parts, *(inputs or ()), *(outputs or ())], problems)
-    sources = _sources(parts, wires, problems)
-    plan = Plan(
-        sources,
-        _named(parts, "input", inputs, sources, problems),
-        _named(parts, "output", outputs, {}, problems),
-        _period(parts, problems),
-    )
-    problems.raise_if_any()
-    return plan
-
-
-def _check_names(names: Sequence[str], problems: Problems) -> None:
-    for name in names:
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
-            problems.add(
-                f"'{name}' cannot name a part or a port; use letters, digits, underscores, no digit"
-                " first."
-            )
-
-
-def _sources(
-    parts: Mapping[str, Model], wires: Sequence[tuple[str, str]], problems: Problems
-) -> dict[Port, Port]:
-    found: dict[Port, Port] = {}
-    for start, end in wires:
-        source = _port(parts, start, "output", problems)
-        target = _port(parts, end, "input", problems)
-        if source is None or target is None:
-            continue
-        if target in found:
-            problems.add(
-                f"The input '{end}' has two sources, '{port_text(found[target])}' and '{start}';"
-                " leave one out."
-            )
-        given, wanted = _unit(parts, source, "output"), _unit(parts, target, "input")
-        if not _same(given, wanted):
-            problems.add(
-                f"The wire from '{start}' [{given}] to '{end}' [{wanted}] joins different units;"
-                " wire ports of one unit, or put a part between them."
-            )
-        found[target] = source
-    return found
-
-
-def _port(parts: Mapping[str, Model], text: str, kind: str, problems: Problems) -> Port | None:
-    """Return a port by its text, or None after noting what is wrong with it."""
-    name, dot, variable = text.partition(".")
-    if name not in parts or not dot:
-        problems.add(
-            f"'{text}' names no part; write part.{kind}, the parts are {', '.join(parts)}."
-        )
-        return None
-    model = parts[name]
-    known = [v.name for v in _variables(model, kind)]
-    if variable not in known:
-        listed = ", ".join(known) or "none"
-        problems.add(f"'{text}' is no {kind}; the {kind}s of '{name}' are: {listed}.")
-        return None
-    return name, variable
-
-
-def _same(one: str, other: str) -> bool:
-    first, second = parse_unit(one), parse_unit(other)
-    return (first.dimension, first.ratio, first.offset) == (
-        second.dimension,
-        second.ratio,
-        second.offset,
-    )
-
-
-def _variables(model: Model, kind: str) -> tuple[Input | Output, ...]:
-    return model.structure.inputs if kind == "input" else model.structure.outputs
-
-
-def _unit(parts: Mapping[str, Model], port: Port, kind: str) -> str:
-    return next(v.unit for v in _variables(parts[port[0]], kind) if v.name == port[1])
-
-
-def _named(
-    parts: Mapping[str, Model],
-    kind: str,
-    given: Mapping[str, str] | None,
-    sources: Mapping[Port, Port],
-    problems: Problems,
-) -> dict[Port, str]:
-    """Return the names outside of the inputs or outputs that have one; one name each."""
-    if given is None:
-        every = [(part, v.name) for part, model in parts.items() for v in _variables(model, kind)]
-        return {port: "_".join(port) for port in every if port not in sources}
-    found: dict[Port, str] = {}
-    for name, text in given.items():
-        port = _port(parts, text, kind, problems)
-        if port is None:
-            continue
-        other = port_text(sources[port]) if port in sources else found.get(port)
-        if other is not None:
-            what = "has two sources," if kind == "input" else "is named twice outside,"
-            problems.add(f"The {kind} '{text}' {what} '{other}' and '{name}'; leave one out.")
-        found[port] = name
-    return found
-
-
-def _period(parts: Mapping[str, Model], problems: Problems) -> str | None:
-    """Return the parameter that is the period of all sampled parts: that of the first of them."""
-    periods = {
-        f"{name}_{model.structure.period}": model.values[model.structure.period]
-        for name, model in parts.items()
-        if model.structure.period is not None
-    }
-    if len(set(periods.values())) > 1:
-        listed = ", ".join(f"{name} = {value:g} s" for name, value in periods.items())
-        problems.add(f"The sampled parts have different periods: {listed}; give them one.")
-    return next(iter(periods), None)
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A part's equations in symbols of its own, by their names; its inputs are still symbols."""
-
-    symbols: Mapping[str, Expression]
-    xdot: Expression
-    y: Expression
-    znext: Expression
-    switches: Expression
-
-
-def wired_components(parts: Mapping[str, Model], plan: Plan) -> tuple[Component, ...]:
-    """Return one component for each part, its inputs replaced by what feeds them.
-
-    Raises InputError for a loop of outputs that follow their inputs at once.
-    """
-    wiring = _Wiring(parts, plan)
-    return tuple(wiring.component(part) for part in parts)
-
-
-class _Wiring:
-    """The parts in symbols of their own, and the outputs that are resolved so far."""
-
-    def __init__(self, parts: Mapping[str, Model], plan: Plan) -> None:
-        self.models = parts
-        self.plan = plan
-        self.time = ca.SX.sym("time")
-        self.period = ca.SX.sym("period")
-        self.parts = {name: self._renamed(name, model) for name, model in parts.items()}
-        self.known: dict[Port, Expression] = {}
-
-    def _renamed(self, name: str, model: Model) -> _Part:
-        s = model.structure
-        names = (*model.parameter_names, *model.state_names, *model.sampled_names)
-        symbols = {n: ca.SX.sym(f"{name}_{n}") for n in (*names, *model.input_names)}
-        if s.period is not None:
-            symbols[s.period] = self.period
-        results = [s.xdot, s.y, s.znext, ca.vertcat(ca.SX(0, 1), *s.switches.values())]
-        old = [s.time, *(s.symbols[n] for n in symbols)]
-        return _Part(symbols, *ca.substitute(results, old, [self.time, *symbols.values()]))
-
-    def component(self, name: str) -> Component:
-        """Return a part as a component whose variables are named `part_variable`."""
-        model, plan = self.models[name], self.plan
-        s, part = model.structure, self.parts[name]
-        every = ca.vertcat(part.xdot, part.znext, part.switches)
-        whole: Expression = self._wired(name, [every], ())[0]
-        nx, nz = len(s.states), len(s.sampled)
-        outputs = {o.name: self.output((name, o.name), ()) for o in s.outputs}
-        values = Equations(
-            der={f"{name}_{v.name}": whole[i] for i, v in enumerate(s.states)},
-            next={f"{name}_{v.name}": whole[nx + i] for i, v in enumerate(s.sampled)},
-            switches={f"{name}_{n}": whole[nx + nz + i] for i, n in enumerate(s.switches)},
-            out={plan.outputs[name, n]: e for n, e in outputs.items() if (name, n) in plan.outputs},
-        )
-        return _declared(name, model, plan, self._equations(values))
-
-    def output(self, port: Port, path: tuple[Port, ...]) -> Expression:
-        """Return an output in states, parameters and the inputs from outside."""
-        if port in path:
-            loop = " -> ".join(port_text(p) for p in (*path[path.index(port) :], port))
-            raise InputError(
-                f"The outputs form a loop, each following its inputs at once: {loop}; put a part"
-                " with a state or a sampled part between two of them."
-            )
-        if port not in self.known:
-            name, variable = port
-            index = self.models[name].output_names.index(variable)
-            own = self.parts[name].y[index]
-            self.known[port] = self._wired(name, [own], (*path, port))[0]
-        return self.known[port]
-
-    def _wired(
-        self, name: str, expressions: list[Expression], path: tuple[Port, ...]
-    ) -> list[Expression]:
-        """Replace the inputs that expressions of a part depend on by what feeds them."""
-        every = ca.vertcat(*expressions)
-        symbols, feeding = [], []
-        for it in self.models[name].structure.inputs:
-            symbol, port = self.parts[name].symbols[it.name], (name, it.name)
-            if port in self.plan.inputs or not ca.depends_on(every, symbol):
-                continue
-            symbols.append(symbol)
-            source = self.plan.sources.get(port)
-            feeding.append(ca.SX(it.start) if source is None else self.output(source, path))
-        replaced: list[Expression] = ca.substitute(expressions, symbols, feeding)
-        return replaced
-
-    def _equations(self, values: Equations) -> Callable[[Symbols], Equations]:
-        """Return the function that gives a part's equations in the symbols of the system."""
-        places = [(self.time, "time")]
-        if self.plan.period is not None:
-            places.append((self.period, self.plan.period))
-        for name, part in self.parts.items():
-            for variable, symbol in part.symbols.items():
-                port = (name, variable)
-                if variable == self.models[name].structure.period:
-                    continue
-                if variable not in self.models[name].input_names:
-                    places.append((symbol, f"{name}_{variable}"))
-                elif port in self.plan.inputs:
-                    places.append((symbol, self.plan.inputs[port]))
-        symbols = [symbol for symbol, _ in places]
-
-        def equations(s: Symbols) -> Equations:
-            after = [getattr(s, name) for _, name in places]
-
-            def of(expressions: Mapping[str, Expression]) -> dict[str, Expression]:
-                found = ca.substitute(list(expressions.values()), symbols, after)
-                return dict(zip(expressions, found, strict=True))
-
-            return Equations(
-                der=of(values.der),
-                next=of(values.next),
-                switches=of(values.switches),
-                out=of(values.out),
-            )
-
-        return equations
-
-
-def _declared(
-    name: str, model: Model, plan: Plan, equations: Callable[[Symbols], Equations]
-) -> Component:
-    """Return the component of a part: its variables renamed, its sources and equations kept."""
-    s = model.structure
-    size = _sizes(name, model, plan.period)
-    sources = "; ".join(dict.fromkeys(c.source.rstrip(".") for c in model.components))
-    texts = ";  ".join(c.equation_text for c in model.components if c.equation_text)
-
-    def own(variable: State) -> State:
-        text = f"{name}: {variable.description}"
-        name_there = f"{name}_{variable.name}"
-        return replace(variable, name=name_there, description=text, nominal=size(variable.nominal))
-
-    return Component(
-        name=name,
-        description=model.description or "; ".join(c.description for c in model.components),
-        source=sources,
-        equation_text=texts,
-        equations=equations,
-        parameters=tuple(
-            replace(
-                p,
-                name=f"{name}_{p.name}",
-                description=f"{name}: {p.description}",
-                scale=None if p.scale is None else size(p.scale),
-            )
-            for p in s.parameters
-            if p.name != s.period or plan.period == f"{name}_{p.name}"
-        ),
-        states=tuple(own(v) for v in s.states),
-        sampled=tuple(own(v) for v in s.sampled),
-        sample_period=plan.period if s.sampled else None,
-        inputs=tuple(
-            replace(v, name=plan.inputs[name, v.name], nominal=size(v.nominal))
-            for v in s.inputs
-            if (name, v.name) in plan.inputs
-        ),
-        outputs=tuple(
-            replace(v, name=plan.outputs[name, v.name], nominal=size(v.nominal))
-            for v in s.outputs
-            if (name, v.name) in plan.outputs
-        ),
-    )
-
-
-def _sizes(name: str, model: Model, period: str | None) -> Callable[[Nominal], Nominal]:
-    """Return what turns a size, given by a part's own values, into one by the system's."""
-    places = {n: f"{name}_{n}" for n in model.parameter_names}
-    if model.structure.period is not None and period is not None:
-        places[model.structure.period] = period
-
-    return lambda own: _BySystem(own, places) if callable(own) else own
-
-
-@dataclass(frozen=True)
-class _BySystem:
-    """A size of a part by the system's values; `places` are its parameters' names there."""
-
-    own: Nominal
-    places: Mapping[str, str]
-
-    def __call__(self, values: Values) -> float:
-        return nominal_value(self.own, {n: values[place] for n, place in self.places.items()})
 
 
 @dataclass(frozen=True)
@@ -370,13 +41,9 @@ class System:
     def model(self) -> Model:
         """Return the system as one model."""
         return connect(
-            self.parts,
-            self.wires,
-            name=self.name,
-            inputs=self.inputs,
-            outputs=self.outputs,
+            self.parts, self.wires, name=self.name, inputs=self.inputs, outputs=self.outputs,
             description=self.description,
-        )
+        )  # fmt: skip
 
 
 def connect(
@@ -399,12 +66,254 @@ def connect(
     sources, a wire between units that differ, periods that differ, and a loop of outputs that
     follow their inputs at once, which it names.
     """
-    plan = plan_of(parts, wires, inputs, outputs)
-    components = wired_components(parts, plan)
-    return compose(components, _values(parts, components), name=name, description=description)
-
-
-def _values(parts: Mapping[str, Model], components: Iterable[Component]) -> dict[str, float]:
+    plan = _plan_of(parts, wires, inputs, outputs)
+    wiring = _Wiring(parts, plan)
+    components = [wiring.component(part) for part in parts]
     given = {f"{part}_{n}": v for part, model in parts.items() for n, v in model.values.items()}
-    declared = {p.name for c in components for p in c.parameters}
-    return {n: v for n, v in given.items() if n in declared}
+    own = {p.name: given[p.name] for c in components for p in c.parameters}
+    return compose(components, own, name=name, description=description)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Which output feeds each wired input; names outside by port; the parameter of the period."""
+
+    sources: Mapping[Port, Port]
+    inputs: Mapping[Port, str]
+    outputs: Mapping[Port, str]
+    period: str | None
+
+
+def _plan_of(
+    parts: Mapping[str, Model],
+    wires: Sequence[tuple[str, str]],
+    inputs: Mapping[str, str] | None,
+    outputs: Mapping[str, str] | None,
+) -> _Plan:
+    """Check wires and names outside, names, units and periods; return what they say."""
+    problems = Problems()
+    for name in (*parts, *(inputs or ()), *(outputs or ())):
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+            problems.add(
+                f"'{name}' cannot name a part or a port; use letters, digits, underscores, no digit"
+                " first."
+            )
+    sources: dict[Port, Port] = {}
+    for start, end in wires:
+        given, wanted = (_port(parts, q, problems) for q in ((start, "output"), (end, "input")))
+        if given is None or wanted is None:
+            continue
+        (source, shown), (target, taken) = given, wanted
+        if target in sources:
+            problems.add(
+                f"The input '{end}' has two sources, '{'.'.join(sources[target])}' and '{start}';"
+                " leave one out."
+            )
+        one, other = parse_unit(shown.unit), parse_unit(taken.unit)
+        if (one.dimension, one.ratio, one.offset) != (other.dimension, other.ratio, other.offset):
+            problems.add(
+                f"The wire from '{start}' [{shown.unit}] to '{end}' [{taken.unit}] joins different"
+                " units; wire ports of one unit, or put a part between them."
+            )
+        sources[target] = source
+    named = (
+        _named(parts, "input", inputs, sources, problems),
+        _named(parts, "output", outputs, {}, problems),
+    )
+    periods = {
+        f"{name}_{q}": model.values[q]
+        for name, model in parts.items()
+        if (q := model.structure.period) is not None
+    }
+    if len(set(periods.values())) > 1:
+        listed = ", ".join(f"{name} = {value:g} s" for name, value in periods.items())
+        problems.add(f"The sampled parts have different periods: {listed}; give them one.")
+    problems.raise_if_any()
+    return _Plan(sources, *named, next(iter(periods), None))
+
+
+def _variables(model: Model, kind: str) -> tuple[Input | Output, ...]:
+    return model.structure.inputs if kind == "input" else model.structure.outputs
+
+
+def _port(
+    parts: Mapping[str, Model], text_and_kind: tuple[str, str], problems: Problems
+) -> tuple[Port, Input | Output] | None:
+    """Return a port and its variable by its text, or None after noting what is wrong with it."""
+    text, kind = text_and_kind
+    name, dot, variable = text.partition(".")
+    if name not in parts or not dot:
+        problems.add(
+            f"'{text}' names no part; write part.{kind}, the parts are {', '.join(parts)}."
+        )
+        return None
+    known = {v.name: v for v in _variables(parts[name], kind)}
+    if variable not in known:
+        listed = ", ".join(known) or "none"
+        problems.add(f"'{text}' is no {kind}; the {kind}s of '{name}' are: {listed}.")
+        return None
+    return (name, variable), known[variable]
+
+
+def _named(
+    parts: Mapping[str, Model],
+    kind: str,
+    given: Mapping[str, str] | None,
+    sources: Mapping[Port, Port],
+    problems: Problems,
+) -> dict[Port, str]:
+    """Return the names outside of the inputs or outputs that have one; one name each."""
+    if given is None:
+        every = [(part, v.name) for part, model in parts.items() for v in _variables(model, kind)]
+        return {port: "_".join(port) for port in every if port not in sources}
+    found: dict[Port, str] = {}
+    for name, text in given.items():
+        known = _port(parts, (text, kind), problems)
+        if known is None:
+            continue
+        port, _ = known
+        other = ".".join(sources[port]) if port in sources else found.get(port)
+        if other is not None:
+            what = "has two sources," if kind == "input" else "is named twice outside,"
+            problems.add(f"The {kind} '{text}' {what} '{other}' and '{name}'; leave one out.")
+        found[port] = name
+    return found
+
+
+class _Wiring:
+    """The parts in symbols by their names in the system, and the outputs resolved so far.
+
+    Inputs that are fed from inside have symbols of their own, until they are replaced.
+    """
+
+    def __init__(self, parts: Mapping[str, Model], plan: _Plan) -> None:
+        self.models, self.plan = parts, plan
+        self.symbols: dict[str, Expression] = {"time": ca.SX.sym("time")}
+        self.inside: dict[Port, Expression] = {}
+        self.known: dict[Port, Expression] = {}
+        self.results = {name: self._renamed(name, model) for name, model in parts.items()}
+
+    def _renamed(self, name: str, model: Model) -> list[Expression]:
+        """Return slopes, next values, switches and outputs of a part in its own new symbols."""
+        s, new = model.structure, [self.symbols["time"]]
+        own = (*model.parameter_names, *model.state_names, *model.sampled_names, *model.input_names)
+        for n in own:
+            symbol, port = ca.SX.sym(f"{name}_{n}"), (name, n)
+            if n in model.input_names and port not in self.plan.inputs:
+                new.append(self.inside.setdefault(port, symbol))
+                continue
+            outside = self.plan.inputs.get(port) or f"{name}_{n}"
+            if n == s.period and self.plan.period is not None:
+                outside = self.plan.period
+            new.append(self.symbols.setdefault(outside, symbol))
+        results = [s.xdot, s.znext, ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.y]
+        found: list[Expression] = ca.substitute(
+            results, [s.time, *(s.symbols[n] for n in own)], new
+        )
+        return found
+
+    def component(self, name: str) -> Component:
+        """Return a part as a component whose variables are named `part_variable`.
+
+        Its inputs are replaced by what feeds them. Raises InputError for a loop of outputs that
+        follow their inputs at once.
+        """
+        model, plan = self.models[name], self.plan
+        s = model.structure
+        places = {"der": model.state_names, "next": model.sampled_names, "switches": s.switches}
+        whole = self._wired(name, ca.vertcat(*self.results[name][:3]), ())
+        rows = iter([whole[k] for k in range(whole.numel())])
+        values = {k: {f"{name}_{n}": next(rows) for n in names} for k, names in places.items()}
+        shown = {n: self.output((name, n), ()) for n in model.output_names}
+        values["out"] = {
+            plan.outputs[q]: e for n, e in shown.items() if (q := (name, n)) in plan.outputs
+        }
+        before = list(self.symbols.values())
+
+        def equations(symbols: Symbols) -> Equations:
+            after = [getattr(symbols, n) for n in self.symbols]
+            return Equations(**{
+                kind: dict(zip(own, ca.substitute(list(own.values()), before, after), strict=True))
+                for kind, own in values.items()
+            })  # fmt: skip
+
+        sources = "; ".join(dict.fromkeys(c.source.rstrip(".") for c in model.components))
+        return Component(
+            name=name,
+            description=model.description or "; ".join(c.description for c in model.components),
+            source=sources,
+            equation_text=";  ".join(c.equation_text for c in model.components if c.equation_text),
+            equations=equations,
+            sample_period=plan.period if s.sampled else None,
+            **self._declared(name, model),
+        )
+
+    def _declared(self, name: str, model: Model) -> dict[str, Any]:
+        """Return the variables of a part as they are named in the system, by kind."""
+        s, plan = model.structure, self.plan
+        places = {n: f"{name}_{n}" for n in model.parameter_names}
+        if s.period is not None and plan.period is not None:
+            places[s.period] = plan.period
+
+        def own(variable: Any, **size: Any) -> Any:
+            text = f"{name}: {variable.description}"
+            return replace(variable, name=f"{name}_{variable.name}", description=text, **size)
+
+        def size(nominal: Nominal) -> Nominal:
+            return _BySystem(nominal, places) if callable(nominal) else nominal
+
+        def named(variables: Sequence[Any], names: Mapping[Port, str]) -> tuple[Any, ...]:
+            return tuple(
+                replace(v, name=names[name, v.name], nominal=size(v.nominal))
+                for v in variables
+                if (name, v.name) in names
+            )
+
+        return {
+            "parameters": tuple(
+                own(p, scale=None if p.scale is None else size(p.scale))
+                for p in s.parameters
+                if p.name != s.period or plan.period == f"{name}_{p.name}"
+            ),
+            "states": tuple(own(v, nominal=size(v.nominal)) for v in s.states),
+            "sampled": tuple(own(v, nominal=size(v.nominal)) for v in s.sampled),
+            "inputs": named(s.inputs, plan.inputs),
+            "outputs": named(s.outputs, plan.outputs),
+        }
+
+    def output(self, port: Port, path: tuple[Port, ...]) -> Expression:
+        """Return an output in states, parameters and the inputs from outside."""
+        if port in path:
+            loop = " -> ".join(".".join(p) for p in (*path[path.index(port) :], port))
+            raise InputError(
+                f"The outputs form a loop, each following its inputs at once: {loop}; put a part"
+                " with a state or a sampled part between two of them."
+            )
+        if port not in self.known:
+            name, variable = port
+            own = self.results[name][3][self.models[name].output_names.index(variable)]
+            self.known[port] = self._wired(name, own, (*path, port))
+        return self.known[port]
+
+    def _wired(self, name: str, expression: Expression, path: tuple[Port, ...]) -> Expression:
+        """Replace the inputs that an expression of a part depends on by what feeds them."""
+        symbols, feeding = [], []
+        for it in self.models[name].structure.inputs:
+            symbol = self.inside.get((name, it.name))
+            if symbol is None or not ca.depends_on(expression, symbol):
+                continue
+            symbols.append(symbol)
+            source = self.plan.sources.get((name, it.name))
+            feeding.append(ca.SX(it.start) if source is None else self.output(source, path))
+        return ca.substitute([expression], symbols, feeding)[0]
+
+
+@dataclass(frozen=True)
+class _BySystem:
+    """A size of a part by the system's values; `places` are its parameters' names there."""
+
+    own: Nominal
+    places: Mapping[str, str]
+
+    def __call__(self, values: Values) -> float:
+        return nominal_value(self.own, {n: values[place] for n, place in self.places.items()})

@@ -1,9 +1,8 @@
 """One record under many sets of parameters: in the lanes of a core's vectors, or on a GPU."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -22,36 +21,31 @@ from psa_casadi.variables import nominal_value
 FloatArray = npt.NDArray[np.float64]
 
 ReductionName = Literal["range", "peak", "last", "misfit"]
+_Reduce = Callable[[FloatArray], npt.ArrayLike]
 
 
-@dataclass(frozen=True)
-class Reduction:
-    """One number [m]: of a displacement and what was measured, both (n,), or of a summary (m,)."""
+class Reduction(NamedTuple):
+    """One number [m]: of what was measured and a displacement, both (n,), or of a summary (m,)."""
 
-    of_row: Callable[[FloatArray, FloatArray], float]
+    of_row: Callable[[FloatArray, FloatArray], npt.ArrayLike]
     of_summary: Callable[[Summary, int], FloatArray]
 
-    def beside(self, meant: FloatArray) -> Callable[[FloatArray], float]:
-        """Return the function of a displacement (n,) alone."""
-        return lambda row: self.of_row(row, meant)
 
-
-REDUCTIONS: dict[ReductionName, Reduction] = {
-    "range": Reduction(lambda row, _: float(np.ptp(row)), lambda s, _: s.largest - s.least),
+REDUCTIONS: dict[str, Reduction] = {
+    "range": Reduction(lambda _, row: np.ptp(row), lambda s, _: s.largest - s.least),
     "peak": Reduction(
-        lambda row, _: float(np.max(np.abs(row))),
+        lambda _, row: np.max(np.abs(row)),
         lambda s, _: np.maximum(np.abs(s.least), np.abs(s.largest)),
     ),
-    "last": Reduction(lambda row, _: float(row[-1]), lambda s, _: s.last),
+    "last": Reduction(lambda _, row: row[-1], lambda s, _: s.last),
     "misfit": Reduction(
-        lambda row, meant: float(np.sqrt(np.mean((row - meant) ** 2))),
+        lambda meant, row: np.sqrt(np.mean((row - meant) ** 2)),
         lambda s, n: np.sqrt(s.squares / n),
     ),
 }
 
 
 Device = Literal["cpu", "cuda"]
-_Reduce = Callable[[FloatArray], npt.ArrayLike]
 
 
 def simulate_many(
@@ -93,40 +87,34 @@ def simulate_many(
         raise InputError(f"There is no device {device!r}; choose one of {get_args(Device)}.")
     if device == "cuda":
         device_module()  # told before work begins
-    kept = _named(reduce) if isinstance(reduce, str) else reduce
-    meant = _meant(record) if reduce == "misfit" else np.zeros(record.n)
+    named = REDUCTIONS.get(reduce) if isinstance(reduce, str) else None
+    if isinstance(reduce, str) and named is None:
+        raise InputError(
+            f"There is no reduction {reduce!r}; choose one of {tuple(REDUCTIONS)}, or give a"
+            " function of a displacement."
+        )
+    meant = record.displacement if reduce == "misfit" else np.zeros(record.n)
+    if meant is None or (reduce == "misfit" and record.displacement_unit != "m"):
+        raise InputError(
+            f"reduce='misfit' needs the displacement of the record {record.name!r} in metres, and"
+            " it has none; read it with its displacement column, or keep something else."
+        )
     t, u = record.time - record.time[0], record_inputs(model, record, record.n)
     p = _columns(model, sets) if isinstance(sets, Mapping) else _rows(model, sets)
-    work = _Work(model, p, Task(model.structure, output, t, u, meant, rtol))
-    _check_bounds(work)
+    task = Task(model.structure, output, t, u, meant, rtol)
+    bounds = np.array([q.bounds for q in model.structure.parameters]).reshape(-1, 2, 1)
+    outside = ~np.all((bounds[:, 0] <= p) & (p <= bounds[:, 1]), axis=0)
+    for k in np.flatnonzero(outside)[:1]:
+        _alone(model, p[:, k])  # raises
+    of_row: _Reduce | None = None if isinstance(reduce, str) else reduce
     if device == "cuda":
-        return _on_device(work, kept)
-    return _on_cores(work, kept.beside(meant) if isinstance(kept, Reduction) else kept)
+        return _on_device(model, task, p, named, of_row)
+    return _on_cores(model, task, p, partial(named.of_row, meant) if named else of_row)
 
 
-@dataclass(frozen=True)
-class _Work:
-    """A task under sets of parameters p (np, m)."""
-
-    model: Model
-    p: FloatArray
-    task: Task
-
-    @property
-    def count(self) -> int:
-        """Return the number of sets."""
-        return int(self.p.shape[1])
-
-    def numbers(self, which: range) -> Numbers:
-        """Return the numbers of some of the sets, with the sizes and the starts of the states."""
-        p = self.p[:, which.start : which.stop]
-        nominal = _sizes(self.model, p)
-        return Numbers(p, starts_on(self.model, p, nominal, self.task.t, self.task.u), nominal)
-
-    def alone(self, which: int) -> Model:
-        """Return the model with the values of one set."""
-        names = self.model.parameter_names
-        return self.model.with_values(dict(zip(names, self.p[:, which].tolist(), strict=True)))
+def _alone(model: Model, p: FloatArray) -> Model:
+    """Return the model with the values p (np,) of one set."""
+    return model.with_values(dict(zip(model.parameter_names, p.tolist(), strict=True)))
 
 
 def _rows(model: Model, sets: Sequence[Mapping[str, float]]) -> FloatArray:
@@ -162,47 +150,23 @@ def _columns(model: Model, sets: Mapping[str, npt.ArrayLike]) -> FloatArray:
     ])  # fmt: skip
 
 
-def _check_bounds(work: _Work) -> None:
-    """Raise InputError for the first set that has a value out of bounds."""
-    bounds = np.array([q.bounds for q in work.task.structure.parameters]).reshape(-1, 2, 1)
-    outside = ~np.all((bounds[:, 0] <= work.p) & (work.p <= bounds[:, 1]), axis=0)
-    for k in np.flatnonzero(outside)[:1]:
-        work.alone(int(k))  # raises
+def _numbers(model: Model, task: Task, p: FloatArray) -> Numbers:
+    """Return parameters p (np, m) with the sizes and the starts of the states.
 
-
-def _sizes(model: Model, p: FloatArray) -> FloatArray:
-    """Return the usual sizes of states (nx, m); a function that several of them have runs once."""
-    names, nominals = model.parameter_names, [s.nominal for s in model.structure.states]
+    A function that several states have as their size runs once.
+    """
+    nominals = [s.nominal for s in model.structure.states]
     unlike = list(dict.fromkeys(nominals))
-    given = (dict(zip(names, row, strict=True)) for row in p.T.tolist())
+    given = (dict(zip(model.parameter_names, row, strict=True)) for row in p.T.tolist())
     sizes = [[nominal_value(size, values) for size in unlike] for values in given]
     places = [unlike.index(size) for size in nominals]
-    return np.array(sizes).reshape(p.shape[1], len(unlike)).T[places]
+    nominal = np.array(sizes).reshape(p.shape[1], len(unlike)).T[places]
+    return Numbers(p, starts_on(model, p, nominal, task.t, task.u), nominal)
 
 
-def _named(name: str) -> Reduction:
-    for known, reduction in REDUCTIONS.items():
-        if known == name:
-            return reduction
-    raise InputError(
-        f"There is no reduction {name!r}; choose one of {tuple(REDUCTIONS)}, or give a function of"
-        " a displacement."
-    )
-
-
-def _meant(record: Record) -> FloatArray:
-    """Return what was measured [m]."""
-    if record.displacement is None or record.displacement_unit != "m":
-        raise InputError(
-            f"reduce='misfit' needs the displacement of the record {record.name!r} in metres, and"
-            " it has none; read it with its displacement column, or keep something else."
-        )
-    return record.displacement
-
-
-def _on_cores(work: _Work, reduce: _Reduce | None) -> FloatArray:
+def _on_cores(model: Model, task: Task, p: FloatArray, reduce: _Reduce | None) -> FloatArray:
     """Run sets in lanes on all cores, or one by one in the stepper."""
-    task, count, n = work.task, work.count, len(work.task.t)
+    count, n = p.shape[1], len(task.t)
     whole = np.empty((count if reduce is None else 0, n))
 
     def kept(rows: FloatArray, which: range) -> list[FloatArray]:
@@ -212,15 +176,15 @@ def _on_cores(work: _Work, reduce: _Reduce | None) -> FloatArray:
         return []
 
     def lanes(which: range) -> list[FloatArray]:
-        p, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
+        own, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
         found = run_sets(
-            task.structure, task.t, task.u, p=p, x0=x0, nominal=nominal,
+            task.structure, task.t, task.u, p=own, x0=x0, nominal=nominal,
             tolerance=task.tolerance, output=task.output,
         )  # fmt: skip
         return kept(found.T, which)
 
     def alone(which: range) -> list[FloatArray]:
-        one = work.alone(which.start)
+        one = _alone(model, p[:, which.start])
         way = Way(task.tolerance, task.tolerance, stepped=True)
         try:
             x0 = start_on(one, task.t, task.u).x
@@ -230,22 +194,25 @@ def _on_cores(work: _Work, reduce: _Reduce | None) -> FloatArray:
         return kept(row[None], which)
 
     try:
-        numbers = work.numbers(range(count))
+        numbers = _numbers(model, task, p)
         rows = side_by_side(lanes, _parts(count, LANES))
     except NotExact:
         rows = side_by_side(alone, _parts(count, 1))
     return whole if reduce is None else np.array([row for group in rows for row in group])
 
 
-def _on_device(work: _Work, reduce: Reduction | _Reduce | None) -> FloatArray:
+def _on_device(
+    model: Model, task: Task, p: FloatArray, named: Reduction | None, reduce: _Reduce | None
+) -> FloatArray:
     """Run sets on a GPU, one a thread."""
-    count, n = work.count, len(work.task.t)
-    found: list[FloatArray] = [np.empty((0, n))] if reduce is None else []
-    named = isinstance(reduce, Reduction)
-    parts = partial(_parts, count)
-    for summary, rows in run_on_device(work.task, parts, work.numbers, whole=not named):
-        if isinstance(reduce, Reduction):
-            found.append(reduce.of_summary(summary, n))
+    n = len(task.t)
+    found: list[FloatArray] = [np.empty((0, n))] if named is None and reduce is None else []
+    for summary, rows in run_on_device(
+        task, partial(_parts, p.shape[1]),
+        lambda which: _numbers(model, task, p[:, which.start : which.stop]), whole=named is None,
+    ):  # fmt: skip
+        if named is not None:
+            found.append(named.of_summary(summary, n))
         elif rows is not None:
             found.append(rows if reduce is None else np.array([reduce(row) for row in rows]))
     return np.concatenate(found) if found else np.empty(0)

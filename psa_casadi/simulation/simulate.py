@@ -13,7 +13,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.shown import Shown, frame, with_units
 from psa_casadi.simulation.exact.run import NotExact, run_exact
-from psa_casadi.simulation.start import memory_names, start_on, start_state
+from psa_casadi.simulation.start import start_on, start_state
 from psa_casadi.simulation.stepper import Steps, run
 
 FloatArray = npt.NDArray[np.float64]
@@ -89,22 +89,20 @@ def trace(
     `steps_limit` bounds the stepper's work between two samples, `steps_most` that of the run.
     Raises SimulationError where both ways fail.
     """
-    none = np.zeros((len(t), 0))
     if not way.stepped:
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
                 unknowns=unknowns, s0=s0, output=output,
             )  # fmt: skip
-            slopes = none if found.sensitivity is None else found.sensitivity
-            return Traced(found.shown, slopes, EXACT)
+            return Traced(found.shown, found.sensitivity, EXACT)
         except NotExact:
             pass
     steps = run(
         model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, steps_most=steps_most,
         unknowns=unknowns, s0=s0, output=output,
     )  # fmt: skip
-    slopes = none if steps.sensitivity is None else steps.sensitivity
+    slopes = np.zeros((len(t), 0)) if steps.sensitivity is None else steps.sensitivity
     return Traced(steps.y[:, model.output_names.index(output)], slopes, STEPPER)
 
 
@@ -116,32 +114,25 @@ def accurate(
     Exact steps get finer until two runs agree to that; where they do not, or for tolerances below
     1e-6, the stepper takes steps of 0.0005 `rtol`.
     """
-    output = output_of(model)
+    output = output_of(model) or ""
     before: FloatArray | None = None
-    nominal = 0.0 if output is None else model.output_nominals()[model.output_names.index(output)]
     for share, coarsest in LADDER if output and rtol >= TIGHTEST else ():
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
-                output=output or "", everything=before is not None,
+                output=output, everything=before is not None,
             )  # fmt: skip
         except NotExact:
             break
-        size = max(float(np.ptp(found.shown)), STILL * nominal)
-        fine = before is not None and not found.forced
-        if (
-            before is not None
-            and fine
-            and np.max(np.abs(found.shown - before)) <= AGREE * rtol * size
-        ):
-            x, y = found.x, found.y
-            if x is not None and y is not None:
-                empty = np.empty((len(t), 0))
-                steps = Steps(x, empty, y, None, found.steps, found.rejected, 0)
-                return steps, EXACT
+        if before is not None and not found.forced:
+            nominal = model.output_nominals()[model.output_names.index(output)]
+            size = max(float(np.ptp(found.shown)), STILL * nominal)
+            if np.max(np.abs(found.shown - before)) <= AGREE * rtol * size:
+                z = np.empty((len(t), 0))
+                return Steps(found.x, z, found.y, None, found.steps, found.rejected, 0), EXACT
         before = found.shown
-    share = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
-    return run(model, t, u, x0, rtol=share, hold=hold), STEPPER
+    step_rtol = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
+    return run(model, t, u, x0, rtol=step_rtol, hold=hold), STEPPER
 
 
 @dataclass(frozen=True, repr=False)
@@ -163,8 +154,7 @@ class Trajectory(Shown):
     @property
     def shown(self) -> str:
         """The output that the sensor shows; without a sensor, the displacement."""
-        name = "measured_displacement"
-        return name if name in self.outputs else "displacement"
+        return SHOWN[0] if SHOWN[0] in self.outputs else SHOWN[1]
 
     @property
     def displacement(self) -> FloatArray:
@@ -205,10 +195,8 @@ def simulate(
     Raises SimulationError, and InputError for samples that do not fit the times or the model.
     """
     t, v = np.asarray(time, dtype=float), np.asarray(voltage, dtype=float)
-    given = {"voltage": v}
-    for name, samples in (("load_force", load_force), ("temperature", temperature)):
-        if samples is not None:
-            given[name] = np.asarray(samples, dtype=float)
+    more = {"load_force": load_force, "temperature": temperature}
+    given = {"voltage": v, **{n: np.asarray(q, float) for n, q in more.items() if q is not None}}
     _check(model, t, given)
     u = input_samples(model, len(t), given)
     if as_exported is None:
@@ -219,7 +207,18 @@ def simulate(
         x0 = np.array([s.start for s in model.structure.states])
     else:
         x0 = start_on(model, t, u, memory).x
-    return _trajectory(model, t, v, *accurate(model, t, u, x0, rtol=rtol, hold=hold))
+    steps, way = accurate(model, t, u, x0, rtol=rtol, hold=hold)
+    s, state_names = model.structure, (*model.state_names, *model.sampled_names)
+    return Trajectory(
+        time=t,
+        voltage=v,
+        states=dict(zip(state_names, (*steps.x.T, *steps.z.T), strict=True)),
+        outputs=dict(zip(model.output_names, steps.y.T, strict=True)),
+        steps=steps.steps,
+        way=way,
+        units=dict(zip(state_names, (q.unit for q in (*s.states, *s.sampled)), strict=True))
+        | {o.name: o.unit for o in s.outputs},
+    )
 
 
 def input_samples(model: Model, n: int, given: Mapping[str, FloatArray]) -> FloatArray:
@@ -267,32 +266,9 @@ def simulate_record(
     """
     extra = {n: getattr(record, n) for n in ("load_force", "temperature") if n in model.input_names}
     return simulate(
-        model,
-        record.time,
-        record.voltage,
-        memory=memory,
-        as_exported=as_exported,
-        rtol=rtol,
+        model, record.time, record.voltage, memory=memory, as_exported=as_exported, rtol=rtol,
         **extra,
-    )
-
-
-def _trajectory(model: Model, t: FloatArray, v: FloatArray, steps: Steps, way: str) -> Trajectory:
-    return Trajectory(
-        time=t,
-        voltage=v,
-        states={
-            **dict(zip(model.state_names, steps.x.T, strict=True)),
-            **dict(zip(model.sampled_names, steps.z.T, strict=True)),
-        },
-        outputs=dict(zip(model.output_names, steps.y.T, strict=True)),
-        steps=steps.steps,
-        way=way,
-        units={
-            **{s.name: s.unit for s in (*model.structure.states, *model.structure.sampled)},
-            **{o.name: o.unit for o in model.structure.outputs},
-        },
-    )
+    )  # fmt: skip
 
 
 #: Samples of a sweep and of a rest.
@@ -327,7 +303,6 @@ def memory_after(
     if not (np.isfinite(rest) and rest >= 0.0):
         problems.add(f"The rest after the history takes {rest:g} s; give a duration of 0 or more.")
     problems.raise_if_any()
-    names = memory_names(model.structure)
     turns = [0.0, *voltages, at]
     share = np.linspace(0.0, 1.0, _SAMPLES + 1)
     parts = [a + (b - a) * share[1:] for a, b in pairwise(turns) if a != b]
@@ -335,16 +310,17 @@ def memory_after(
     if rest > 0.0:
         parts.append(np.full(_SAMPLES, at))
         steps += [rest / _SAMPLES] * _SAMPLES
+    memories = [s for s in model.structure.states if s.memory]
     if not parts:
-        return dict.fromkeys(names, 0.0)
+        return {s.name: 0.0 for s in memories}
     times, played_voltage = np.append(0.0, np.cumsum(steps)), np.concatenate([[0.0], *parts])
     played = simulate(model, times, played_voltage, as_exported=False)
-    ended = {n: float(played.states[n][-1]) for n in names}
-    stays = {s.name: ended[s.name] for s in model.structure.states if s.memory and not s.settles}
+    ended = {s.name: float(played.states[s.name][-1]) for s in memories}
+    stays = {s.name: ended[s.name] for s in memories if not s.settles}
     settled = start_state(model, _held(model, at), memory=stays).x
-    for state, value in zip(model.structure.states, settled, strict=True):
-        if state.memory and state.settles:
-            ended[state.name] -= float(value)
+    for s in memories:
+        if s.settles:
+            ended[s.name] -= float(settled[model.state_names.index(s.name)])
     return ended
 
 

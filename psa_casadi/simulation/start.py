@@ -231,29 +231,33 @@ def _start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca
     where = [s.time, s.x, s.u, s.p, deviation]
     slopes = _slopes(s)
     by_x, by_u = ca.jacobian(slopes, s.x), ca.jacobian(slopes, s.u)
-    newton = _newton(s, (slopes, by_x), settling, _placed(s, s.x, memory, deviation))
-    settle = ca.Function("settle", where, [ca.densify(newton)])
-    settled = ca.substitute([newton], [s.x], [known])[0]
-    start = _newton(s, (slopes, by_x), fast, _placed(s, s.x, memory, deviation, settled))
+
+    def newton(rows: list[int], x: Expression) -> Expression:
+        """A Newton step for the rows' derivatives to vanish; its derivative is the implicit one."""
+        return _moved(x, rows, -ca.solve(_at(s, by_x[rows, rows], x), _at(s, slopes, x)[rows]))
+
+    # memories that do not settle are at their deviation, those that do count it from where they do
+    held = {i: deviation[k] for k, i in enumerate(memory) if not s.states[i].settles}
+    placed = _put(s.x, held)
+    first = newton(settling, placed)
+    settle = ca.Function("settle", where, [ca.densify(first)])
+    settled = ca.substitute([first], [s.x], [known])[0]
+    free = {i: settled[i] + deviation[k] for k, i in enumerate(memory) if s.states[i].settles}
+    start = newton(fast, _put(placed, free))
     rest = ca.Function("rest", [*where, known], [ca.densify(start)])
     rate = ca.SX.sym("rate", len(s.inputs))
     moving: Expression = start
     jacobian, by_input = _at(s, by_x, start), _at(s, by_u, start)
+    own = jacobian[fast, fast]
     for _ in range(2):
         drive = by_input[fast, :] @ rate
         if memory:
             drive += jacobian[fast, memory] @ _at(s, slopes, moving)[memory]
-        moving = _in_motion(start, fast, jacobian[fast, fast], drive)
+        # a steady motion lags behind the rest by the rates it takes
+        moving = _moved(start, fast, _solved(own, -_solved(own, drive)))
     derivatives: list[Expression] = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
-    return (
-        settle,
-        rest,
-        ca.Function(
-            "moving",
-            [*where, known, rate],
-            [ca.densify(e) for e in (moving, *derivatives)],
-        ),
-    )
+    results = [ca.densify(e) for e in (moving, *derivatives)]
+    return settle, rest, ca.Function("moving", [*where, known, rate], results)
 
 
 @lru_cache(maxsize=64)
@@ -261,15 +265,10 @@ def _functions_of_many(
     structure: Structure, sets: int
 ) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return the functions of `start_state` for so many columns, the last without derivatives."""
-    settle, rest, moving = (f.map(sets) for f in _without_derivatives(structure))
-    return settle, rest, moving
-
-
-@cache
-def _without_derivatives(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
     settle, rest, moving = _start_functions(structure)
     given = moving.sx_in()
-    return settle, rest, ca.Function("start", given, [moving.call(given)[0]])
+    start = ca.Function("start", given, [moving.call(given)[0]])
+    return settle.map(sets), rest.map(sets), start.map(sets)
 
 
 def _slopes(s: Structure) -> Expression:
@@ -283,39 +282,14 @@ def _at(s: Structure, expression: Expression, x: Expression) -> Expression:
     return ca.substitute([expression], [s.x], [x])[0]
 
 
-def _placed(
-    s: Structure,
-    x: Expression,
-    memory: list[int],
-    deviation: Expression,
-    settled: Expression | None = None,
-) -> Expression:
-    """Return x with the memories at their deviation from the settled value, if there is one.
-
-    Without `settled` those that have such a value stay as they are.
-    """
-    parts: list[Expression] = ca.vertsplit(x)
-    for column, i in enumerate(memory):
-        if not s.states[i].settles:
-            parts[i] = deviation[column]
-        elif settled is not None:
-            parts[i] = settled[i] + deviation[column]
-    return ca.vertcat(*parts)
+def _put(x: Expression, values: Mapping[int, Expression]) -> Expression:
+    """Return x with values in some places."""
+    return ca.vertcat(*[values.get(i, part) for i, part in enumerate(ca.vertsplit(x))])
 
 
-def _newton(
-    s: Structure, of: tuple[Expression, Expression], rows: list[int], x: Expression
-) -> Expression:
-    """One Newton step for the rows' derivatives to vanish; its derivative is the implicit one.
-
-    `of` are the slopes and their Jacobian by x.
-    """
-    slopes, by_x = of
-    step = ca.solve(_at(s, by_x[rows, rows], x), _at(s, slopes, x)[rows])
-    parts: list[Expression] = ca.vertsplit(x)
-    for k, i in enumerate(rows):
-        parts[i] = parts[i] - step[k]
-    return ca.vertcat(*parts)
+def _moved(x: Expression, places: list[int], by: Expression) -> Expression:
+    """Return x with some places moved."""
+    return _put(x, {i: x[i] + by[k] for k, i in enumerate(places)})
 
 
 def _solved(matrix: Expression, right: Expression) -> Expression:
@@ -326,22 +300,6 @@ def _solved(matrix: Expression, right: Expression) -> Expression:
     """
     first = ca.solve(matrix, right)
     return first + ca.solve(matrix, right - matrix @ first)
-
-
-def _in_motion(
-    rest: Expression, fast: list[int], jacobian: Expression, drive: Expression
-) -> Expression:
-    """Move the fast states from rest to a steady motion.
-
-    `jacobian` is that of their slopes by themselves, `drive` the rate of these slopes that the
-    rates of inputs and memories cause.
-    """
-    steady = -_solved(jacobian, drive)
-    lag = _solved(jacobian, steady)
-    parts: list[Expression] = ca.vertsplit(rest)
-    for k, i in enumerate(fast):
-        parts[i] = parts[i] + lag[k]
-    return ca.vertcat(*parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,12 +316,6 @@ class LinearPart:
         systems = 1j * omega[:, None, None] * identity - self.a
         right = np.broadcast_to(self.b[:, None].astype(complex), (len(omega), len(self.b), 1))
         return np.asarray(np.linalg.solve(systems, right)[:, :, 0] @ self.c)
-
-    def first_resonance(self) -> float:
-        """Return the lowest natural frequency of the oscillating parts [Hz]; 0 if none rings."""
-        poles = np.linalg.eigvals(self.a)
-        ringing = poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)]
-        return float(np.min(np.abs(ringing)) / (2.0 * np.pi)) if ringing.size else 0.0
 
 
 def linear_part(model: Model) -> LinearPart:

@@ -127,26 +127,29 @@ def run(
     Raises SimulationError, which names state and time, and InputError for arrays of wrong shape,
     times that do not increase, or numbers that are not finite.
     """
-    arrays = _arrays(model, values or model.values, (t, u, x0), unknowns, s0)
-    arrays["z0"] = doubles(_sampled_starts(model) if z0 is None else z0)
+    s, n, nx, count = model.structure, len(t), len(model.state_names), len(unknowns)
+    own = values or model.values
+    if z0 is None:
+        z0 = np.array([q.start for q in s.sampled])
+    if s0 is None:
+        s0 = np.array([[float(q == k) for q in unknowns] for k in range(nx)]).reshape(nx, count)
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "t": doubles(t), "u": doubles(u), "x0": doubles(x0), "z0": doubles(z0), "s0": doubles(s0),
+        "p": np.array([own[name] for name in model.parameter_names]),
+        "nominal": model.state_nominals() if nx else np.ones(1), "x": np.empty((n, max(1, nx))),
+        "z": np.empty((n, len(s.sampled))), "y": np.empty((n, len(s.outputs))),
+        "which": which_of(model, unknowns), "dy": np.empty((n, count)),
+        "work": np.empty((_STAGES + 3) * nx * max(count, 1)),
+    }  # fmt: skip
     _check(model, arrays, hold)
-    _check_instants(model, arrays)
-    nx = len(model.state_names)
     arrays["x0"] = arrays["x0"] if nx else np.zeros(1)  # C has one unused state
-    count = len(unknowns)
     count_run(differentiated=count > 0)
     request = _Run(
-        samples=len(t),
-        zero_order_hold=int(hold == "zero"),
-        rtol=rtol,
-        max_step=max_step,
-        steps_limit=steps_limit,
-        steps_most=steps_most,
-        count=count,
-        stop=flag_address(),
+        samples=n, zero_order_hold=int(hold == "zero"), rtol=rtol, max_step=max_step,
+        steps_limit=steps_limit, steps_most=steps_most, count=count, stop=flag_address(),
         output=model.output_names.index(output) if count else 0,
         **{name: array.ctypes.data for name, array in arrays.items()},
-    )
+    )  # fmt: skip
     status = _library(model.structure).psa_run(ctypes.byref(request))
     if status == _STOPPED:
         raise KeyboardInterrupt
@@ -159,37 +162,8 @@ def run(
             f" {_REASONS[status]}. Parameter values far from physical ones are the likely cause;"
             " check them, or loosen the tolerance."
         )
-    cost = (request.steps, request.rejected, request.evaluations)
-    return Steps(
-        arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"] if count else None, *cost
-    )
-
-
-def _sampled_starts(model: Model) -> FloatArray:
-    return np.array([s.start for s in model.structure.sampled])
-
-
-def _arrays(
-    model: Model,
-    values: Mapping[str, float],
-    given: tuple[FloatArray, FloatArray, FloatArray],
-    unknowns: Sequence[str | int],
-    s0: FloatArray | None,
-) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays that `_Run` points to, by the names of its fields."""
-    n, nx, count = len(given[0]), len(model.state_names), len(unknowns)
-    return {
-        **{name: doubles(array) for name, array in zip(("t", "u", "x0"), given, strict=True)},
-        "p": np.array([values[name] for name in model.parameter_names]),
-        "nominal": model.state_nominals() if nx else np.ones(1),
-        "x": np.empty((n, max(1, nx))),
-        "z": np.empty((n, len(model.sampled_names))),
-        "y": np.empty((n, len(model.output_names))),
-        "which": which_of(model, unknowns),
-        "s0": _initial_sensitivities(nx, unknowns) if s0 is None else doubles(s0),
-        "dy": np.empty((n, count)),
-        "work": np.empty((_STAGES + 3) * nx * max(count, 1)),
-    }
+    found = arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"] if count else None
+    return Steps(*found, request.steps, request.rejected, request.evaluations)
 
 
 def doubles(values: npt.ArrayLike) -> FloatArray:
@@ -203,19 +177,13 @@ def which_of(model: Model, unknowns: Sequence[str | int]) -> npt.NDArray[np.int3
     return np.array([names.index(q) if isinstance(q, str) else -1 for q in unknowns], np.int32)
 
 
-def _initial_sensitivities(nx: int, unknowns: Sequence[str | int]) -> FloatArray:
-    """Return d x0 / d unknown where no start depends on a parameter, shape (nx, k)."""
-    start = np.zeros((nx, len(unknowns)))
-    for column, unknown in enumerate(unknowns):
-        if isinstance(unknown, int):
-            start[unknown, column] = 1.0
-    return start
-
-
 def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> None:
-    n, nx, k = arrays["t"].size, len(model.state_names), arrays["which"].size
-    shapes: dict[str, tuple[int, ...]] = {"t": (n,), "u": (n, len(model.input_names)), "x0": (nx,)}
-    shapes |= {"s0": (nx, k), "z0": (len(model.sampled_names),)}
+    t, k = arrays["t"], arrays["which"].size
+    nx, nz = len(model.state_names), len(model.sampled_names)
+    shapes: dict[str, tuple[int, ...]] = {
+        "t": (t.size,), "u": (t.size, len(model.input_names)), "x0": (nx,), "s0": (nx, k),
+        "z0": (nz,),
+    }  # fmt: skip
     problems = Problems()
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
@@ -225,9 +193,9 @@ def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> N
             )
         elif not np.isfinite(arrays[name]).all():
             problems.add(f"The array {name} holds numbers that are not finite; replace them.")
-    if n == 0 or not (np.diff(arrays["t"], axis=0) > 0).all():
+    if t.size == 0 or not (np.diff(t, axis=0) > 0).all():
         problems.add("The times do not strictly increase; sort them and remove the repeated ones.")
-    if k and model.sampled_names:
+    if k and nz:
         problems.add(
             f"Sensitivities of a model with sampled states ({', '.join(model.sampled_names)}) are"
             " not computed; leave the sampled component out, or take differences of two runs."
@@ -235,16 +203,12 @@ def _check(model: Model, arrays: Mapping[str, npt.NDArray[Any]], hold: str) -> N
     if hold not in ("linear", "zero"):
         problems.add(f"The hold '{hold}' does not exist; use 'linear' or 'zero'.")
     problems.raise_if_any()
-
-
-def _check_instants(model: Model, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    period = model.structure.period
-    if not period:
-        return
-    seconds = float(arrays["p"][model.parameter_names.index(period)])
-    furthest = float(np.abs(arrays["t"]).max())
-    if furthest > _MOST_PERIODS * seconds:
-        raise InputError(
-            f"Sample periods of {seconds:g} s ('{period}') cannot be counted up to {furthest:g} s:"
-            " a double does not tell them apart there. Count the time from a nearer start."
-        )
+    if period := model.structure.period:
+        seconds = float(arrays["p"][model.parameter_names.index(period)])
+        furthest = float(np.abs(t).max())
+        if furthest > _MOST_PERIODS * seconds:
+            raise InputError(
+                f"Sample periods of {seconds:g} s ('{period}') cannot be counted up to"
+                f" {furthest:g} s: a double does not tell them apart there. Count the time from a"
+                " nearer start."
+            )

@@ -20,7 +20,6 @@ from psa_casadi.design.tracking.targets import (
     binding,
     dynamics_of,
     error_of,
-    raster_scan,
     read_target,
     uncompensated,
 )
@@ -137,13 +136,6 @@ def test_a_move_obeys_rate_and_current() -> None:
     assert np.abs(rate).max() <= 8e5 * (1.0 + 1e-6)
     assert np.abs(found.response.current).max() <= 0.9 * (1.0 + 1e-3)
     assert found.residual < 1e-3
-
-
-def test_a_raster_scan_is_smooth_and_closed() -> None:
-    path = raster_scan(low=1e-6, high=5e-6, frequency=10.0, lines=2, samples=2001)
-    assert path.displacement[[0, 500, 1000, -1]] * 1e6 == pytest.approx([1.0, 5.0, 1.0, 1.0])
-    speed = np.diff(path.displacement) / path.step
-    assert np.abs(np.diff(speed)).max() < 0.05 * np.abs(speed).max()
 
 
 def test_mistakes_are_told_together(tmp_path: Path) -> None:

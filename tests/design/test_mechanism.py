@@ -18,7 +18,6 @@ from psa_casadi.design.mechanism.loop import (
     step_response,
 )
 from psa_casadi.design.mechanism.mechanism import (
-    Limits,
     MechanismDesign,
     design_mechanism,
     mechanism_model,
@@ -26,6 +25,7 @@ from psa_casadi.design.mechanism.mechanism import (
     port_model,
     root_locus,
 )
+from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.archive import export_fmu

@@ -304,7 +304,8 @@ class Separation:
 
     def _refit(self, target: FloatArray, rival: Rival, record: Record, evaluations: int) -> _Refit:
         """Fit a rival again to a target (n,) [m], held by what is known of it."""
-        root = _root(rival.information)
+        values, vectors = np.linalg.eigh(rival.information)
+        root = np.sqrt(np.clip(values, 0.0, None))[:, None] * vectors.T  # R^T R = information
 
         def evaluate(delta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
             try:
@@ -314,12 +315,9 @@ class Separation:
             residual = np.concatenate([self._white(y - target), root @ delta])
             return residual, np.vstack([self._white(jacobian), root])
 
+        start = np.zeros(rival.size)
         found = minimise(
-            evaluate,
-            np.zeros(rival.size),
-            rival.bounds(),
-            tolerance=_SETTLED,
-            evaluations=evaluations,
+            evaluate, start, rival.bounds(), tolerance=_SETTLED, evaluations=evaluations
         )
         if found is None:
             raise SimulationError(
@@ -336,13 +334,6 @@ class Separation:
 def overall(distances: Collection[float]) -> float:
     """Return the logarithm of the harmonic mean of distances: the least one counts most."""
     return float(np.log(len(distances) / sum(1.0 / max(t, LEAST) for t in distances)))
-
-
-def _root(information: FloatArray) -> FloatArray:
-    """Return R with R^T R = information."""
-    values, vectors = np.linalg.eigh(information)
-    root: FloatArray = np.sqrt(np.clip(values, 0.0, None))[:, None] * vectors.T
-    return root
 
 
 Optimality = Literal["D", "E", "A"]

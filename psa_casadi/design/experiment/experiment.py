@@ -21,7 +21,7 @@ from psa_casadi.design.experiment.criteria import (
     rival_of_model,
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
-from psa_casadi.design.experiment.search import BRIEF, GRID, Best, Effort, Progress, coarse, search
+from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Progress, coarse, search
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
@@ -216,8 +216,10 @@ def separating_experiment(
     is too slow to show a resonance.
     """
     begin = clock.perf_counter()
-    _check_curves(rivals, limits)
-    steepest = limits.steepest(_capacitance(rivals[0].model))
+    curves = {c.curve for r in rivals for c in r.model.components if c.name == r.name}
+    if _slow(limits) and len(rivals) > 1 and len(curves) == 1 and None not in curves:
+        raise InputError(str(note("same_curve", effects=tuple(r.name for r in rivals))))
+    steepest = limits.steepest(rivals[0].model.values.get("C_p"))
     samples = min(limits.samples, GRID)
     coarser = Separation(tuple(rivals), noise.on_grid(limits, samples))
     usual = usual_records(limits, steepest)
@@ -238,9 +240,12 @@ def separating_experiment(
         record=usual.get(chosen, best.record),
         kind=chosen if chosen in usual else best.kind,
         limits=limits,
-        pairs=_pairs(found),
+        pairs=tuple(
+            Pair(a, b, 0.5 * t, {n: 0.5 * found[n][a, b] for n in usual})
+            for (a, b), t in found["designed"].items()
+        ),
         chance=chances["designed"],
-        usual_chance={n: c for n, c in chances.items() if n != "designed"},
+        usual_chance={n: chances[n] for n in usual},
         plays=plays_of(criterion, base, records["designed"], chances["designed"]),
         evaluations=best.evaluations,
         seconds=clock.perf_counter() - begin,
@@ -263,12 +268,12 @@ def informative_experiment(
     Raises InputError and SimulationError.
     """
     begin = clock.perf_counter()
-    steepest = limits.steepest(_capacitance(rival.model))
+    steepest = limits.steepest(rival.model.values.get("C_p"))
     samples = min(limits.samples, GRID)
     wanted = tuple(names) or rival.unknowns.names
     criterion = Information(rival, wanted, optimality, noise.on_grid(limits, samples))
     plain = usual_records(limits, steepest)
-    best: Best = search(
+    best = search(
         criterion, limits, steepest,
         usual=tuple(plain.values()), kinds=kinds, effort=effort, progress=progress,
     )  # fmt: skip
@@ -344,24 +349,6 @@ def _slow(limits: Limits) -> bool:
     return limits.duration >= FAST * limits.samples
 
 
-def _check_curves(rivals: Sequence[Rival], limits: Limits) -> None:
-    curves = {c.curve for r in rivals for c in r.model.components if c.name == r.name}
-    if _slow(limits) and len(rivals) > 1 and len(curves) == 1 and None not in curves:
-        raise InputError(str(note("same_curve", effects=tuple(r.name for r in rivals))))
-
-
-def _pairs(found: Mapping[str, Mapping[tuple[str, str], float]]) -> tuple[Pair, ...]:
-    """Return the growth of ln B, T/2, of every pair with the designed and the usual voltages."""
-    return tuple(
-        Pair(a, b, 0.5 * t, {n: 0.5 * f[a, b] for n, f in found.items() if n != "designed"})
-        for (a, b), t in found["designed"].items()
-    )
-
-
 def _intervals(rival: Rival, errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
     values = rival.model.values
     return {n: (values[n] - _SURE * e, values[n] + _SURE * e) for n, e in errors.items()}
-
-
-def _capacitance(model: Model) -> float | None:
-    return model.values.get("C_p")

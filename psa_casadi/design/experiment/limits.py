@@ -57,11 +57,8 @@ class Limits:
                 f"{self.samples} samples hold no experiment; give {_FEWEST} or more, a thousand are"
                 " usual."
             )
-        for name, value in (
-            ("rate [V/s]", self.rate),
-            ("current [A]", self.current),
-            ("bandwidth [Hz]", self.bandwidth),
-        ):
+        largest = {"rate [V/s]": self.rate, "current [A]": self.current}
+        for name, value in {**largest, "bandwidth [Hz]": self.bandwidth}.items():
             if value is not None and not value > 0.0:
                 problems.add(f"The largest {name} is {value:g}; give a positive one, or none.")
         problems.raise_if_any()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -39,15 +40,10 @@ BRIEF = Effort(draws=6, starts=1, steps=5)
 
 @dataclass(frozen=True, eq=False)
 class Best:
-    """The best voltage found: its record in full, its family, value, and what it cost.
-
-    `drawn` is the best value before any improvement; `evaluations` counts values and gradients.
-    """
+    """The best voltage found: its record in full, its family, and values and gradients it took."""
 
     record: Record
     kind: str
-    value: float
-    drawn: float
     evaluations: int
 
 
@@ -72,10 +68,13 @@ def search(
     coordinates, evaluated side by side. Raises SimulationError where no waveform can be simulated.
     """
     effort = effort or Effort()
-    problem = _Problem(criterion, limits)
-    pool = _drawn(limits, steepest, kinds, effort)
+    problem, rng = _Problem(criterion, limits), np.random.default_rng(effort.seed)
+    # no faster than the grid of the comparison can show
+    rate = min(limits.samples, GRID) / limits.duration
+    slower = replace(limits, bandwidth=min(limits.band, rate / _CYCLE))
+    pool = [draw(kind, slower, steepest, rng) for kind in kinds for _ in range(effort.draws)]
     progress(f"comparing {len(pool)} voltages")
-    values = problem.compare(pool)
+    values = np.array(side_by_side(lambda w: problem.point(w, w.start).value, pool))
     order = np.argsort(values)[::-1]
     if values[order[0]] <= _POOR:
         raise SimulationError(
@@ -91,30 +90,13 @@ def search(
         better = value > best
         if better:
             best, found = value, (pool[k], p)
-    record, kind = _in_full(*found, limits), str(found[0].kind)
+    record = replace(problem.record(*found, limits.grid()), name="designed")
+    kind = str(found[0].kind)
     for other in usual:
-        value = problem.value(other)
+        value = problem.of(coarse(other, len(problem.time))).value
         if value > best:
             best, record, kind = value, other, other.name
-    return Best(record, kind, best, float(values[order[0]]), problem.evaluations)
-
-
-def _drawn(
-    limits: Limits, steepest: float, kinds: Sequence[Kind], effort: Effort
-) -> list[Waveform]:
-    """Draw waveforms of every family, no faster than the grid of the comparison can show."""
-    rng = np.random.default_rng(effort.seed)
-    rate = min(limits.samples, GRID) / limits.duration
-    limits = replace(limits, bandwidth=min(limits.band, rate / _CYCLE))
-    return [draw(kind, limits, steepest, rng) for kind in kinds for _ in range(effort.draws)]
-
-
-def _in_full(wave: Waveform, p: FloatArray, limits: Limits) -> Record:
-    """Return the record of a waveform on all of its samples."""
-    time = limits.grid()
-    return Record(
-        name="designed", time=time, voltage=np.clip(wave.voltage(p, time), limits.low, limits.high)
-    )
+    return Best(record, kind, problem.evaluations)
 
 
 def coarse(record: Record, samples: int) -> Record:
@@ -130,35 +112,27 @@ class _Problem:
     """The criterion as a function of a waveform's coordinates, with its gradient."""
 
     def __init__(self, criterion: Criterion, limits: Limits) -> None:
-        self._criterion = criterion
-        self._time = limits.grid(min(limits.samples, GRID))
-        self._limits = limits
+        self._criterion, self._limits = criterion, limits
+        self.time = limits.grid(min(limits.samples, GRID))
         self.evaluations = 0
 
-    def record(self, wave: Waveform, p: FloatArray) -> Record:
-        """Return the planned record on the grid."""
-        voltage = np.clip(wave.voltage(p, self._time), self._limits.low, self._limits.high)
-        return Record(name=wave.kind, time=self._time, voltage=voltage)
+    def record(self, wave: Waveform, p: FloatArray, time: FloatArray | None = None) -> Record:
+        """Return the planned record on the grid, or at instants [s]."""
+        at = self.time if time is None else time
+        voltage = np.clip(wave.voltage(p, at), self._limits.low, self._limits.high)
+        return Record(name=wave.kind, time=at, voltage=voltage)
 
     def point(self, wave: Waveform, p: FloatArray) -> Point:
-        """Return the criterion at p; a poor value where the models cannot follow."""
+        """Return the criterion at p."""
+        return self.of(self.record(wave, p))
+
+    def of(self, record: Record) -> Point:
+        """Return the criterion at a record; a poor value where the models cannot follow."""
         self.evaluations += 1
         try:
-            return self._criterion.at(self.record(wave, p))
+            return self._criterion.at(record)
         except PsaError:
             return Point(_POOR, lambda _: 0.0)
-
-    def value(self, record: Record) -> float:
-        """Return the criterion at a record that is no waveform, brought to the grid."""
-        self.evaluations += 1
-        try:
-            return self._criterion.at(coarse(record, len(self._time))).value
-        except PsaError:
-            return _POOR
-
-    def compare(self, pool: Sequence[Waveform]) -> FloatArray:
-        """Return the value of every waveform as drawn."""
-        return np.array(side_by_side(lambda w: self.point(w, w.start).value, pool))
 
     def gradient(self, wave: Waveform, p: FloatArray, point: Point) -> FloatArray:
         """Return d value / d p (k,) by steps of the frozen function, into the bounds."""
@@ -198,15 +172,16 @@ class _Problem:
             downhill: FloatArray = -self.gradient(wave, p, at(p))
             return downhill
 
-        bounded = wave.slack(wave.start).size > 0
-        slack = scipy.optimize.NonlinearConstraint(wave.slack, 0.0, np.inf)
+        constraints: Any = []
+        if wave.slack(wave.start).size > 0:
+            constraints = [scipy.optimize.NonlinearConstraint(wave.slack, 0.0, np.inf)]
         scipy.optimize.minimize(
             cost,
             wave.start,
             jac=slope,
             method="SLSQP",
             bounds=scipy.optimize.Bounds(wave.lower, wave.upper),
-            constraints=[slack] if bounded else [],
+            constraints=constraints,
             options={"maxiter": steps, "ftol": 1e-3},
         )
         return best

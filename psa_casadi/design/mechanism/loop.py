@@ -117,15 +117,17 @@ def closed_polynomial(mechanics: Mechanics, mounting: Mounting) -> FloatArray:
 
 def mechanical_poles(mechanics: Mechanics, mounting: Mounting) -> ComplexArray:
     """Return the roots of D + M H [rad/s], slowest first."""
-    roots = _scaled_roots(closed_polynomial(mechanics, mounting), mechanics.frequency)
+    unit = mechanics.frequency
+    scaled = in_units(closed_polynomial(mechanics, mounting), unit)
+    found = np.roots(scaled / np.max(np.abs(scaled))) * unit
+    roots: ComplexArray = np.asarray(found, dtype=np.complex128)
     return roots[np.argsort(np.abs(roots), kind="stable")]
 
 
-def _scaled_roots(polynomial: FloatArray, unit: float) -> ComplexArray:
-    """Roots in the unit `unit` [rad/s], so that the coefficients are of one size."""
+def in_units(polynomial: FloatArray, unit: float) -> FloatArray:
+    """Return a polynomial in s over a unit [rad/s], so that its coefficients are of one size."""
     powers = np.arange(len(polynomial) - 1, -1, -1)
-    scaled = polynomial * unit**powers
-    return np.asarray(np.roots(scaled / np.max(np.abs(scaled))) * unit, dtype=np.complex128)
+    return np.asarray(polynomial * unit**powers, dtype=np.float64)
 
 
 def damping_ratios(poles: ComplexArray) -> FloatArray:
@@ -159,9 +161,7 @@ def bandwidth(mechanics: Mechanics, mounting: Mounting, *, whole: bool = False) 
 
 def _squared_magnitude(polynomial: FloatArray, unit: float) -> FloatArray:
     """|p(i w unit)|^2 as a polynomial in w^2, highest power first."""
-    powers = np.arange(len(polynomial) - 1, -1, -1)
-    scaled = polynomial * unit**powers
-    product = np.polymul(scaled, scaled * (-1.0) ** powers)  # p(s) p(-s), even in s
+    product = np.polymul(in_units(polynomial, unit), in_units(polynomial, -unit))  # even in s
     even = product[::-2][::-1]
     signs = (-1.0) ** np.arange(len(even) - 1, -1, -1)
     return np.asarray(even * signs, dtype=np.float64)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt
+from math import inf, isfinite
 
 import numpy as np
 
@@ -23,50 +23,11 @@ from psa_casadi.design.mechanism.loop import (
     step_response,
     stroke_loss,
 )
-from psa_casadi.design.mechanism.search import Wish, search
+from psa_casadi.design.mechanism.search import Limits, Wish, search
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Provenance
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a mechanism may cost.
-
-    `stroke_loss`: largest share of the static stroke [1]; `force`: largest force in the mechanism
-    in a step of rated voltage [N]; `mass` [kg] and `damping` [N.s/m]: least and largest.
-    """
-
-    stroke_loss: float = 0.1
-    force: float | None = None
-    mass: tuple[float, float] = (0.0, 1.0)
-    damping: tuple[float, float] = (0.0, 1e5)
-
-
-def goal_texts(
-    damping: float | None, width: float | None, poles: Sequence[complex]
-) -> tuple[str, ...]:
-    """Return each goal in words."""
-    texts = []
-    if damping is not None:
-        texts.append(f"a damping ratio of {damping:g} or more")
-    if width is not None:
-        texts.append(f"a bandwidth of {width:g} Hz or more")
-    if poles:
-        texts.append("poles at " + ", ".join(f"{p:.5g}" for p in poles) + " rad/s")
-    return tuple(texts)
-
-
-def wanted_pairs(poles: Sequence[complex]) -> tuple[tuple[float, float], ...]:
-    """Return (natural frequency, damping ratio) of wanted poles: conjugates, then real ones."""
-    upper = [p for p in poles if p.imag > 0.0]
-    real = sorted(p.real for p in poles if p.imag == 0.0)
-    pairs = [(abs(p), -p.real / abs(p)) for p in upper]
-    for a, b in zip(real[::2], real[1::2], strict=True):
-        w = sqrt(a * b)
-        pairs.append((w, -(a + b) / (2.0 * w)))
-    return tuple(pairs)
 
 
 def check_goals(
@@ -130,6 +91,7 @@ def _check_limits(limits: Limits, problems: Problems) -> None:
             )
 
 
+_LIMITS = Limits()
 #: A goal counts as reached if it is missed by less than this share.
 _REACHED = 1e-3
 #: A wanted pole counts as reached if one lies within this share of its size.
@@ -185,7 +147,7 @@ def design_mechanism(
     damping: float | None = None,
     bandwidth: float | None = None,
     poles: Sequence[complex] = (),
-    limits: Limits = Limits(),
+    limits: Limits = _LIMITS,
     acts_on: str = "wafers",
     starts: int = 6,
 ) -> MechanismDesign:
@@ -202,11 +164,7 @@ def design_mechanism(
     """
     check_goals(damping, bandwidth, poles, limits, starts)
     mechanics = mechanics_of(model, acts_on)
-    wish = Wish(
-        damping, bandwidth, wanted_pairs(poles), limits.stroke_loss, limits.force, limits.mass,
-        limits.damping,
-    )  # fmt: skip
-    found = search(mechanics, wish, starts)
+    found = search(mechanics, Wish(damping, bandwidth, tuple(poles), limits), starts)
     best = found[0]
     if not best.converged:
         raise InputError(
@@ -215,12 +173,21 @@ def design_mechanism(
         )
     agreeing = sum(c.converged and c.cost < best.cost + _SAME for c in found)
     mounting, free = best.mounting, Mounting(0.0, 0.0, 0.0)
-    reached = _measured(mechanics, mounting)
+    reached, closed = _measured(mechanics, mounting), mechanical_poles(mechanics, mounting)
+    goals, attained = [], True
+    if damping is not None:
+        goals.append(f"a damping ratio of {damping:g} or more")
+        attained &= reached.damping >= damping * (1.0 - _REACHED)
+    if bandwidth is not None:
+        goals.append(f"a bandwidth of {bandwidth:g} Hz or more")
+        attained &= reached.bandwidth >= bandwidth * (1.0 - _REACHED)
+    if poles:
+        goals.append("poles at " + ", ".join(f"{p:.5g}" for p in poles) + " rad/s")
+        attained &= all(bool(np.abs(closed - p).min() < _NEAR * abs(p)) for p in poles)
     return MechanismDesign(
-        mechanics, mounting, acts_on, goal_texts(damping, bandwidth, poles), limits,
-        poles=mechanical_poles(mechanics, mounting), free_poles=mechanical_poles(mechanics, free),
-        lag_pole=-1.0 / mechanics.lag, reached=reached, free=_measured(mechanics, free),
-        attained=_attained(mechanics, mounting, reached, damping, bandwidth, poles),
+        mechanics, mounting, acts_on, tuple(goals), limits, poles=closed,
+        free_poles=mechanical_poles(mechanics, free), lag_pole=-1.0 / mechanics.lag,
+        reached=reached, free=_measured(mechanics, free), attained=attained,
         binding=_binding(mounting, reached, limits), agreeing=agreeing, starts=len(found),
     )  # fmt: skip
 
@@ -273,16 +240,12 @@ def root_locus(design: MechanismDesign, gains: FloatArray) -> ComplexArray:
         poles = mechanical_poles(
             design.mechanics, Mounting(g * m.mass, g * m.damping, g * m.stiffness)
         )
-        if rows and len(poles) == len(rows[-1]):
-            poles = _continued(rows[-1], poles)
+        if rows and len(poles) == len(rows[-1]):  # each next to the one it came from
+            left = list(poles)
+            nearest = [left.pop(int(np.argmin(np.abs(np.array(left) - b)))) for b in rows[-1]]
+            poles = np.array(nearest)
         rows.append(poles)
     return np.array(rows)
-
-
-def _continued(before: ComplexArray, poles: ComplexArray) -> ComplexArray:
-    """Order poles so that each stands next to the one it came from."""
-    left = list(poles)
-    return np.array([left.pop(int(np.argmin([abs(p - b) for p in left]))) for b in before])
 
 
 def _measured(mechanics: Mechanics, mounting: Mounting) -> Reached:
@@ -296,22 +259,6 @@ def _measured(mechanics: Mechanics, mounting: Mounting) -> Reached:
         stroke_loss=stroke_loss(mechanics, mounting),
         peak_force=float(np.abs(response.force).max()),
         overshoot=max(0.0, float(x.max()) / final - 1.0),
-    )
-
-
-def _attained(
-    mechanics: Mechanics,
-    mounting: Mounting,
-    r: Reached,
-    damping: float | None,
-    width: float | None,
-    poles: Sequence[complex],
-) -> bool:
-    if poles:
-        found = mechanical_poles(mechanics, mounting)
-        return all(bool(np.abs(found - p).min() < _NEAR * abs(p)) for p in poles)
-    return (damping is None or r.damping >= damping * (1.0 - _REACHED)) and (
-        width is None or r.bandwidth >= width * (1.0 - _REACHED)
     )
 
 

@@ -12,7 +12,7 @@ takes the derivatives from CasADi. A goal that the limits do not allow is missed
 possible: its shortfall, in logarithms, is an unknown with a steep cost.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import permutations
 from math import isfinite, log, sqrt
@@ -21,14 +21,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from psa_casadi.design.mechanism.loop import (
-    ComplexArray,
-    Mechanics,
-    Mounting,
-    mechanical_poles,
-)
+from psa_casadi.design.mechanism.loop import Mechanics, Mounting, in_units, mechanical_poles
 from psa_casadi.interruption import raise_if_stopped
-from psa_casadi.units import FloatArray
 
 
 def product(a: Any, b: Any) -> Any:
@@ -57,76 +51,6 @@ def log_square(polynomial: Any, w: Any) -> Any:
 
 #: Steps of the answer: the step size doubles from phase to phase.
 _PHASES, _STEPS = 14, 10
-
-
-@dataclass(frozen=True)
-class Loop:
-    """A mounted stack in units of time 1/w0 and stiffness K, as expressions.
-
-    `h` (3,) mass, damping, stiffness; `w`, `z` (pairs,) natural frequencies and damping ratios;
-    `static` is 1 + kappa; `ahead` the numerator's s coefficient over its constant; `lag`, `drive`.
-    """
-
-    h: Any
-    w: Any
-    z: Any
-    static: Any
-    ahead: float
-    lag: float
-    drive: float
-
-
-def force_history(loop: Loop) -> list[Any]:
-    """Return the mechanism's force over k_L u_rated K N(0)/D(0) at every step.
-
-    The chain drive, lag, pairs of poles is stepped with the method of Radau (order 3, L-stable):
-    `z+ = (1 - 2/3 hA + h^2 A^2/6)^-1 (1 + hA/3) z`, z measured from its final value.
-    """
-    A, last = _chain(loop)
-    size = A.shape[0]
-    pairs = loop.w.numel()
-    final = ca.vertcat(1.0, 1.0, *[1.0, 0.0] * pairs)
-    away = -final
-    rows = [ca.DM.zeros(1, size)]
-    rows[0][last] = 1.0
-    derivatives = [ca.MX(rows[0])]
-    for _ in range(3):
-        derivatives.append(derivatives[-1] @ A)
-    mu, chi, kappa = loop.h[0], loop.h[1], loop.h[2]
-    read = sum(
-        weight * (derivatives[k] + loop.ahead * derivatives[k + 1])
-        for k, weight in enumerate((kappa, chi, mu))
-    )
-    slowest = max(loop.lag, loop.drive)
-    h = 60.0 * slowest / (_STEPS * (2.0**_PHASES - 1.0))
-    history = []
-    unit = ca.DM.eye(size)
-    for _ in range(_PHASES):
-        step = ca.solve(unit - 2.0 / 3.0 * h * A + h * h / 6.0 * (A @ A), unit + h / 3.0 * A)
-        for _ in range(_STEPS):
-            away = step @ away
-            history.append((kappa + read @ away) / loop.static)
-        h *= 2.0
-    return history
-
-
-def _chain(loop: Loop) -> tuple[Any, int]:
-    """Return the matrix of drive, lag and pairs of poles in a row, and the place of the last."""
-    pairs = loop.w.numel()
-    size = 2 + 2 * pairs
-    A = ca.MX.zeros(size, size)
-    A[0, 0] = -1.0 / loop.drive
-    A[1, 0], A[1, 1] = 1.0 / loop.lag, -1.0 / loop.lag
-    source = 1
-    for i in range(pairs):
-        at = 2 + 2 * i
-        w, z = loop.w[i], loop.z[i]
-        A[at, at + 1] = 1.0
-        A[at + 1, source], A[at + 1, at], A[at + 1, at + 1] = w * w, -w * w, -2.0 * z * w
-        source = at
-    return A, source
-
-
 #: Parts of w_b at which |X/F| is held above -3 dB, and the cost of a shortfall.
 _PARTS = np.linspace(0.05, 1.0, 20)
 _STEEP = 100.0
@@ -141,20 +65,27 @@ _OPTIONS: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What is wanted, SI: least damping ratio, least bandwidth [Hz], or pairs of poles.
+class Limits:
+    """What a mechanism may cost.
 
-    `pairs` are (natural frequency [rad/s], damping ratio). `stroke_loss` is the largest share,
-    `force` [N] the largest force in the mechanism, `mass` [kg] and `damping` [N.s/m] the ranges.
+    `stroke_loss`: largest share of the static stroke [1]; `force`: largest force in the mechanism
+    in a step of rated voltage [N]; `mass` [kg] and `damping` [N.s/m]: least and largest.
     """
+
+    stroke_loss: float = 0.1
+    force: float | None = None
+    mass: tuple[float, float] = (0.0, 1.0)
+    damping: tuple[float, float] = (0.0, 1e5)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is wanted, SI: least damping ratio, least bandwidth [Hz], or poles [rad/s]; limits."""
 
     damping: float | None
     bandwidth: float | None
-    pairs: tuple[tuple[float, float], ...]
-    stroke_loss: float
-    force: float | None
-    mass: tuple[float, float]
-    damper: tuple[float, float]
+    poles: tuple[complex, ...]
+    limits: Limits
 
 
 @dataclass(frozen=True)
@@ -169,17 +100,12 @@ class Candidate:
 def search(mechanics: Mechanics, wish: Wish, starts: int, seed: int = 0) -> list[Candidate]:
     """Search from several starts, and return what each led to, best first."""
     draw = np.random.default_rng(seed)
-    pairs = (len(mechanics.denominator) - 1) // 2
-    found = []
-    for order in _assignments(len(wish.pairs), pairs):
+    count, found = (len(mechanics.denominator) - 1) // 2, []
+    # which pair of the stack's poles each wanted pair may become
+    for order in permutations(range(count), len(pairs_of(wish.poles))):
         problem = _Problem(mechanics, wish, order)
         found += [problem.solve(draw) for _ in range(starts)]
     return sorted(found, key=lambda c: (not c.converged, c.cost))
-
-
-def _assignments(wanted: int, pairs: int) -> Sequence[tuple[int, ...]]:
-    """Which pair of the stack's poles each wanted pair may become."""
-    return list(permutations(range(pairs), wanted))
 
 
 class _Problem:
@@ -187,70 +113,82 @@ class _Problem:
 
     def __init__(self, mechanics: Mechanics, wish: Wish, order: tuple[int, ...]) -> None:
         self.mechanics, self.wish, self.order = mechanics, wish, order
-        self.w0 = mechanics.frequency
+        self.w0 = w0 = mechanics.frequency
         self.K = float(mechanics.denominator[-1] / mechanics.path[-1])
-        self.count = (len(mechanics.denominator) - 1) // 2
-        n, d, m = (
-            self._scaled(p) for p in (mechanics.numerator, mechanics.denominator, mechanics.path)
-        )
-        self.h, self.lw, self.lz = (
-            ca.MX.sym("h", 3),
-            *(ca.MX.sym(name, self.count) for name in ("w", "z")),
-        )
-        self.b, self.least, self.short = ca.MX.sym("b"), ca.MX.sym("least"), ca.MX.sym("short")
-        self.closed = total(ca.MX(ca.DM(d)), product(ca.MX(ca.DM(m)), self.h))
-        self.n = n
-        self.equal: list[Any] = []
+        self.count = count = (len(mechanics.denominator) - 1) // 2
+        polynomials = (mechanics.numerator, mechanics.denominator, mechanics.path)
+        n, d, m = (in_units(p, w0) / p[-1] for p in polynomials)
+        self.h, self.lw, self.lz = (ca.MX.sym(*q) for q in (("h", 3), ("w", count), ("z", count)))
+        self.b, self.least, self.short = (ca.MX.sym(q) for q in ("b", "least", "short"))
+        closed = total(ca.MX(ca.DM(d)), product(ca.MX(ca.DM(m)), self.h))
+        # the closed polynomial's coefficients are those of the product of pairs
+        pairs = closed[0]
+        for i in range(count):
+            w, z = ca.exp(self.lw[i]), ca.exp(self.lz[i])
+            pairs = product(pairs, ca.vertcat(1.0, 2.0 * z * w, w * w))
+        equal = pairs[1:] / closed[1:] - 1.0
+        # |N/(D + M H)| over its static value is above 1/sqrt(2) up to w_b
         self.positive: list[Any] = []
-        self._tie()
-        self._band()
-        self._force()
+        for part in _PARTS:
+            w = part * ca.exp(self.b)
+            above = log_square(ca.MX(ca.DM(n)), w) - log_square(closed, w)
+            self.positive.append(above + 2.0 * ca.log(closed[-1]) + log(2.0))
+        # |m x'' + c x' + k x| stays below the limit in the answer to a step of rated voltage
+        if wish.limits.force is not None:
+            largest = mechanics.force * self.K / mechanics.stiffness
+            limit = _MARGIN * wish.limits.force / largest
+            for force in self._force_history(closed[-1], float(n[0] / n[1])):
+                self.positive += [limit - force, limit + force]
         cost = self._cost()
         x = ca.vertcat(self.h, self.lw, self.lz, self.b, self.least, self.short)
-        g = ca.vertcat(*self.equal, *self.positive)
-        self.free = sum(e.numel() for e in self.equal), sum(e.numel() for e in self.positive)
+        g = ca.vertcat(equal, *self.positive)
+        self.rows = equal.numel(), g.numel() - equal.numel()
         programme: dict[str, Any] = {"x": x, "f": cost, "g": g}
         self.solver = ca.nlpsol("mechanism", "ipopt", programme, _OPTIONS)
 
-    def _scaled(self, polynomial: FloatArray) -> FloatArray:
-        powers = np.arange(len(polynomial) - 1, -1, -1)
-        return np.asarray(polynomial * self.w0**powers / polynomial[-1])
+    def _force_history(self, static: Any, ahead: float) -> list[Any]:
+        """Return the mechanism's force over k_L u_rated K N(0)/D(0) at every step.
 
-    def _tie(self) -> None:
-        """The closed polynomial's coefficients are those of the product of pairs."""
-        pairs = self.closed[0]
+        The chain drive, lag, pairs of poles is stepped with the method of Radau (order 3,
+        L-stable): `z+ = (1 - 2/3 hA + h^2 A^2/6)^-1 (1 + hA/3) z`, z measured from its final value.
+        `static` is 1 + kappa, `ahead` the numerator's s coefficient over its constant.
+        """
+        lag, drive = self.mechanics.lag * self.w0, self.mechanics.drive * self.w0
+        size, last = 2 + 2 * self.count, 1
+        A = ca.MX.zeros(size, size)
+        A[0, 0] = -1.0 / drive
+        A[1, 0], A[1, 1] = 1.0 / lag, -1.0 / lag
         for i in range(self.count):
-            w, z = ca.exp(self.lw[i]), ca.exp(self.lz[i])
-            pairs = product(pairs, ca.vertcat(1.0, 2.0 * z * w, w * w))
-        self.equal.append(pairs[1:] / self.closed[1:] - 1.0)
-
-    def _band(self) -> None:
-        """|N/(D + M H)| over its static value is above 1/sqrt(2) up to w_b."""
-        for part in _PARTS:
-            w = part * ca.exp(self.b)
-            above = log_square(ca.MX(ca.DM(self.n)), w) - log_square(self.closed, w)
-            self.positive.append(above + 2.0 * ca.log(self.closed[-1]) + log(2.0))
-
-    def _force(self) -> None:
-        """|m x'' + c x' + k x| stays below the limit in the answer to a step of rated voltage."""
-        if self.wish.force is None:
-            return
-        limit = (
-            _MARGIN * self.wish.force / (self.mechanics.force * self.K / self.mechanics.stiffness)
+            at, w, z = 2 + 2 * i, ca.exp(self.lw)[i], ca.exp(self.lz)[i]
+            A[at, at + 1] = 1.0
+            A[at + 1, last], A[at + 1, at], A[at + 1, at + 1] = w * w, -w * w, -2.0 * z * w
+            last = at
+        away: Any = -ca.vertcat(1.0, 1.0, *[1.0, 0.0] * self.count)
+        row = ca.DM.zeros(1, size)
+        row[last] = 1.0
+        derivatives = [ca.MX(row)]
+        for _ in range(3):
+            derivatives.append(derivatives[-1] @ A)
+        mu, chi, kappa = self.h[0], self.h[1], self.h[2]
+        read = sum(
+            weight * (derivatives[k] + ahead * derivatives[k + 1])
+            for k, weight in enumerate((kappa, chi, mu))
         )
-        loop = Loop(
-            h=self.h, w=ca.exp(self.lw), z=ca.exp(self.lz), static=self.closed[-1],
-            ahead=float(self.n[0] / self.n[1]), lag=self.mechanics.lag * self.w0,
-            drive=self.mechanics.drive * self.w0,
-        )  # fmt: skip
-        for force in force_history(loop):
-            self.positive += [limit - force, limit + force]
+        h = 60.0 * max(lag, drive) / (_STEPS * (2.0**_PHASES - 1.0))
+        history, unit = [], ca.DM.eye(size)
+        for _ in range(_PHASES):
+            step = ca.solve(unit - 2.0 / 3.0 * h * A + h * h / 6.0 * (A @ A), unit + h / 3.0 * A)
+            for _ in range(_STEPS):
+                away = step @ away
+                history.append((kappa + read @ away) / static)
+            h *= 2.0
+        return history
 
     def _cost(self) -> Any:
         wish, lz = self.wish, self.lz
         cost = _STEEP * self.short + _SMALL * ca.sum1(self.h)
-        if wish.pairs:
-            for (w, z), i in zip(wish.pairs, self.order, strict=True):
+        if wish.poles:
+            for (w, z), i in zip(pairs_of(wish.poles), self.order, strict=True):
                 cost += (self.lw[i] - log(w / self.w0)) ** 2 + (lz[i] - log(z)) ** 2
             return cost
         if wish.damping is not None:
@@ -267,22 +205,24 @@ class _Problem:
 
     def solve(self, draw: np.random.Generator) -> Candidate:
         """Search from one random start."""
-        wish, unit = self.wish, (self.K / self.w0**2, self.K / self.w0, self.K)
-        low = [wish.mass[0] / unit[0], wish.damper[0] / unit[1], 0.0]
-        most = wish.stroke_loss / (1.0 - wish.stroke_loss)
-        high = [wish.mass[1] / unit[0], wish.damper[1] / unit[1], most]
+        limits, unit = self.wish.limits, (self.K / self.w0**2, self.K / self.w0, self.K)
+        most = limits.stroke_loss / (1.0 - limits.stroke_loss)
+        low = [limits.mass[0] / unit[0], limits.damping[0] / unit[1], 0.0]
+        high = [limits.mass[1] / unit[0], limits.damping[1] / unit[1], most]
         sizes = (*np.exp(draw.uniform(log(1e-2), log(30.0), 2)), most * draw.uniform(0.05, 0.95))
         start = np.clip(sizes, low, high)
         mounting = Mounting(*(float(s * u) for s, u in zip(start, unit, strict=True)))
-        w, z = _pairs_of(mechanical_poles(self.mechanics, mounting) / self.w0)
+        poles = pairs_of(mechanical_poles(self.mechanics, mounting) / self.w0)
+        w, z = np.array(sorted(poles, key=lambda pair: pair[0])).T
+        z = np.maximum(z, 1e-3)  # unstable ones are damped
         x0 = [*start, *np.log(w), *np.log(z), min(np.log(w).min(), 3.0), min(0.0, log(min(z))), 0.0]
         few = [-25.0] * self.count, [25.0] * self.count
         found = self.solver(
             x0=x0,
             lbx=[*low, *few[0], *[log(1e-4)] * self.count, -25.0, -12.0, 0.0],
             ubx=[*high, *few[1], *[log(1e5)] * self.count, 25.0, 0.0, 50.0],
-            lbg=[0.0] * sum(self.free),
-            ubg=[0.0] * self.free[0] + [np.inf] * self.free[1],
+            lbg=[0.0] * sum(self.rows),
+            ubg=[0.0] * self.rows[0] + [np.inf] * self.rows[1],
         )
         raise_if_stopped()  # which the solver takes for a failure
         h = np.clip(np.array(found["x"]).ravel()[:3], low, high)
@@ -292,18 +232,13 @@ class _Problem:
         return Candidate(Mounting(*values), cost, ended)
 
 
-def _pairs_of(poles: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Return natural frequencies and damping ratios of poles paired off; unstable ones are damped.
+def pairs_of(poles: Iterable[complex]) -> list[tuple[float, float]]:
+    """Return natural frequency and damping ratio of poles paired off: conjugates, then real ones.
 
-    Complex poles are paired with their conjugates, real ones with their neighbours in size.
+    Real poles are paired with their neighbours in size.
     """
-    upper = [p for p in poles if p.imag > 1e-9 * abs(p)]
-    real = sorted(p.real for p in poles if abs(p.imag) <= 1e-9 * abs(p))
-    w = [abs(p) for p in upper] + [
-        sqrt(abs(a * b)) for a, b in zip(real[::2], real[1::2], strict=True)
-    ]
-    sums = [-2.0 * p.real for p in upper]
-    sums += [-(a + b) for a, b in zip(real[::2], real[1::2], strict=True)]
-    z = [max(s / (2.0 * size), 1e-3) for s, size in zip(sums, w, strict=True)]
-    order = np.argsort(w)
-    return np.array(w)[order], np.array(z)[order]
+    every = list(poles)
+    pairs = [(float(abs(p)), -2.0 * p.real) for p in every if p.imag > 1e-9 * abs(p)]
+    real = sorted(p.real for p in every if abs(p.imag) <= 1e-9 * abs(p))
+    pairs += [(sqrt(abs(a * b)), -(a + b)) for a, b in zip(real[::2], real[1::2], strict=True)]
+    return [(w, float(both) / (2.0 * w)) for w, both in pairs]

@@ -48,7 +48,10 @@ def zero_phase_inverse(part: LinearPart, wanted: FloatArray, step: float) -> Flo
     sample, and comes back to it behind the last one.
     """
     n = len(wanted)
-    pad = _padding(part, step, n)
+    # samples in which all but slow creep settles, at most as many as the path has
+    decay = -np.linalg.eigvals(part.a).real
+    slowest = 1.0 / np.min(decay) if np.all(decay > 0) else 0.0
+    pad = int(np.clip(10.0 * slowest / step, 50, max(n, 50)))
     back = 0.5 * (1.0 + np.cos(np.pi * np.arange(1, pad + 1) / (pad + 1)))
     tail = wanted[0] + (wanted[-1] - wanted[0]) * back
     path = np.concatenate([np.full(pad, wanted[0]), wanted, np.full(pad, wanted[-1]), tail])
@@ -59,13 +62,6 @@ def zero_phase_inverse(part: LinearPart, wanted: FloatArray, step: float) -> Flo
     inverse[0] = 1.0 / response[0].real
     voltage = np.fft.irfft(np.fft.rfft(path) * inverse, len(path))
     return np.asarray(voltage[pad : pad + n])
-
-
-def _padding(part: LinearPart, step: float, n: int) -> int:
-    """Return the samples in which all but slow creep settles, at most as many as the path has."""
-    decay = -np.linalg.eigvals(part.a).real
-    slowest = 1.0 / np.min(decay) if np.all(decay > 0) else 0.0
-    return int(np.clip(10.0 * slowest / step, 50, max(n, 50)))
 
 
 _PARTS = 4  # sub-intervals of a sample for the hysteresis inverse
@@ -99,20 +95,6 @@ def invert(
     """
     demand_stack(model)
     part, even = linear_part(model), _evenly(target)
-    _demand_reach(model, part, target)
-    bounds = limits or AmplifierLimits()
-    rest, _ = rest_at(model, float(target.displacement[0]))
-    learner = _Learner(model, part, even, rest, trials)
-    best = learner.learn(zero_phase_inverse(part, even.displacement, even.step), AmplifierLimits())
-    if bounds != AmplifierLimits():
-        best = learner.learn(best.wanted, bounds)
-    voltage = np.interp(target.time, even.time, best.voltage)
-    final = respond(model, target.time, voltage)
-    errors = tuple(t.error for t in learner.made)
-    return InvertedInput(target, final, error_of(target, final.displacement), errors)
-
-
-def _demand_reach(model: Model, part: LinearPart, target: Target) -> None:
     rated = model.values.get("u_rated", np.inf)
     stroke = rated * float(abs(part.response(np.zeros(1))[0]))
     if target.span > _MOST_STROKES * stroke:
@@ -121,6 +103,31 @@ def _demand_reach(model: Model, part: LinearPart, target: Target) -> None:
             f" {rated:.4g} V about {1e6 * stroke:.3g} um; the path is likely in another unit:"
             " correct it."
         )
+    bounds = limits or AmplifierLimits()
+    rest, _ = rest_at(model, float(target.displacement[0]))
+    made: list[_Trial] = []
+
+    def learn(wanted: FloatArray, limits: AmplifierLimits) -> _Trial:
+        """Return the best of the trials from a first one on, as long as the error falls."""
+        first, felt = len(made), list[float]()
+        for _ in range(max(trials, 1)):
+            free = _voltage(model, even, wanted, rest)
+            voltage = held(model, limits, even.time, free)
+            shown = respond(model, even.time, voltage).displacement
+            made.append(_Trial(wanted, voltage, error_of(even, shown)))
+            left = np.where(voltage == free, even.displacement - shown, 0.0)
+            felt.append(float(np.linalg.norm(left)))
+            if len(felt) > 1 and felt[-1] > _WORTH * felt[-2]:
+                break
+            wanted = wanted + zero_phase_inverse(part, left, even.step)
+        return min(made[first:], key=lambda t: t.error.rms)
+
+    best = learn(zero_phase_inverse(part, even.displacement, even.step), AmplifierLimits())
+    if bounds != AmplifierLimits():
+        best = learn(best.wanted, bounds)
+    final = respond(model, target.time, np.interp(target.time, even.time, best.voltage))
+    error = error_of(target, final.displacement)
+    return InvertedInput(target, final, error, tuple(t.error for t in made))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,31 +137,6 @@ class _Trial:
     wanted: FloatArray
     voltage: FloatArray
     error: TrackingError
-
-
-class _Learner:
-    """Trials on the simulator whose errors go back through the inverse, so long as they fall."""
-
-    def __init__(
-        self, model: Model, part: LinearPart, even: Target, rest: float, trials: int
-    ) -> None:
-        self._model, self._part, self._even, self._rest = model, part, even, rest
-        self._most, self.made = trials, list[_Trial]()
-
-    def learn(self, wanted: FloatArray, limits: AmplifierLimits) -> _Trial:
-        """Return the best of the trials from a first one on."""
-        first, felt, even = len(self.made), list[float](), self._even
-        for _ in range(max(self._most, 1)):
-            free = _voltage(self._model, even, wanted, self._rest)
-            voltage = held(self._model, limits, even.time, free)
-            shown = respond(self._model, even.time, voltage).displacement
-            self.made.append(_Trial(wanted, voltage, error_of(even, shown)))
-            left = np.where(voltage == free, even.displacement - shown, 0.0)
-            felt.append(float(np.linalg.norm(left)))
-            if len(felt) > 1 and felt[-1] > _WORTH * felt[-2]:
-                break
-            wanted = wanted + zero_phase_inverse(self._part, left, even.step)
-        return min(self.made[first:], key=lambda t: t.error.rms)
 
 
 def correct(model: Model, target: Target, voltage: FloatArray, measured: FloatArray) -> FloatArray:
@@ -191,37 +173,28 @@ def _evenly(target: Target) -> Target:
 
 
 def _voltage(model: Model, even: Target, wanted: FloatArray, rest: float) -> FloatArray:
-    """Return the voltage (n,) that `wanted` becomes with hysteresis; at rest for one sample."""
-    voltage = wanted if "h_ref" not in model.values else _through_hysteresis(model, even, wanted)
-    voltage = np.array(voltage)
+    """Return the voltage (n,) that `wanted` becomes with hysteresis; at rest for one sample.
+
+    Drive, exact inverse of the Bouc-Wen element, drive back.
+    """
+    p, voltage = model.values, np.array(wanted)
+    if "h_ref" in p:
+        constant, dt, n = p["R_s"] * p["C_p"], even.step / _PARTS, len(wanted)
+        fine = np.interp(np.arange((n - 1) * _PARTS + 1) / _PARTS, np.arange(n), wanted)
+        # the drive's exact answer to a line through samples, from rest
+        given, decay = p["G"] * fine, np.exp(-dt / constant)
+        later = 1.0 - constant / dt * (1.0 - decay)
+        upper, lower = [later, 1.0 - decay - later], [1.0, -decay]
+        state = [given[0] * (1.0 - later)]
+        behind = scipy.signal.lfilter(upper, lower, given, zi=state)[0]
+        march = _march(model).mapaccum("march", len(fine) - 1)
+        u = np.array(march(ca.DM([behind[0], 0.0]), np.diff(behind)[None, :], dt)).T
+        u = np.concatenate([[behind[0]], u[:, 0]])
+        rate = np.diff(u) / dt
+        ends = np.concatenate([rate[:1], rate, rate[-1:]])
+        voltage = ((u + constant * 0.5 * (ends[:-1] + ends[1:])) / p["G"])[::_PARTS].copy()
     voltage[:2] = rest
-    return voltage
-
-
-def _through_hysteresis(model: Model, even: Target, wanted: FloatArray) -> FloatArray:
-    """Drive, exact inverse of the Bouc-Wen element, drive back."""
-    p = model.values
-    constant, dt = p["R_s"] * p["C_p"], even.step / _PARTS
-    fine = np.interp(
-        np.arange((len(wanted) - 1) * _PARTS + 1) / _PARTS, np.arange(len(wanted)), wanted
-    )
-    behind = _lagged(p["G"] * fine, constant, dt)
-    march = _march(model).mapaccum("march", len(fine) - 1)
-    u = np.array(march(ca.DM([behind[0], 0.0]), np.diff(behind)[None, :], dt)).T
-    u = np.concatenate([[behind[0]], u[:, 0]])
-    rate = np.diff(u) / dt
-    ends = np.concatenate([rate[:1], rate, rate[-1:]])
-    slope = 0.5 * (ends[:-1] + ends[1:])
-    return np.asarray(((u + constant * slope) / p["G"])[::_PARTS])
-
-
-def _lagged(values: FloatArray, constant: float, dt: float) -> FloatArray:
-    """Return the answer of 1/(constant s + 1) to a line through samples, from rest; exact."""
-    decay = np.exp(-dt / constant)
-    later = 1.0 - constant / dt * (1.0 - decay)
-    first = values[0] * (1.0 - later)
-    upper, lower = [later, 1.0 - decay - later], [1.0, -decay]
-    return np.asarray(scipy.signal.lfilter(upper, lower, values, zi=[first - 0.0])[0])
+    return np.asarray(voltage)
 
 
 def _march(model: Model) -> ca.Function:

@@ -60,10 +60,6 @@ class LinearMove:
     limits: AmplifierLimits
     n: int
 
-    def no_offsets(self) -> Offsets:
-        """Return the offsets of the linear part alone."""
-        return Offsets(np.zeros(len(self.fast)), np.zeros(len(self.fast)), 0.0)
-
     def forces(self, time: float, state: FloatArray, voltage: float) -> Offsets:
         """Return what is left of the model's rates and displacement without the linear part."""
         m = self.model
@@ -106,42 +102,36 @@ class LinearMove:
         return high, np.concatenate([[self.rest], found])
 
     def nearest(self, length: float, voltage: FloatArray, offsets: Offsets) -> FloatArray | None:
-        """Return the voltage that arrives and differs least, at most, from another; None if none.
-
-        Unknowns: the voltage and its largest difference, both over the span of the limits.
-        """
-        matrix, right = self._conditions(length, offsets)
-        rows, tops = self._limited(length)
-        n, near = self.n, voltage[1:]
-        bound = -np.ones((n, 1))
-        upper = np.vstack(
-            [
-                np.hstack([rows, np.zeros((len(rows), 1))]),
-                np.hstack([np.eye(n), bound]),
-                np.hstack([-np.eye(n), bound]),
-            ]
-        )
-        answer: Any = scipy.optimize.linprog(
-            np.r_[np.zeros(n), 1.0],
-            A_ub=upper, b_ub=np.concatenate([tops, near, -near]),
-            A_eq=np.hstack([matrix, np.zeros((len(matrix), 1))]), b_eq=right,
-            bounds=[(self.limits.min_voltage, self.limits.max_voltage)] * n + [(0.0, None)],
-        )  # fmt: skip
-        return np.concatenate([[self.rest], answer.x[:n]]) if answer.status == 0 else None
+        """Return the voltage that arrives and at most differs least from another; None if none."""
+        answer = self._program(length, offsets, voltage[1:])
+        return np.concatenate([[self.rest], answer.x[: self.n]]) if answer.status == 0 else None
 
     def _arrive(self, length: float, offsets: Offsets) -> FloatArray | None:
         """Return a voltage (n,) that arrives in a length [s], None if none does."""
+        answer = self._program(length, offsets)
+        arrives = answer.status == 0 and answer.fun < _SLACK
+        return np.asarray(answer.x[: self.n]) if arrives else None
+
+    def _program(self, length: float, offsets: Offsets, near: FloatArray | None = None) -> Any:
+        """Solve for the voltage (n,) with the least distances from rest and position.
+
+        Or, with `near` (n,), for the one that arrives with the least largest difference from it.
+        """
         matrix, right = self._conditions(length, offsets)
         rows, tops = self._limited(length)
-        k, n = len(right), self.n
-        answer: Any = scipy.optimize.linprog(
-            np.r_[np.zeros(n), np.ones(2 * k)],
-            A_ub=np.hstack([rows, np.zeros((len(rows), 2 * k))]) if len(rows) else None,
-            b_ub=tops if len(rows) else None,
-            A_eq=np.hstack([matrix, np.eye(k), -np.eye(k)]), b_eq=right,
-            bounds=[(self.limits.min_voltage, self.limits.max_voltage)] * n + [(0.0, None)] * 2 * k,
+        n, k = self.n, len(right)
+        if near is None:
+            equal = np.hstack([matrix, np.eye(k), -np.eye(k)])
+            upper = np.hstack([rows, np.zeros((len(rows), 2 * k))])
+        else:
+            equal, tops = np.hstack([matrix, np.zeros((k, 1))]), np.concatenate([tops, near, -near])
+            sides = np.hstack([np.vstack([np.eye(n), -np.eye(n)]), -np.ones((2 * n, 1))])
+            upper = np.vstack([np.hstack([rows, np.zeros((len(rows), 1))]), sides])
+        more = equal.shape[1] - n
+        return scipy.optimize.linprog(
+            np.r_[np.zeros(n), np.ones(more)], A_ub=upper, b_ub=tops, A_eq=equal, b_eq=right,
+            bounds=[(self.limits.min_voltage, self.limits.max_voltage)] * n + [(0.0, None)] * more,
         )  # fmt: skip
-        return np.asarray(answer.x[:n]) if answer.status == 0 and answer.fun < _SLACK else None
 
     def _conditions(self, length: float, offsets: Offsets) -> tuple[FloatArray, FloatArray]:
         """Return the rows of rest and position, times the voltage (n,), and what they must give.
@@ -272,7 +262,8 @@ def quickest_move(
     started = clocks.perf_counter()
     rest, _ = move_ends(model, begin, end, limits)
     linear = linear_move(model, rest, end, limits, intervals)
-    length, voltage = linear.shortest(linear.no_offsets())
+    none = np.zeros(len(linear.fast))
+    length, voltage = linear.shortest(Offsets(none, none, 0.0))
     linear_time = length
     plays = _plays(model, linear, length, voltage, progress)
     best = min(plays[_FREE:], key=lambda p: p.distance)

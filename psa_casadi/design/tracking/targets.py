@@ -86,42 +86,6 @@ def checked_target(time: FloatArray, displacement: FloatArray, where: str = "tar
     return Target(time - time[0], displacement)
 
 
-def raster_scan(
-    *, low: float, high: float, frequency: float, lines: int, samples: int, turn: float = 0.2
-) -> Target:
-    """Return a raster scan: a triangle between two positions [m] with rounded turns.
-
-    `frequency` [Hz] is that of the there and back, `lines` their number. Over the share `turn` of
-    each half period, half of it on either side of a turn, the acceleration is a half sine; between
-    the turns the speed is constant. It starts and ends at rest at `low`. `samples` counts the
-    instants.
-
-    Raises InputError for figures that make no scan.
-    """
-    problems = Problems()
-    if not (frequency > 0.0 and high > low):
-        problems.add("A scan needs a positive frequency and a high above its low; correct them.")
-    if lines < 1 or samples < 20 * lines:
-        problems.add("A scan needs at least one line and 20 samples for each; give more samples.")
-    if not 0.0 < turn <= 1.0:
-        problems.add(f"The turn is {turn:g}; give a share of the half period, above 0 up to 1.")
-    problems.raise_if_any()
-    time = np.linspace(0.0, lines / frequency, samples)
-    return Target(time, low + (high - low) * _rounded_triangle(time * frequency, turn))
-
-
-def _rounded_triangle(phase: FloatArray, turn: float) -> FloatArray:
-    """Return a triangle of period 1 from 0 to 1 and back whose turns take the share `turn`."""
-    s = 1.0 - np.abs(1.0 - 2.0 * np.mod(phase, 1.0))  # way along the half period, 0 to 1
-    half = 0.5 * turn
-    near = np.minimum(s, 1.0 - s)  # way from the nearer turn
-    # speed sin(pi near / turn) in the turn, 1 outside; distance is its integral
-    inside = turn / np.pi * (1.0 - np.cos(np.pi * np.minimum(near, half) / turn))
-    way = inside + np.maximum(near - half, 0.0)
-    full = 2.0 * (turn / np.pi + 0.5 - half)
-    return np.asarray(np.where(s <= 0.5, way, full - way) / full)
-
-
 @dataclass(frozen=True)
 class AmplifierLimits:
     """Bounds of the voltage command [V], of its rate [V/s], and of the stack's current [A].
@@ -163,6 +127,11 @@ class Response:
     displacement: FloatArray
     current: FloatArray
     states: FloatArray
+
+    @property
+    def rate(self) -> FloatArray:
+        """Rate of the voltage between samples (n - 1,) [V/s]."""
+        return np.asarray(np.diff(self.voltage) / np.diff(self.time))
 
 
 @dataclass(frozen=True)
@@ -208,8 +177,7 @@ def usage(
 
     The limit is that of the magnitude for rate and current, the highest for the voltage.
     """
-    rate = np.diff(response.voltage) / np.diff(response.time)
-    v, i = response.voltage, response.current
+    v, i, rate = response.voltage, response.current, response.rate
     return (
         ("voltage", float(v.min()), float(v.max()), limits.max_voltage, "V"),
         ("voltage rate", float(rate.min()), float(rate.max()), limits.max_rate, "V/s"),
@@ -219,13 +187,13 @@ def usage(
 
 def breaks(response: Response, limits: AmplifierLimits, slack: float = 1e-3) -> bool:
     """Whether a response breaks a limit by more than the share `slack`."""
-    v, rate = response.voltage, np.diff(response.voltage) / np.diff(response.time)
+    v = response.voltage
     span = limits.max_voltage - limits.min_voltage
     room = slack * (span if np.isfinite(span) else max(1.0, float(np.ptp(v))))
     return bool(
         v.max() > limits.max_voltage + room
         or v.min() < limits.min_voltage - room
-        or np.abs(rate).max() > (1.0 + slack) * limits.max_rate
+        or np.abs(response.rate).max() > (1.0 + slack) * limits.max_rate
         or np.abs(response.current).max() > (1.0 + slack) * limits.max_current
     )
 
@@ -273,7 +241,7 @@ def demand_stack(model: Model) -> None:
             f"The model '{model.name}' has no voltage input or no displacement output, so no"
             " voltage can make it follow a path; give the model of a stack."
         )
-    if getattr(model.structure, "sampled", ()):
+    if model.structure.sampled:
         raise InputError(
             f"The model '{model.name}' has states that change at sample instants only, which a"
             " design cannot see through; give the stack without its controller."
@@ -298,25 +266,22 @@ def rest_at(model: Model, displacement: float) -> tuple[float, FloatArray]:
     Newton's method on the settled state by secants; the displacement at rest is all but linear in
     the voltage. Raises InputError if no voltage gives the displacement.
     """
-    row = model.output_names.index("displacement")
-    starts = [i.start for i in model.structure.inputs]
-    column = model.input_names.index("voltage")
-    p = model.parameter_vector()
+    row, p = model.output_names.index("displacement"), model.parameter_vector()
 
     def settled(v: float) -> tuple[float, FloatArray]:
-        u = [v if k == column else start for k, start in enumerate(starts)]
+        u = [v if i.name == "voltage" else i.start for i in model.structure.inputs]
         x = start_state(model, u).x
         return float(model.structure.f(0.0, x, u, p)[1][row]), x
 
-    before, after = 0.0, 1.0
+    before, after, size = 0.0, 1.0, model.output_nominals()[row]
     reached = settled(before)[0]
     for _ in range(20):
         found, x = settled(after)
-        if found == reached or abs(found - displacement) < 1e-9 * model.output_nominals()[row]:
+        if found == reached or abs(found - displacement) < 1e-9 * size:
             break
         slope = (found - reached) / (after - before)
         before, reached, after = after, found, after + (displacement - found) / slope
-    if not abs(found - displacement) < 1e-6 * model.output_nominals()[row]:
+    if not abs(found - displacement) < 1e-6 * size:
         raise InputError(
             f"No voltage holds the stack at {1e6 * displacement:g} um; the path is likely in"
             " another unit, or far beyond the stroke: correct it."
@@ -385,26 +350,28 @@ def binding(response: Response, limits: AmplifierLimits) -> tuple[str, ...]:
 
     A rate or a current counts where it lasts for three samples at least.
     """
-    v, rate = response.voltage, np.diff(response.voltage) / np.diff(response.time)
-    rate, least = np.abs(np.concatenate([rate[:1], rate])), (1, 1, 3, 3)
-    room = _BINDS * np.ptp(v)
-    current = np.abs(response.current)
+    v, rate, current = response.voltage, np.abs(response.rate), np.abs(response.current)
+    room, most = _BINDS * np.ptp(v), limits.max_rate
     cases = (
-        (f"highest voltage, {limits.max_voltage:.4g} V", v > limits.max_voltage - room),
-        (f"lowest voltage, {limits.min_voltage:.4g} V", v < limits.min_voltage + room),
-        (f"largest rate, {limits.max_rate:.4g} V/s", rate > (1.0 - _BINDS) * limits.max_rate),
+        (f"highest voltage, {limits.max_voltage:.4g} V", v > limits.max_voltage - room, 1),
+        (f"lowest voltage, {limits.min_voltage:.4g} V", v < limits.min_voltage + room, 1),
+        (f"largest rate, {most:.4g} V/s", np.append(rate[:1], rate) > (1.0 - _BINDS) * most, 3),
         (
             f"largest current, {limits.max_current:.4g} A",
             current > (1.0 - 3.0 * _BINDS) * limits.max_current,
+            3,
         ),
     )
     sentences = []
-    for (name, stands), fewest in zip(cases, least, strict=True):
+    for name, stands, fewest in cases:
         spans = [(a, b) for a, b in _runs(stands) if b - a + 1 >= fewest]
         if spans:
+            times = [(1e3 * response.time[a], 1e3 * response.time[b]) for a, b in spans[:_NAMED]]
+            when = " and ".join(f"from {first:.4g} to {last:.4g} ms" for first, last in times)
+            more = len(spans) - _NAMED
+            when += f", and {more} times more" if more > 0 else ""
             share = 100.0 * sum(b - a + 1 for a, b in spans) / len(v)
-            when = f"{_when(spans, response.time)} ({share:.2g} % of the samples)"
-            sentences.append(f"The {name}, is reached {when}.")
+            sentences.append(f"The {name}, is reached {when} ({share:.2g} % of the samples).")
     return tuple(sentences)
 
 
@@ -417,9 +384,3 @@ def _runs(stands: BoolArray) -> list[tuple[int, int]]:
         else:
             spans.append((first, stop - 1))
     return spans
-
-
-def _when(spans: list[tuple[int, int]], time: FloatArray) -> str:
-    named = [f"from {1e3 * time[a]:.4g} to {1e3 * time[b]:.4g} ms" for a, b in spans[:_NAMED]]
-    more = len(spans) - _NAMED
-    return " and ".join(named) + (f", and {more} times more" if more > 0 else "")

@@ -41,7 +41,7 @@ from psa_casadi.errors import InputError, PsaError
 from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.stepper import Steps, run
+from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 
 NODES = (1.0 / 3.0, 1.0)
@@ -90,62 +90,48 @@ def interval_of(dynamics: Dynamics, *, symbolic: bool = True) -> Interval:
     return Interval(step, dynamics.nominal, symbolic)
 
 
-@dataclass(frozen=True, eq=False)
-class Chain:
-    """The constraints over all intervals: `residual` (2 nx, N), outputs at the nodes (2, N)."""
-
-    residual: Expression
-    displacement: Expression
-    current: Expression
-
-
 def chain(
     interval: Interval, start: FloatArray, inner: Expression, voltage: Expression, clock: Expression
-) -> Chain:
+) -> tuple[Expression, Expression, Expression]:
     """Chain N intervals: `start` (nx,) over nominal, `inner` (2 nx, N), `voltage` (1, N + 1) [V].
 
-    `clock` (2, N) holds start and length of the intervals [s].
+    `clock` (2, N) holds start and length of the intervals [s]. Returns the residual (2 nx, N), and
+    displacement and current at the nodes (2, N).
     """
     count, nx = inner.shape[1], len(interval.nominal)
     before = ca.horzcat(ca.DM(start), inner[nx:, : count - 1])
     ends = ca.vertcat(voltage[:, :count], voltage[:, 1:])
     if interval.symbolic:
-        return Chain(*interval.step.map(count)(before, inner, ends, clock))
+        residual, displacement, current = interval.step.map(count)(before, inner, ends, clock)
+        return residual, displacement, current
     # the derivatives of an FMU are right only where its calls stand in the program itself
     pieces = [
         interval.step.call([before[:, k], inner[:, k], ends[:, k], ca.MX(clock)[:, k]], True, False)
         for k in range(count)
     ]
-    return Chain(*(ca.horzcat(*column) for column in zip(*pieces, strict=True)))
+    residual, displacement, current = (ca.horzcat(*c) for c in zip(*pieces, strict=True))
+    return residual, displacement, current
 
 
-def nodes_of(time: FloatArray) -> FloatArray:
+def _at_nodes(
+    model: Model, time: FloatArray, voltage: FloatArray, start: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the simulated states over nominal (2 nx, N) and displacement (2, N) [m] at the nodes.
+
+    `start` (nx,) is the state at the first instant.
+    """
+    count = len(time) - 1
+    grid = np.concatenate([time[:1], _nodes(time).T.ravel()])
+    u = input_samples(model, len(grid), {"voltage": np.interp(grid, time, voltage)})
+    steps = run(model, grid, u, start, rtol=1e-7)
+    shown = steps.y[1:, model.output_names.index("displacement")]
+    states = steps.x[1:] / model.state_nominals()
+    return states.reshape(count, -1).T, shown.reshape(count, 2).T
+
+
+def _nodes(time: FloatArray) -> FloatArray:
     """Return the instants of the nodes, shape (2, N) [s]."""
     return np.array([time[:-1] + NODES[0] * np.diff(time), time[1:]])
-
-
-def simulated_states(
-    model: Model, nodes: FloatArray, time: FloatArray, voltage: FloatArray, start: FloatArray
-) -> FloatArray:
-    """Return the simulated states over nominal at the nodes (2, N), shape (2 nx, N)."""
-    states = _simulate(model, nodes, time, voltage, start).x[1:] / model.state_nominals()
-    return states.reshape(nodes.shape[1], -1).T
-
-
-def simulated_displacement(
-    model: Model, nodes: FloatArray, time: FloatArray, voltage: FloatArray, start: FloatArray
-) -> FloatArray:
-    """Return the simulated displacement at the nodes, shape (2, N) [m]."""
-    y = _simulate(model, nodes, time, voltage, start).y[1:]
-    return y[:, model.output_names.index("displacement")].reshape(nodes.shape[1], 2).T
-
-
-def _simulate(
-    model: Model, nodes: FloatArray, time: FloatArray, voltage: FloatArray, start: FloatArray
-) -> Steps:
-    grid = np.concatenate([time[:1], nodes.T.ravel()])
-    u = input_samples(model, len(grid), {"voltage": np.interp(grid, time, voltage)})
-    return run(model, grid, u, start, rtol=1e-7)
 
 
 #: Price of the voltage's second differences over the voltage scale, beside errors over the range.
@@ -183,16 +169,6 @@ class Problem:
     start: FloatArray
     limits: AmplifierLimits
     minimax: bool = False
-    tolerance: float = 1e-8
-    iterations: int = 150
-    symbolic: bool = True
-
-    @property
-    def limited(self) -> bool:
-        """Say whether something else than the squares of the errors shapes the answer."""
-        b = self.limits
-        finite = np.isfinite([b.min_voltage, b.max_voltage, b.max_rate, b.max_current])
-        return bool(self.minimax or finite.any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,11 +200,13 @@ class Program:
         free = self._x[size : size + count - 1]
         self._voltage = ca.horzcat(first, (problem.scale * free).T)
         clock = np.vstack([problem.time[:-1], np.diff(problem.time)])
-        self._chain: Chain = chain(problem.interval, problem.start, inner, self._voltage, clock)
-        self._errors = (ca.vec(self._chain.displacement) - self._path) / problem.span
-        self._rows, self._low, self._high = self._constraints(clock[1])
-        self._solver = self._build()
-        self._outputs = ca.Function("outputs", [self._x], [self._chain.displacement])
+        residual, displacement, current = chain(
+            problem.interval, problem.start, inner, self._voltage, clock
+        )
+        self._errors = (ca.vec(displacement) - self._path) / problem.span
+        rows, self._low, self._high = self._constraints(residual, current, clock[1])
+        self._solver = self._build(rows)
+        self._outputs = ca.Function("outputs", [self._x], [displacement])
 
     def solve(self, path: FloatArray, voltage: FloatArray, inner: FloatArray) -> Solution:
         """Solve for a path (2, N) [m] at the nodes from a first guess of voltage and states.
@@ -263,29 +241,28 @@ class Program:
             bool(stats["success"]),
         )
 
-    def _constraints(self, lengths: FloatArray) -> tuple[Expression, FloatArray, FloatArray]:
+    def _constraints(
+        self, residual: Expression, current: Expression, lengths: FloatArray
+    ) -> tuple[Expression, FloatArray, FloatArray]:
         """Return rows with their bounds: equations, rate, current, and the largest error."""
         q = self.problem
-        residual: Expression = ca.vec(self._chain.residual)
-        rows, tops = [residual], [np.zeros(residual.shape[0])]
+        rows: list[Any] = [ca.vec(residual)]
+        least, most = [0.0], [0.0]
         if np.isfinite(q.limits.max_rate):
-            relative: Expression = ca.diff(self._voltage, 1, 1)[1:].T / (
-                q.limits.max_rate * lengths[1:]
-            )
-            rows, tops = [*rows, relative], [*tops, np.ones(relative.shape[0])]
+            change: Expression = ca.diff(self._voltage, 1, 1)[1:].T
+            rows.append(change / (q.limits.max_rate * lengths[1:]))
         if np.isfinite(q.limits.max_current):
-            passed: Expression = ca.vec(self._chain.current)
-            relative = passed / q.limits.max_current
-            rows, tops = [*rows, relative], [*tops, np.ones(relative.shape[0])]
-        lows = [-top for top in tops]
+            passed: Expression = ca.vec(current)
+            rows.append(passed / q.limits.max_current)
+        least += [-1.0] * (len(rows) - 1)
+        most += [1.0] * (len(rows) - 1)
         if q.minimax:
-            largest = self._x[-1]
-            rows += [self._errors - largest, -self._errors - largest]
-            tops += [np.zeros(self._errors.shape[0])] * 2
-            lows += [np.full(self._errors.shape[0], -np.inf)] * 2
-        return ca.vertcat(*rows), np.concatenate(lows), np.concatenate(tops)
+            rows += [self._errors - self._x[-1], -self._errors - self._x[-1]]
+            least, most = [*least, -np.inf, -np.inf], [*most, 0.0, 0.0]
+        sizes = [row.shape[0] for row in rows]
+        return ca.vertcat(*rows), np.repeat(least, sizes), np.repeat(most, sizes)
 
-    def _build(self) -> ca.Function:
+    def _build(self, rows: Expression) -> ca.Function:
         """Return the solver.
 
         Where only squares of errors count, its Hessian is that of their sum (Gauss and Newton): the
@@ -302,21 +279,22 @@ class Program:
         cost = WEIGHT * ca.sumsqr(terms)
         slopes = ca.jacobian(terms, self._x)
         sigma = ca.MX.sym("sigma")
-        multipliers = ca.MX.sym("multipliers", self._rows.shape[0])
+        multipliers = ca.MX.sym("multipliers", rows.shape[0])
         hessian = ca.triu(2.0 * WEIGHT * sigma * slopes.T @ slopes)
         arguments = [self._x, self._path, sigma, multipliers]
-        barrier = _BARRIER_LIMITED if q.limited else _BARRIER
+        limited = q.minimax or q.limits != AmplifierLimits()  # not only squares shape the answer
+        barrier = _BARRIER_LIMITED if limited else _BARRIER
         options: dict[str, Any] = {
             "print_time": False,
             "ipopt": {
-                "print_level": 0, "sb": "yes", "tol": q.tolerance, "max_iter": q.iterations,
+                "print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": 150,
                 "mu_init": barrier,
             },
         }  # fmt: skip
-        if not (q.limited and q.symbolic):
+        if not (limited and q.interval.symbolic):
             options["hess_lag"] = ca.Function("hessian", arguments, [hessian])
         goal = cost + self._x[-1] * 100.0 if q.minimax else cost
-        program = {"x": self._x, "p": self._path, "f": goal, "g": self._rows}
+        program = {"x": self._x, "p": self._path, "f": goal, "g": rows}
         return ca.nlpsol("tracking", "ipopt", program, options)
 
 
@@ -391,7 +369,7 @@ def track(
     interval = interval_of((equations or dynamics_of)(smooth), symbolic=equations is None)
     problem = Problem(
         interval, target.time, target.span, rest, float(np.ptp(inverse.response.voltage)),
-        start / interval.nominal, bounds, minimax, symbolic=equations is None,
+        start / interval.nominal, bounds, minimax,
     )  # fmt: skip
     solutions = _solve(model, smooth, target, problem, guess, corrections, progress)
     designed = _chosen(model, target, bounds, minimax, solutions, cut)
@@ -457,11 +435,11 @@ def _solve(
 
     There are fewer, or none, where IPOPT finds no further one.
     """
-    nodes = nodes_of(target.time)
-    path = np.asarray(scipy.interpolate.PchipInterpolator(target.time, target.displacement)(nodes))
+    between = scipy.interpolate.PchipInterpolator(target.time, target.displacement)
+    path = np.asarray(between(_nodes(target.time)))
     start = problem.start * problem.interval.nominal
     program, shown = Program(problem), path
-    inner = simulated_states(smooth, nodes, target.time, guess, start)
+    inner, _ = _at_nodes(smooth, target.time, guess, start)
     solutions: list[tuple[float, Solution]] = []
     for count in range(corrections + 1):
         progress(f"solution {count + 1} of {corrections + 1}")
@@ -469,8 +447,10 @@ def _solve(
             found = program.solve(shown, guess, inner)
         except NoSolutionError:
             break
-        reached = simulated_displacement(model, nodes, target.time, found.voltage, start)
-        solutions.append((_size(reached - path, problem.minimax), found))
+        _, reached = _at_nodes(model, target.time, found.voltage, start)
+        off = np.abs(reached - path)
+        size = np.max(off) if problem.minimax else np.sqrt(np.mean(off**2))
+        solutions.append((float(size), found))
         guess, inner = found.voltage, found.inner
         shown = path - (reached - found.displacement)
     return solutions

@@ -66,16 +66,16 @@ class _Request(ctypes.Structure):
 
 @dataclass(frozen=True)
 class ExactSteps:
-    """What a run returned; arrays are None where they were not asked for.
+    """What a run returned: the chosen output `shown` (n,), `sensitivity` (n, k), its derivatives.
 
-    `shown` (n,) is the chosen output, `sensitivity` (n, k) its derivatives, `x` (n, nx) and `y`
-    (n, ny) all states and outputs. `forced` steps missed the tolerance at the finest length.
+    `x` (n, nx) and `y` (n, ny) are all states and outputs, without rows where they were not asked
+    for. `forced` steps missed the tolerance at the finest length.
     """
 
     shown: FloatArray
-    sensitivity: FloatArray | None
-    x: FloatArray | None
-    y: FloatArray | None
+    sensitivity: FloatArray
+    x: FloatArray
+    y: FloatArray
     steps: int
     rejected: int
     forced: int
@@ -109,21 +109,14 @@ def _compiled(structure: Structure, output: str, lanes: int) -> Path | str:
     """Return the model's library, or why there is none; the text is made where it is not cached."""
     optimise = _OPTIMISE if lanes == 1 else _OPTIMISE_LANES
     flags = (*_FLAGS, *optimise, *vector_flags(), f"-DPSA_LANES={lanes}")
-    named = repr((fingerprint(structure), output, _generator()))
+    sources = sorted(Path(__file__).parent.glob("*.py"))  # another generator: other libraries
+    named = repr((fingerprint(structure), output, [q.read_text("utf-8") for q in sources]))
     try:
         return generated_library(
             named, lambda: {"exact_model.h": model_text(structure, output)}, ("exact.c",), flags
         )
     except NotExact as reason:
         return str(reason)
-
-
-@cache
-def _generator() -> str:
-    """Return the text of what generates: another one makes other libraries."""
-    return "".join(
-        path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py"))
-    )
 
 
 @cache
@@ -176,25 +169,22 @@ def run_exact(
     `everything` asks for all states and outputs. Raises NotExact where this way is not possible,
     where it fails, or where it needs so many steps that the stepper is no slower.
     """
-    reason = why_not(model.structure, output)
-    if reason:
-        raise NotExact(reason)
     n, nx, count = len(t), len(model.state_names), len(unknowns)
-    start = np.zeros((nx, count)) if s0 is None else s0
     arrays: dict[str, npt.NDArray[Any]] = {
         "p": model.parameter_vector(), "x0": doubles(x0),
         "nominal": model.error_sizes(), "shown": np.empty(n), "which": which_of(model, unknowns),
-        "s0": doubles(start), "dy": np.empty((n, count)),
+        "s0": doubles(np.zeros((nx, count)) if s0 is None else s0), "dy": np.empty((n, count)),
     }  # fmt: skip
+    rows = n if everything else 0
+    x, y = np.empty((rows, nx)), np.empty((rows, len(model.output_names)))
     if everything:
-        arrays |= {"x": np.empty((n, nx)), "y": np.empty((n, len(model.output_names)))}
-    library = _library(model.structure, output, 1)
+        arrays |= {"x": x, "y": y}
     most = int(MOST * max(1.0, AT / tolerance) ** 0.5 * n) << coarsest
-    how = {"tolerance": tolerance, "coarsest": coarsest, "steps_limit": most}
-    cost = _run(library, (t, u, hold), arrays, sets=1, count=count, **how)
-    return ExactSteps(
-        arrays["shown"], arrays["dy"] if count else None, arrays.get("x"), arrays.get("y"), *cost
-    )
+    cost = _run(
+        model.structure, output, (t, u, hold), arrays,
+        count=count, tolerance=tolerance, coarsest=coarsest, steps_limit=most,
+    )  # fmt: skip
+    return ExactSteps(arrays["shown"], arrays["dy"], x, y, *cost)
 
 
 def run_sets(
@@ -214,43 +204,42 @@ def run_sets(
     `x0` and `nominal` are (nx, m). Every column has the bits of a run by itself; one that cannot be
     integrated is nan from there on. Raises NotExact like `run_exact`.
     """
-    reason = why_not(structure, output)
-    if reason:
-        raise NotExact(reason)
-    sets = p.shape[1]
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "p": doubles(p), "x0": doubles(x0), "nominal": doubles(nominal),
-        "shown": np.empty((len(t), sets)),
-    }  # fmt: skip
-    limit = MOST_IN_LANES * len(t)
-    how = {"tolerance": tolerance, "coarsest": 0, "steps_limit": limit}
-    _run(_library(structure, output, LANES), (t, u, hold), arrays, sets=sets, count=0, **how)
-    return arrays["shown"]
+    shown = np.empty((len(t), p.shape[1]))
+    arrays = {"p": doubles(p), "x0": doubles(x0), "nominal": doubles(nominal), "shown": shown}
+    _run(
+        structure, output, (t, u, hold), arrays, lanes=LANES, sets=p.shape[1],
+        tolerance=tolerance, steps_limit=MOST_IN_LANES * len(t),
+    )  # fmt: skip
+    return shown
 
 
 def _run(
-    library: ctypes.CDLL,
+    structure: Structure,
+    output: str,
     record: tuple[FloatArray, FloatArray, str],
     arrays: Mapping[str, npt.NDArray[Any]],
+    *,
+    lanes: int = 1,
+    sets: int = 1,
+    count: int = 0,
+    coarsest: int = 0,
     **how: Any,
 ) -> tuple[int, int, int]:
-    """Run the library over times, inputs and hold; return steps, rejected and forced ones."""
+    """Run a model over times, inputs and hold; return steps, rejected and forced ones."""
+    reason = why_not(structure, output)
+    if reason:
+        raise NotExact(reason)
     t, u, hold = record
-    count_run(differentiated=how["count"] > 0)
+    count_run(differentiated=count > 0)
     lengths, which_step = time_steps(t)
-    given: dict[str, npt.NDArray[Any]] = {
-        "t": doubles(t), "v": doubles(u), "length": lengths, "which_step": which_step,
-    }  # fmt: skip
+    times = {"t": doubles(t), "v": doubles(u), "length": lengths}
+    given: dict[str, npt.NDArray[Any]] = {**times, "which_step": which_step, **arrays}
     request = _Request(
-        samples=len(t),
-        zero_order_hold=int(hold == "zero"),
-        lengths=len(lengths),
-        stop=flag_address(),
-        finest=max(FINEST, int(how["coarsest"])),
-        **how,
-        **{name: array.ctypes.data for name, array in {**given, **arrays}.items()},
-    )
-    status = library.psa_run_exact(ctypes.byref(request))
+        samples=len(t), zero_order_hold=int(hold == "zero"), lengths=len(lengths), sets=sets,
+        count=count, coarsest=coarsest, finest=max(FINEST, coarsest), stop=flag_address(), **how,
+        **{name: array.ctypes.data for name, array in given.items()},
+    )  # fmt: skip
+    status = _library(structure, output, lanes).psa_run_exact(ctypes.byref(request))
     if status == _STOPPED:
         raise KeyboardInterrupt
     if status:

@@ -6,7 +6,8 @@ from importlib import import_module
 
 import numpy as np
 
-from psa_casadi.design.mechanism.mechanism import Limits, design_mechanism
+from psa_casadi.design.mechanism.mechanism import design_mechanism
+from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.examples.linearisation_trial import (
     Drive,
     ageing,

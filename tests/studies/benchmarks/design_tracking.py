@@ -17,7 +17,6 @@ from psa_casadi.design.tracking.targets import (
     Target,
     TrackingError,
     error_of,
-    raster_scan,
     uncompensated,
 )
 from psa_casadi.design.tracking.tracking import track
@@ -213,9 +212,27 @@ def scanner(payload: float = PAYLOAD) -> Model:
 
 def scan(model: Model, samples: int) -> Target:
     """Return a raster scan at a twentieth of the first resonance, 250 samples a line."""
-    frequency = linear_part(model).first_resonance() / 20.0
+    poles = np.linalg.eigvals(linear_part(model).a)
+    ringing = np.abs(poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)])
+    frequency = float(np.min(ringing)) / (2.0 * np.pi) / 20.0
     lines = max(1, samples // LINE)
-    return raster_scan(low=0.0, high=STROKE, frequency=frequency, lines=lines, samples=samples)
+    time = np.linspace(0.0, lines / frequency, samples)
+    return Target(time, STROKE * rounded_triangle(time * frequency, 0.2))
+
+
+def rounded_triangle(phase: FloatArray, turn: float) -> FloatArray:
+    """Return a triangle of period 1 from 0 to 1 and back whose turns take the share `turn`.
+
+    Over that share of each half period the acceleration is a half sine; it begins at rest.
+    """
+    s = 1.0 - np.abs(1.0 - 2.0 * np.mod(phase, 1.0))  # way along the half period, 0 to 1
+    half = 0.5 * turn
+    near = np.minimum(s, 1.0 - s)  # way from the nearer turn
+    # speed sin(pi near / turn) in the turn, 1 outside; distance is its integral
+    inside = turn / np.pi * (1.0 - np.cos(np.pi * np.minimum(near, half) / turn))
+    way = inside + np.maximum(near - half, 0.0)
+    full = 2.0 * (turn / np.pi + 0.5 - half)
+    return np.asarray(np.where(s <= 0.5, way, full - way) / full)
 
 
 def judged(values: Mapping[str, float], target: Target, voltage: FloatArray) -> TrackingError:
