@@ -60,7 +60,16 @@ def rates_of(loop: Loop, k: float) -> Rates:
     of a period at most, and a sentence says where that is not enough. Voltage and displacement
     pass through the same filter, so that what it bends it bends alike.
     """
-    window, excess = window_of(loop)
+    period = 1.0 / (loop.frequency * loop.sample_time)
+    longest = max(_SHORTEST, int(_LONGEST * period) // 2 * 2 - 1)
+    allowed = _QUIET * 2.0 * loop.frequency * float(np.ptp(loop.displacement))
+    noise, window = high_frequency_noise(loop.displacement), _SHORTEST
+    while True:
+        weights = scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=loop.sample_time)
+        excess = noise * float(np.linalg.norm(weights)) / allowed
+        if excess <= 1.0 or window >= longest:
+            break
+        window = min(longest, max(window + 2, int(1.2 * window) // 2 * 2 + 1))
     u, u_rate, x, x_rate = (
         np.asarray(
             scipy.signal.savgol_filter(
@@ -85,21 +94,6 @@ def rates_of(loop: Loop, k: float) -> Rates:
         loop.name, k, u, u_rate, x - k * u, x_rate, inner, branches,
         notes if excess > _TOO_MUCH else (),
     )  # fmt: skip
-
-
-def window_of(loop: Loop) -> tuple[int, float]:
-    """Return the window in samples (odd), and the noise of x' over what is allowed."""
-    period = 1.0 / (loop.frequency * loop.sample_time)
-    longest = max(_SHORTEST, int(_LONGEST * period) // 2 * 2 - 1)
-    allowed = _QUIET * 2.0 * loop.frequency * float(np.ptp(loop.displacement))
-    noise = high_frequency_noise(loop.displacement)
-    window = _SHORTEST
-    while True:
-        weights = scipy.signal.savgol_coeffs(window, _ORDER, deriv=1, delta=loop.sample_time)
-        excess = noise * float(np.linalg.norm(weights)) / allowed
-        if excess <= 1.0 or window >= longest:
-            return window, excess
-        window = min(longest, max(window + 2, int(1.2 * window) // 2 * 2 + 1))
 
 
 #: Samples count in (31), (34) where h and |u'| exceed this share of their largest values.
@@ -160,12 +154,22 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
     """
     rates = [rates_of(loop, k) for loop in loops]
     notes = [note for r in rates for note in r.notes]
-    pairs = [pair for r in rates for pair in crossing_pairs(r)]
+    crossed = [[(r.sign(b), _crossing(r, b)) for b in r.branches] for r in rates]
+    pairs = [pair for own in crossed for pair in _periods(own)]
     if not pairs:
-        return HysteresisPart(notes=(*notes, _no_crossing(rates)))
-    each = np.array([slope_and_asymmetry(up, down, k) for up, down in pairs])
+        seen = {sign for own in crossed for sign, at in own if at is not None}
+        missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in seen]
+        return HysteresisPart(notes=(*notes, note("no_crossing", branches=missing)))
+    each = np.array([_slope_and_asymmetry(up, down, k) for up, down in pairs])
     A, delta = (float(v) for v in each.mean(axis=0))
-    notes += _doubts_about_k(rates, each[:, 0])
+    scatter = float(np.std(each[:, 0]) / max(abs(float(np.mean(each[:, 0]))), 1e-300))
+    if scatter > _SCATTER:
+        notes.append(note("scatter", share=100.0 * scatter))
+    widest = max(rates, key=lambda r: float(np.ptp(r.u)))
+    top = int(np.argmax(np.abs(widest.u)))
+    share = abs(float(widest.h[top])) / float(np.max(np.abs(widest.h)))
+    if share < _CLOSED:  # the loop closes on the line x = k u
+        notes.append(note("secant", loop=widest.name, share=100.0 * share))
     rising, falling = (_logarithms(rates, A, delta, sign) for sign in (1.0, -1.0))
     notes += _lost(rising, "rising", "beta + gamma") + _lost(falling, "falling", "gamma - beta")
     if rising is None or falling is None:
@@ -180,13 +184,14 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
     return HysteresisPart(A, delta, bends, tuple(notes))
 
 
-def crossing_pairs(r: Rates) -> list[tuple[Crossing, Crossing]]:
+def _periods(
+    branches: Sequence[tuple[float, Crossing | None]],
+) -> list[tuple[Crossing, Crossing]]:
     """Return each crossing of x = k u on a rising branch with that of the next falling branch.
 
     Where no rising branch with a crossing is followed by such a falling one, a falling branch is
     paired with the next rising one.
     """
-    branches = [(r.sign(b), _crossing(r, b)) for b in r.branches]
     pairs = [
         (first[0], first[1], then[1])
         for first, then in pairwise(branches)
@@ -196,7 +201,7 @@ def crossing_pairs(r: Rates) -> list[tuple[Crossing, Crossing]]:
     return up_first or [(then, first) for _, first, then in pairs]
 
 
-def slope_and_asymmetry(up: Crossing, down: Crossing, k: float) -> tuple[float, float]:
+def _slope_and_asymmetry(up: Crossing, down: Crossing, k: float) -> tuple[float, float]:
     """Return A_i [m/V] and delta_i [m/(V.s)] of one period, eq. (29).
 
     x'_+ = (A_i + k) u'_+ + delta_i u_+,  x'_- = (A_i + k) u'_- - delta_i u_-.
@@ -221,12 +226,8 @@ def _crossing(r: Rates, branch: slice) -> Crossing | None:
     j = int(where[where.size // 2])
     jump = float(h[j] - h[j + 1])
     share = float(h[j]) / jump if jump else 0.5
-
-    def at(values: FloatArray) -> float:
-        first, then = values[branch][j : j + 2]
-        return float(first + share * (then - first))
-
-    return Crossing(at(r.u), at(r.u_rate), at(r.x_rate))
+    pairs = [values[branch][j : j + 2] for values in (r.u, r.u_rate, r.x_rate)]
+    return Crossing(*(float(first + share * (then - first)) for first, then in pairs))
 
 
 def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> _Line | None:
@@ -261,27 +262,4 @@ def _lost(line: _Line | None, branch: str, what: str) -> list[Note]:
     notes = [note("negative_rising")] if branch == "rising" and line.sign < 0.0 else []
     if line.lost > _FEW:
         notes.append(note("wrong_sign", lost=100.0 * line.lost, branch=branch, what=what))
-    return notes
-
-
-def _no_crossing(rates: Sequence[Rates]) -> Note:
-    missing = [
-        name
-        for name, sign in (("rising", 1.0), ("falling", -1.0))
-        if not any(_crossing(r, b) for r in rates for b in r.branches if r.sign(b) == sign)
-    ]
-    return note("no_crossing", branches=missing)
-
-
-def _doubts_about_k(rates: Sequence[Rates], slopes: FloatArray) -> list[Note]:
-    """Note that k is doubtful where A scatters, or where the loop closes on the line x = k u."""
-    notes = []
-    scatter = float(np.std(slopes) / max(abs(float(np.mean(slopes))), 1e-300))
-    if scatter > _SCATTER:
-        notes.append(note("scatter", share=100.0 * scatter))
-    widest = max(rates, key=lambda r: float(np.ptp(r.u)))
-    top = int(np.argmax(np.abs(widest.u)))
-    share = abs(float(widest.h[top])) / float(np.max(np.abs(widest.h)))
-    if share < _CLOSED:
-        notes.append(note("secant", loop=widest.name, share=100.0 * share))
     return notes
