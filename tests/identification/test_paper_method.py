@@ -9,17 +9,18 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
-from psa_casadi.identification.paper.hysteresis import hysteresis_part
-from psa_casadi.identification.paper.linear import (
+from psa_casadi.identification.paper import (
     COEFFICIENTS,
     coefficients_of_limits,
     find_loops,
     find_steps,
+    hysteresis_part,
+    identify_by_paper,
     linear_part,
     mechanics_of,
     moment_coefficients,
+    paper_method,
 )
-from psa_casadi.identification.paper.method import identify_by_paper, paper_method
 from psa_casadi.model.model_file import load_model
 from psa_casadi.records import (
     Record,
@@ -256,7 +257,7 @@ def test_a_hysteresis_that_runs_away_is_set_back(monkeypatch: pytest.MonkeyPatch
     real = paper_method([loop()])
     wild = real.model.with_values({"beta": -2e3, "gamma": 0.0, "A": -50.0, "n": 4.0})
     monkeypatch.setattr(
-        "psa_casadi.identification.paper.method.paper_method",
+        "psa_casadi.identification.paper.paper_method",
         lambda records, stiffness: type(real)(**{**vars(real), "model": wild}),
     )
     found = identify_by_paper([loop()])
