@@ -323,8 +323,7 @@ def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
     free = best.unknowns.names
     names = [*free, name]
     none: list[dict[str, float]] = [{} for _ in experiments]
-    known = best.unknowns
-    fresh = unknowns_of(best.model, names, none, known.first_voltage, known.offset_scale)
+    fresh = unknowns_of(best.model, names, none, best.unknowns.offset_scale)
     count = len(free)
     unknowns = replace(
         fresh,
