@@ -15,6 +15,7 @@ creep lag, and the oscillator as fast as the other one.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from psa_casadi.errors import PsaError
@@ -24,7 +25,10 @@ from psa_casadi.identification.fitting.prediction import measured, predict
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level
+from psa_casadi.simulation.simulate import record_inputs, simulate_record
+from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
 
@@ -313,3 +317,22 @@ def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
     scaled = jacobian / max(best.rms, min(best.sigma))
     information = scaled.T @ scaled + np.diag(1.0 / unknowns.prior**2)
     return bool(np.sqrt(np.linalg.pinv(information, hermitian=True)[count, count]) < 0.5)
+
+
+#: Error of the simulated force over its range: far below the noise of what it is fitted to.
+_FORCE_RTOL = 1e-5
+
+
+def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
+    """Return a record's simulated force in front of the lag (samples,) [N].
+
+    `number` is the record's place in the fit; the error is far below what sensors see. Raises
+    PsaError where it cannot be simulated.
+    """
+    found = simulate_record(fit.model, record, memory=fit.start(number), rtol=_FORCE_RTOL)
+    s = fit.model.structure
+    states = np.array([found.states[n] for n in fit.model.state_names])
+    inputs = record_inputs(fit.model, record, record.n).T
+    force = ca.Function("force", [s.time, s.x, s.u, s.p], [s.sums["free_force"]])
+    values = force(record.time[None, :], states, inputs, fit.model.parameter_vector())
+    return np.asarray(values, dtype=np.float64).reshape(-1)
