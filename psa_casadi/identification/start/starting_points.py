@@ -1,4 +1,4 @@
-"""Starting points of a search: dynamics and loops that the records show, ordinary shapes.
+"""Starting points of a search: dynamics that the records show, ordinary loops.
 
 Starting values of the linear part, from the records alone.
 
@@ -8,34 +8,403 @@ Starting values of the linear part, from the records alone.
    record shows lie below those that it shows.
 4. Every such start refined by least squares with the exact response (`linear_fit`), the best ones
    to the end, and k_P/k_B as well where that explains more.
+
+The linear part fitted to excerpts: eqs. (13), (15) behind a drive and a static loop.
+
+    u = v/(T s + 1),   f = g_0 u + sum_j g_j play_j(u),   y = H f + constant,
+
+H the mechanics and the creep lag with gain 1 at rest. The weights g, which every excerpt has for
+itself, and the constants are linear: they are eliminated at every theta (variable projection, with
+Kaufman's derivative, BIT 15 (1975), 49). A loop of Bouc and Wen is odd play operators to about a
+percent, so the rates at which it runs do not mislead the time constants.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.components import BASE
+from psa_casadi.identification.fitting.levenberg_marquardt import minimise
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.linear_fit import (
-    COORDINATES,
-    Excerpt,
-    LinearFit,
-    cost_of,
-    excerpts,
-    fit_linear,
-)
 from psa_casadi.identification.start.linear_response import (
     ComplexArray,
     Response,
     contributions,
+    first_order,
+    mechanics_poles,
+    numerator_time,
+    orthonormal,
+    plays,
+    respond,
     vector_fit,
 )
 from psa_casadi.identification.start.ordinary import has_loop, loop_starts
 from psa_casadi.model.compose import Model
+from psa_casadi.records.drive import turns
+from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
+
+BoolArray = npt.NDArray[np.bool_]
+
+#: Samples that all excerpts together may have, and that one may.
+SAMPLES, MOST = 8_000, 4_000
+#: Radii of the play operators that stand for the loop, over the range of the voltage.
+RADII = tuple(k / 16.0 for k in range(1, 9))
+#: Share of its range that a static loop must miss in a record: with a voltage that crosses its
+#: range within `_FAST` samples, and with a slower one, where the shape of the loop may be missed.
+_SHOWS_FAST, _SHOWS_SLOW, _FAST = 0.01, 0.03, 16.0
+#: A record whose voltage takes this many times longer than that of the fastest adds no dynamics.
+_SLOWER = 30.0
+#: Least noise over the range, and the largest where fast motion looks like noise to its estimate.
+_NOISE = (2e-3, 2e-2)
+_FEWEST = 16
+#: Share of the range within which a response has settled, and within which it is all but over.
+_SETTLED, _OVER = 0.01, 0.05
+#: Share of an excerpt that begins in motion and is given to its transient.
+_LEAD = 0.2
+#: A motion that begins with less than this share of its ordinary rate begins at rest.
+_SLOWLY = 0.2
+#: Voltages alike within this share of the range are one level.
+_LEVEL = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """Uniform samples h [s] apart of one record, from (nearly) rest; all arrays (n,).
+
+    `v` [V] and `y` [m] are deviations from the start; `valid` marks measured samples that count,
+    elsewhere y is a stand-in; `sigma` [m] is the white noise, within `_NOISE`; `loop` [m] is the
+    best static loop for y, 0 at the start, and `static` [m] the root mean square that it leaves.
+    No time constant of a stack exceeds `longest` [s]: a hold shows when the response is over.
+    """
+
+    name: str
+    h: float
+    longest: float
+    v: FloatArray
+    y: FloatArray
+    valid: BoolArray
+    sigma: float
+    loop: FloatArray
+    static: float
+
+    @property
+    def range(self) -> float:
+        """Range of the displacement [m]."""
+        return float(np.ptp(self.y[self.valid]))
+
+    @property
+    def missed(self) -> float:
+        """Root mean square that a static loop leaves beyond the noise [m]."""
+        return float(np.sqrt(max(self.static**2 - self.sigma**2, 0.0)))
+
+    @property
+    def crossing(self) -> float:
+        """Time in which the voltage crosses its range at its fastest [s]."""
+        return self.h * float(np.ptp(self.v) / np.max(np.abs(np.diff(self.v))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Uniform samples of a record, as they stand: nan where no displacement was measured."""
+
+    h: float
+    longest: float
+    v: FloatArray
+    y: FloatArray
+
+    def part(self, start: int, stop: int, every: int = 1) -> "_Samples":
+        cut = slice(max(start, 0), stop, every)
+        return _Samples(self.h * every, self.longest, self.v[cut], self.y[cut])
+
+
+def excerpts(records: Sequence[Record]) -> list[Excerpt]:
+    """Return the excerpts in which a static loop misses what is there, the clearest first."""
+    found = [e for r in records for e in _of_record(r)]
+    shown = [
+        e
+        for e in found
+        if (e.static > _SHOWS_FAST * e.range if _fast(e) else e.missed > _SHOWS_SLOW * e.range)
+    ]
+    shown.sort(key=lambda e: e.range / e.static)
+    fastest = min((e.crossing for e in shown), default=0.0)
+    kept: list[Excerpt] = []
+    for e in shown:
+        room = not kept or sum(k.y.size for k in kept) + e.y.size <= SAMPLES
+        if room and e.crossing <= _SLOWER * fastest:
+            kept.append(e)
+    return kept
+
+
+def _fast(e: Excerpt) -> bool:
+    return e.crossing <= _FAST * e.h
+
+
+def _of_record(record: Record) -> list[Excerpt]:
+    """Return the excerpts of one record: all of it, or its fastest part and a coarse whole."""
+    if record.displacement is None or record.mask.sum() < _FEWEST or not np.ptp(record.voltage):
+        return []
+    whole = _without_rests(_uniform(record))
+    if whole.v.size <= MOST:
+        return _excerpt(record.name, whole)
+    # of equal parts the last, a little before
+    energy = np.concatenate([[0.0], np.cumsum(np.diff(whole.v) ** 2)])
+    inside = energy[MOST - 1 :] - energy[: whole.v.size - MOST + 1]
+    start = int(np.flatnonzero(inside >= (1.0 - 1e-9) * inside.max())[-1])
+    start = max(start - MOST // 50, 0)
+    found = _excerpt(f"{record.name}, fastest part", whole.part(start, start + MOST))
+    coarse = whole.part(0, whole.v.size, -(-whole.v.size // MOST))
+    at = np.arange(whole.v.size) * whole.h
+    missed = np.interp(at, np.arange(coarse.v.size) * coarse.h, coarse.v) - whole.v
+    if np.std(missed) < 0.02 * np.ptp(whole.v):
+        found += _excerpt(f"{record.name}, coarse", coarse)
+    return found
+
+
+def _excerpt(name: str, samples: _Samples) -> list[Excerpt]:
+    """Return the samples as an excerpt, or nothing where too little was measured or moved."""
+    v, y = samples.v, samples.y
+    valid = np.isfinite(y)
+    rest = _leading_rest(v)
+    lead = int(_LEAD * v.size)
+    if rest == 0 and np.ptp(v[lead:]) > 0.5 * np.ptp(v):
+        valid[:lead] = False
+    if valid.sum() < _FEWEST or not np.ptp(v) or not np.ptp(y[valid]):
+        return []
+    filled = np.interp(np.arange(y.size), np.flatnonzero(np.isfinite(y)), y[np.isfinite(y)])
+    moved = filled - np.mean(filled[: max(rest, 1)])
+    loop, static = _static_loop(v - v[0], moved, valid)
+    found = Excerpt(name, samples.h, samples.longest, v - v[0], moved, valid, 0.0, loop, static)
+    noise = max(high_frequency_noise(filled[valid]), _NOISE[0] * found.range)
+    return [replace(found, sigma=min(noise, _NOISE[1] * found.range) if _fast(found) else noise)]
+
+
+def _static_loop(v: FloatArray, y: FloatArray, valid: BoolArray) -> tuple[FloatArray, float]:
+    """Return the best static loop for y, 0 at the start, and the rms [m] that it leaves."""
+    span = float(np.ptp(v))
+    columns = np.column_stack([v, plays(v, [span * r for r in RADII]), np.full(v.size, span)])
+    q, transform = orthonormal(columns[valid])
+    weights = transform @ (q.T @ y[valid])
+    fitted = columns @ weights
+    return fitted - fitted[0], float(np.sqrt(np.mean((y[valid] - fitted[valid]) ** 2)))
+
+
+def _uniform(record: Record) -> _Samples:
+    """Return the record on uniform instants; a displacement counts within half an interval."""
+    t, y = record.time, np.asarray(record.displacement, dtype=np.float64)
+    steps = np.diff(t)
+    if np.ptp(steps) < 0.01 * record.sample_time:
+        return _Samples(record.duration / steps.size, record.duration, record.voltage, y)
+    h = max(float(np.quantile(steps, 0.1)), record.duration / (20.0 * MOST))
+    grid = t[0] + h * np.arange(int(record.duration / h) + 1)
+    measured = t[record.mask]
+    after = np.searchsorted(measured, grid).clip(1, measured.size - 1)
+    distance = np.minimum(np.abs(grid - measured[after - 1]), np.abs(measured[after] - grid))
+    displacement = np.interp(grid, measured, y[record.mask])
+    displacement[distance > 0.5 * h] = np.nan
+    return _Samples(h, record.duration, np.interp(grid, t, record.voltage), displacement)
+
+
+def _without_rests(s: _Samples) -> _Samples:
+    """Return the samples up to where the last response has settled, and settled ones made nan.
+
+    A rest before the first change of voltage is cut short. Where the longest hold is more than
+    twice as long as the response to within 5 %, that response limits the time constants.
+    """
+    y, size = s.y.copy(), float(np.nanmax(s.y) - np.nanmin(s.y))
+    still = np.abs(np.diff(s.v)) <= _LEVEL * np.ptp(s.v)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]])))
+    holds = [(int(a), int(b) + 1) for a, b in zip(edges[::2], edges[1::2], strict=True) if a > 0]
+    over = [(last - first, _settled(s.y[first:last], _OVER * size)) for first, last in holds]
+    length, response = max(over, default=(0, 0))
+    longest = s.longest
+    if 2 * response < length:
+        longest = min((max(r for n, r in over if 2 * r < n) + 8) * s.h, longest)
+    for first, last in holds:
+        y[first + 2 * _settled(s.y[first:last], _SETTLED * size) + _FEWEST : last] = np.nan
+    start = max(_leading_rest(s.v) - max(s.v.size // 50, 8), 0)
+    whole = _Samples(s.h, longest, s.v, y)
+    return whole.part(start, int(np.flatnonzero(np.isfinite(y))[-1]) + 1)
+
+
+def _settled(y: FloatArray, tolerance: float) -> int:
+    """Return the number of samples until a hold stays at its last level; all where that is open."""
+    third = y[2 * y.size // 3 :]
+    if np.isfinite(third).sum() < _FEWEST:
+        return int(y.size)
+    noise = high_frequency_noise(y[np.isfinite(y)])
+    away = np.flatnonzero(np.abs(y - np.nanmedian(third)) > max(tolerance, 3.0 * noise))
+    return int(away[-1]) + 1 if away.size else 0
+
+
+def _leading_rest(v: FloatArray) -> int:
+    """Return how many samples at the start have the first voltage; 0 if it was moving before.
+
+    A single sample counts as a rest where the voltage jumps to a level or begins to move slowly.
+    """
+    level = _LEVEL * float(np.ptp(v))
+    changed = np.flatnonzero(np.abs(v - v[0]) > level)
+    rest = int(changed[0]) if changed.size else v.size
+    moves = np.diff(v)
+    slow = np.max(np.abs(moves[:3])) < _SLOWLY * np.sqrt(np.mean(moves**2))
+    return 0 if rest == 1 and np.ptp(v[1:4]) > level and not slow else rest
+
+
+IndexArray = npt.NDArray[np.intp]
+
+#: Names of the coordinates: natural logarithms of times T, tau, a, of squares of times q, and of
+#: r = k_P/k_B, as in `linear_response`.
+COORDINATES = ("T", "tau", "a_P", "q_P", "a_B", "q_B", "r")
+#: Standard deviations of the weak priors of the coordinates, centred where a fit starts.
+_PRIOR = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0])
+#: Weak priors, all with standard deviation 1.5: ln of the damping ratios a/(2 sqrt(q)) about 0.7,
+#: which keeps a pole and the zero from cancelling far below the band, and ln (m_P/m_B) about 0,
+#: since wafers and bonding layers with their places exchanged respond alike.
+_TYPICAL = np.array(
+    [[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0], [0, 0, 0, 1, 0, -1, 1]]
+) / 1.5  # fmt: skip
+_TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
+#: Mean and standard deviation of the prior of a play operator's weight, over the slope, where the
+#: voltage turns; and where it does not: there only the prior keeps a curve that bends the other
+#: way from standing for a fast response behind a slow drive.
+_LOOP_PRIOR, _CURVE_PRIOR = (0.03, 0.1), (0.03, 0.02)
+#: The same for a shift of the voltage in time, in samples, where it jumps within `_JUMP` samples:
+#: the record does not tell when, between two of them.
+_SHIFT_PRIOR, _JUMP = (0.0, 0.3), 2.0
+#: Step of the derivatives by differences, in natural logarithms.
+_STEP = 1e-3
+#: A fit ends when two steps in a row lower the cost by less than this share of it.
+_TOLERANCE = 1e-3
+#: Shortest time constant over the shortest interval.
+_SHORTEST = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """Where a fit ended: theta (7,), standard errors (7,), weighted cost, and what is left over.
+
+    `left` holds the root mean square of the residual of every excerpt [m], `white` that of its
+    white part; a coordinate that was held has no standard error (nan).
+    """
+
+    theta: FloatArray
+    errors: FloatArray
+    cost: float
+    left: tuple[float, ...]
+    white: tuple[float, ...]
+
+
+def fit_linear(
+    parts: Sequence[Excerpt], start: FloatArray, *, ratio_free: bool, evaluations: int
+) -> LinearFit:
+    """Fit theta (7,) to the excerpts, from `start`; r stays there unless it is free."""
+    free = np.arange(7 if ratio_free else 6)
+    low, high = _bounds(parts)
+    weights = 1.0 / _PRIOR[free]
+
+    def evaluate(coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (of every excerpt and its loop's prior, then priors) and Jacobian."""
+        theta = start.copy()
+        theta[free] = coordinates
+        each = [_eliminated(e, theta, free) for e in parts]
+        priors = [weights * (coordinates - start[free]), _TYPICAL @ theta - _TYPICAL_AT]
+        residual = np.concatenate([*(r for r, _ in each), *priors])
+        return residual, np.vstack([*(j for _, j in each), np.diag(weights), _TYPICAL[:, free]])
+
+    found = minimise(
+        evaluate, start[free], (low[free], high[free]),
+        tolerance=_TOLERANCE, evaluations=evaluations,
+    )  # fmt: skip
+    if found is None:  # the objective is finite wherever the bounds allow
+        raise ArithmeticError("The linear fit has no value at its start.")
+    theta = start.copy()
+    theta[free] = found.theta
+    data, first = [], 0
+    for e in parts:
+        count = int(e.valid.sum())
+        data.append(found.residual[first : first + count])
+        first += count + _weights_of(e)
+    level = max(1.0, float(np.mean(np.concatenate(data) ** 2)))
+    information = found.jacobian.T @ found.jacobian / level
+    errors = np.full(7, np.nan)
+    errors[free] = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
+    residuals = [e.sigma * r for e, r in zip(parts, data, strict=True)]
+    return LinearFit(
+        theta=theta,
+        errors=errors,
+        cost=found.cost,
+        left=tuple(float(np.sqrt(np.mean(r**2))) for r in residuals),
+        white=tuple(high_frequency_noise(r) for r in residuals),
+    )
+
+
+def _cost_of(parts: Sequence[Excerpt], theta: FloatArray) -> float:
+    """Return the weighted sum of squares that theta (7,) leaves, without its prior."""
+    inside = np.clip(theta, *_bounds(parts))
+    none = np.arange(0)
+    return sum(float(np.sum(_eliminated(e, inside, none)[0] ** 2)) for e in parts)
+
+
+def _bounds(parts: Sequence[Excerpt]) -> tuple[FloatArray, FloatArray]:
+    shortest = np.log(_SHORTEST * min(e.h for e in parts))
+    longest = np.log(min(e.longest for e in parts))
+    power = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0])
+    ratio = np.log([0.05, 100.0])
+    return np.append(power * shortest, ratio[0]), np.append(power * longest, ratio[1])
+
+
+def _weights_of(e: Excerpt) -> int:
+    """Return how many weights of an excerpt's loop have a prior: of plays, and a jump's shift."""
+    return len(RADII) + int(e.crossing < _JUMP * e.h)
+
+
+def _eliminated(e: Excerpt, theta: FloatArray, free: IndexArray) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted residual that the best weights leave, with its priors, and its Jacobian.
+
+    Kaufman's, with a column for each free coordinate.
+    """
+    force = _force(e, theta)
+    count, extra = int(e.valid.sum()), _weights_of(e)
+    slope = float(np.polyfit(e.v[e.valid], e.y[e.valid], 1)[0])
+    priors = [_LOOP_PRIOR if turns(e.v) else _CURVE_PRIOR] * len(RADII)
+    mean, deviation = np.array([*priors, _SHIFT_PRIOR][:extra]).T
+    matrix = np.zeros((count + extra, extra + 2))
+    matrix[:count, :-1] = _behind(e, theta, force)[e.valid] / e.sigma
+    matrix[:count, -1] = 1.0 / e.sigma
+    matrix[count:, 1:-1] = np.diag(1.0 / (deviation * abs(slope)))
+    target = np.append(e.y[e.valid] / e.sigma, np.sign(slope) * mean / deviation)
+    q, transform = orthonormal(matrix)
+    weights = (transform @ (q.T @ target))[:-1]
+    jacobian = np.zeros((target.size, free.size))
+    if free.size:
+        total = force @ weights
+        here = _behind(e, theta, total)[e.valid]
+        for k, place in enumerate(free):
+            moved = theta.copy()
+            moved[place] += _STEP
+            source = _force(e, moved) @ weights if place == 0 else total
+            jacobian[:count, k] = (_behind(e, moved, source)[e.valid] - here) / (_STEP * e.sigma)
+    return q @ (q.T @ target) - target, jacobian - q @ (q.T @ jacobian)
+
+
+def _force(e: Excerpt, theta: FloatArray) -> FloatArray:
+    """Return the drive's voltage, the play operators on it and, for a jump, its shift, (n, k)."""
+    u = first_order(float(np.exp(theta[0])), e.v, e.h)
+    span = float(np.ptp(e.v))
+    columns = [u[:, None], plays(u, [span * r for r in RADII])]
+    if e.crossing < _JUMP * e.h:
+        columns.append(np.gradient(u)[:, None])
+    return np.hstack(columns)
+
+
+def _behind(e: Excerpt, theta: FloatArray, x: FloatArray) -> FloatArray:
+    """Return x behind the creep lag and the mechanics, gain 1 at rest."""
+    return respond(mechanics_poles(theta), numerator_time(theta), x, e.h)
+
 
 #: Number of candidates at most, and of poles that vector fitting looks for.
 CANDIDATES, ORDERS = 4, (1, 2, 3, 4, 5)
@@ -86,18 +455,15 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
     if not parts:
         return None
     starts = _starts(parts, log(values["k_P"] / values["k_B"]))
-    starts = sorted(starts, key=lambda theta: cost_of(parts, theta))
+    starts = sorted(starts, key=lambda theta: _cost_of(parts, theta))
     best: Sequence[LinearFit] = ()
     for count, evaluations in _ROUNDS:
-        fits = [
+        best = _different(
             fit_linear(parts, s, ratio_free=False, evaluations=evaluations) for s in starts[:count]
-        ]
-        best = different(sorted(fits, key=lambda f: f.cost))
+        )
         starts = [f.theta for f in best]
         parts = _reweighted(parts, best[0])
-    best = best[:CANDIDATES]
-    fits = [_refined(parts, f) for f in best]
-    fits = different(sorted(fits, key=lambda f: f.cost))
+    fits = _different(_refined(parts, f) for f in best[:CANDIDATES])
     kept = [f for f in fits if _explains(parts, f)]
     if not kept:
         return None
@@ -143,10 +509,10 @@ def _refined(parts: Sequence[Excerpt], fit: LinearFit) -> LinearFit:
     return free if told else fixed
 
 
-def different(fits: Sequence[LinearFit]) -> list[LinearFit]:
+def _different(fits: Iterable[LinearFit]) -> list[LinearFit]:
     """Return the fits, best first, without those that repeat a better one within 10 %."""
     kept: list[LinearFit] = []
-    for f in fits:
+    for f in sorted(fits, key=lambda f: f.cost):
         if all(np.max(np.abs(f.theta - k.theta)) > _ALIKE for k in kept):
             kept.append(f)
     return kept
@@ -154,33 +520,32 @@ def different(fits: Sequence[LinearFit]) -> list[LinearFit]:
 
 def _candidate(fit: LinearFit, values: Mapping[str, float], misfit: float) -> LinearCandidate:
     size = dict(zip(COORDINATES, np.exp(fit.theta).tolist(), strict=True))
-    k_B = values["k_B"]
-    k_P = values["k_P"] if np.isnan(fit.errors[-1]) else size["r"] * k_B
+    ratio_free, k_B = not np.isnan(fit.errors[-1]), values["k_B"]
+    k_P = size["r"] * k_B if ratio_free else values["k_P"]
     found = {
-        "tau": size["tau"],
         "R_s": size["T"] / values["C_p"],
+        "tau": size["tau"],
         "c_P": size["a_P"] * k_P,
         "m_P": size["q_P"] * k_P,
         "c_B": size["a_B"] * k_B,
         "m_B": size["q_B"] * k_B,
         "k_P": k_P,
     }
-    names = dict(zip(COORDINATES, ("R_s", "tau", "c_P", "m_P", "c_B", "m_B", "k_P"), strict=True))
-    if np.isnan(fit.errors[-1]):
+    told = tuple(n for n, e in zip(found, fit.errors, strict=True) if e < 0.5)
+    if not ratio_free:
         del found["k_P"]
     bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
-    return LinearCandidate(
-        values={n: float(np.clip(v, *bounds[n])) for n, v in found.items()},
-        misfit=misfit,
-        told=tuple(names[c] for c, e in zip(COORDINATES, fit.errors, strict=True) if e < 0.5),
-    )
+    within = {n: float(np.clip(v, *bounds[n])) for n, v in found.items()}
+    return LinearCandidate(within, misfit, told)
 
 
 def _starts(parts: Sequence[Excerpt], ratio: float) -> list[FloatArray]:
     """Return theta (7,) for every way to place the poles of every order, of every excerpt."""
     found: list[FloatArray] = []
     for e in parts[:_SOURCES]:
-        for source in (_scaled(e), e.loop):
+        v, y = e.v[e.valid] - np.mean(e.v[e.valid]), e.y[e.valid]
+        scaled = e.v * float(v @ (y - np.mean(y)) / (v @ v))  # the voltage in metres
+        for source in (scaled, e.loop):
             response = [Response(e.h, source, e.y, e.valid, e.sigma)]
             for order in ORDERS:
                 poles = vector_fit(response, order)
@@ -191,12 +556,6 @@ def _starts(parts: Sequence[Excerpt], ratio: float) -> list[FloatArray]:
                         if all(np.max(np.abs(theta - f)) > _ALIKE for f in found):
                             found.append(theta)
     return found
-
-
-def _scaled(e: Excerpt) -> FloatArray:
-    """Return the voltage in metres: times the slope of displacement on voltage."""
-    v = e.v[e.valid] - np.mean(e.v[e.valid])
-    return e.v * float(v @ (e.y[e.valid] - np.mean(e.y[e.valid])) / (v @ v))
 
 
 def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
