@@ -26,9 +26,11 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening import independent, without
+from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import trace_record
+from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.refitting import Progress, force_of, quick_from, refit, without_blur
 from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import ordinary_values
@@ -312,7 +314,7 @@ def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress
     """Fit with resonances near or above the band; None where none explains much more.
 
     Steps excite such a resonance, and what a slow record shows of its ringing looks like noise
-    after each step. `before` may hold causes.
+    after each step. `before` may hold causes; the mechanics is sought again where it holds none.
     """
     found = before
     for _ in range(_RESONANCES):
@@ -322,7 +324,7 @@ def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress
         found = more
     if found.rms > _MUCH * before.rms:
         return None
-    return found if before.model.effects else without_blur(found, experiments)
+    return found if before.model.effects else _tuned(found, experiments, progress)
 
 
 @stage("base fit again")
@@ -356,13 +358,27 @@ def instead_of(
     what looks like a further mode.
     """
     own = _with_ringing(base, experiments, progress, least=_as_good(found, _LIKE))
-    close = own is not None and _short(own, found) < _LIKE
-    return without_blur(own, experiments) if own is not None and close else None
+    if own is not None and _short(own, found) < _LIKE:
+        return _tuned(own, experiments, progress)
+    if not shows_ringing(experiments):
+        return None
+    again = retuned(base, experiments, progress, reached=found.rms)
+    if _short(base, again) <= _CLEAR:
+        return None
+    return without_blur(again, experiments) if _short(again, found) < _LIKE else None
 
 
 def rings(effect: Component) -> bool:
     """Whether an effect is a further resonance of the plant."""
     return effect.tone is not None and effect.belongs_to == "plant"
+
+
+def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+    """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
+    left = ringing(found, experiments)
+    if left is None or left.decrease >= SEEN:
+        found = retuned(found, experiments, progress)
+    return without_blur(found, experiments)
 
 
 def _short(found: Fit, other: Fit) -> float:

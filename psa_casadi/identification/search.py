@@ -19,6 +19,7 @@ import numpy as np
 from psa_casadi.components.stack import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.refitting import (
     Progress,
     differing,
@@ -169,6 +170,10 @@ def _search(
     outcomes, not_unique = _outcomes(found, polished, best, experiments)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
+        tuned = retuned(best, experiments, progress) if told else best
+        if tuned is not best:
+            best = tuned
+            outcomes, not_unique = _outcomes(found, polished, best, experiments)
         keep(best)
         best = without_blur(best, experiments)
         keep(best)

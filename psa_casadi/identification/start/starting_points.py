@@ -19,7 +19,7 @@ Kaufman's derivative, BIT 15 (1975), 49). A loop of Bouc and Wen is odd play ope
 percent, so the rates at which it runs do not mislead the time constants.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
@@ -151,11 +151,7 @@ def _of_record(record: Record) -> list[Excerpt]:
     whole = _without_rests(_uniform(record))
     if whole.v.size <= MOST:
         return _excerpt(record.name, whole)
-    # of equal parts the last, a little before
-    energy = np.concatenate([[0.0], np.cumsum(np.diff(whole.v) ** 2)])
-    inside = energy[MOST - 1 :] - energy[: whole.v.size - MOST + 1]
-    start = int(np.flatnonzero(inside >= (1.0 - 1e-9) * inside.max())[-1])
-    start = max(start - MOST // 50, 0)
+    start = fastest_part(whole.v, MOST)
     found = _excerpt(f"{record.name}, fastest part", whole.part(start, start + MOST))
     coarse = whole.part(0, whole.v.size, -(-whole.v.size // MOST))
     at = np.arange(whole.v.size) * whole.h
@@ -252,6 +248,17 @@ def _leading_rest(v: FloatArray) -> int:
     moves = np.diff(v)
     slow = np.max(np.abs(moves[:3])) < _SLOWLY * np.sqrt(np.mean(moves**2))
     return 0 if rest == 1 and np.ptp(v[1:4]) > level and not slow else rest
+
+
+def fastest_part(v: FloatArray, length: int) -> int:
+    """Return the start of the part with the largest jumps of voltage from sample to sample.
+
+    Of equal parts the last, a little before.
+    """
+    energy = np.concatenate([[0.0], np.cumsum(np.diff(v) ** 2)])
+    inside = energy[length - 1 :] - energy[: v.size - length + 1]
+    best = int(np.flatnonzero(inside >= (1.0 - 1e-9) * inside.max())[-1])
+    return max(best - length // 50, 0)
 
 
 IndexArray = npt.NDArray[np.intp]
@@ -408,6 +415,8 @@ def _behind(e: Excerpt, theta: FloatArray, x: FloatArray) -> FloatArray:
 
 #: Number of candidates at most, and of poles that vector fitting looks for.
 CANDIDATES, ORDERS = 4, (1, 2, 3, 4, 5)
+#: Poles count that are this share of the noise, or of the strongest.
+_COUNTS = 0.2
 #: Excerpts whose poles are sought.
 _SOURCES = 3
 #: Rounds of the search: how many of the best starts go on, for how many evaluations; the last one.
@@ -451,18 +460,16 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
     `values` gives C_p [F], k_P and k_B [N/m], which voltage and displacement do not determine.
     None where the records show no dynamics: loops that a static loop explains.
     """
-    parts = excerpts(records)
+    parts: Sequence[Excerpt] = excerpts(records)
     if not parts:
         return None
-    starts = _starts(parts, log(values["k_P"] / values["k_B"]))
-    starts = sorted(starts, key=lambda theta: _cost_of(parts, theta))
-    best: Sequence[LinearFit] = ()
-    for count, evaluations in _ROUNDS:
-        best = _different(
-            fit_linear(parts, s, ratio_free=False, evaluations=evaluations) for s in starts[:count]
-        )
-        starts = [f.theta for f in best]
-        parts = _reweighted(parts, best[0])
+    starts: list[FloatArray] = []
+    for e in parts[:_SOURCES]:
+        v, y = e.v[e.valid] - np.mean(e.v[e.valid]), e.y[e.valid]
+        scaled = e.v * float(v @ (y - np.mean(y)) / (v @ v))  # the voltage in metres
+        for source in (scaled, e.loop):
+            starts += placed(e, source, ORDERS, [log(values["k_P"] / values["k_B"])], weak=True)
+    best, parts = sought(parts, starts, _ROUNDS, ratio_free=False, reweigh=True)
     fits = _different(_refined(parts, f) for f in best[:CANDIDATES])
     kept = [f for f in fits if _explains(parts, f)]
     if not kept:
@@ -474,16 +481,42 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
     )
 
 
-def _reweighted(parts: Sequence[Excerpt], fit: LinearFit) -> list[Excerpt]:
-    """Return the excerpts with the noise that a fit leaves.
+def sought(
+    parts: Sequence[Excerpt],
+    starts: Sequence[FloatArray],
+    rounds: Sequence[tuple[int, int]],
+    *,
+    ratio_free: bool,
+    reweigh: bool = False,
+) -> tuple[list[LinearFit], Sequence[Excerpt]]:
+    """Return the best fits from starts (7,), unlike each other, and the excerpts as last weighted.
 
-    The rest of the residual, which the model misses and which is not white, counts many times.
+    In rounds: how many of the best go on, and for how many evaluations. `reweigh` gives excerpts
+    the noise that the best fit leaves, in which what the model misses and which is not white counts
+    many times.
     """
-    found = []
-    for e, left, white in zip(parts, fit.left, fit.white, strict=True):
-        missed = _MISSED * np.sqrt(max(left**2 - white**2, 0.0))
-        found.append(replace(e, sigma=float(max(np.hypot(white, missed), _FLOOR * e.range))))
-    return found
+    kept: list[FloatArray] = []
+    for theta in starts:
+        if all(np.max(np.abs(theta - k)) > _ALIKE for k in kept):
+            kept.append(theta)
+    kept.sort(key=lambda theta: _cost_of(parts, theta))
+    best: list[LinearFit] = []
+    for count, evaluations in rounds:
+        best = _different(
+            fit_linear(parts, s, ratio_free=ratio_free, evaluations=evaluations)
+            for s in kept[:count]
+        )
+        kept = [f.theta for f in best]
+        if reweigh:
+            levels = [
+                np.hypot(white, _MISSED * np.sqrt(max(left**2 - white**2, 0.0)))
+                for left, white in zip(best[0].left, best[0].white, strict=True)
+            ]
+            parts = [
+                replace(e, sigma=float(max(level, _FLOOR * e.range)))
+                for e, level in zip(parts, levels, strict=True)
+            ]
+    return best, parts
 
 
 def _explains(parts: Sequence[Excerpt], fit: LinearFit) -> bool:
@@ -539,23 +572,22 @@ def _candidate(fit: LinearFit, values: Mapping[str, float], misfit: float) -> Li
     return LinearCandidate(within, misfit, told)
 
 
-def _starts(parts: Sequence[Excerpt], ratio: float) -> list[FloatArray]:
-    """Return theta (7,) for every way to place the poles of every order, of every excerpt."""
-    found: list[FloatArray] = []
-    for e in parts[:_SOURCES]:
-        v, y = e.v[e.valid] - np.mean(e.v[e.valid]), e.y[e.valid]
-        scaled = e.v * float(v @ (y - np.mean(y)) / (v @ v))  # the voltage in metres
-        for source in (scaled, e.loop):
-            response = [Response(e.h, source, e.y, e.valid, e.sigma)]
-            for order in ORDERS:
-                poles = vector_fit(response, order)
-                share = contributions(response, poles)
-                for least in {min(1.0, share.max()), share.max()}:
-                    for placed in arrangements(poles[share >= 0.2 * least], e.h):
-                        theta = np.append(placed, ratio)
-                        if all(np.max(np.abs(theta - f)) > _ALIKE for f in found):
-                            found.append(theta)
-    return found
+def placed(
+    e: Excerpt, source: FloatArray, orders: Sequence[int], ratios: Sequence[float], *, weak: bool
+) -> Iterator[FloatArray]:
+    """Yield theta (7,) for every way to place the poles of an excerpt's response to a source (n,).
+
+    Poles that hardly show are left out; with `weak` also those that do beside the strongest.
+    """
+    response = [Response(e.h, source, e.y, e.valid, e.sigma)]
+    for order in orders:
+        poles = vector_fit(response, order)
+        share = contributions(response, poles)
+        least = min(1.0, share.max())
+        for level in {least, share.max()} if weak else {least}:
+            for own in arrangements(poles[share >= _COUNTS * level], e.h):
+                for ratio in ratios:
+                    yield np.append(own, ratio)
 
 
 def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
