@@ -75,7 +75,7 @@ def identify(
     """Fit the model of a stack to records; show which parameters the data determine."""
     from psa_casadi.cli.inputs import Given
     from psa_casadi.identification.identify import identify as run
-    from psa_casadi.identification.paper.method import identify_by_paper as by_paper
+    from psa_casadi.identification.paper import identify_by_paper as by_paper
     from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 

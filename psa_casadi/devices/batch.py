@@ -62,12 +62,20 @@ class Results:
         make_folder(folder)
 
     def kept(self, job: Job, key: str) -> DeviceFile | None:
-        """Return how a device ended if that holds for the same files and options, else None."""
+        """Return how a device ended if that holds for the same files and options, else None.
+
+        With the batch and date that it has now, which are written too.
+        """
         told = self.told(job.device)
         if told is None or told.key != key or told.status == "failed":
             return None
-        whole = len(told.sha256) == len(told.files) and not damage(self.folder / job.device, told)
-        return told if whole else None
+        if len(told.sha256) != len(told.files) or damage(self.folder / job.device, told):
+            return None
+        day = job.day.isoformat() if job.day else ""
+        if (told.batch, told.date) != (job.batch, day):
+            told = replace(told, batch=job.batch, date=day)
+            atomic_write(self.folder / job.device / DEVICE_FILE, json_text(asdict(told)))
+        return told
 
     def told(self, device: str) -> DeviceFile | None:
         """Return how a device ended, None where that is not known."""
@@ -105,15 +113,6 @@ class Results:
             tuple(hash_of(text.encode()) for _, text in outcome.files),
         )
         atomic_write(here / DEVICE_FILE, json_text(asdict(told)))
-        return told
-
-    def restated(self, job: Job, told: DeviceFile) -> DeviceFile:
-        """Return how a kept device ended with the batch and date that it has now, written too."""
-        day = job.day.isoformat() if job.day else ""
-        if (told.batch, told.date) == (job.batch, day):
-            return told
-        told = replace(told, batch=job.batch, date=day)
-        atomic_write(self.folder / job.device / DEVICE_FILE, json_text(asdict(told)))
         return told
 
     def findings(
@@ -172,7 +171,13 @@ def write_summary(
     A parameter has the columns `NAME [UNIT]`, `NAME low` and `NAME high` (95 % interval, SI units),
     empty where the records of a device do not determine it.
     """
-    table = [_row(told, found) for told, found in rows]
+    own = ("device", "batch", "date", "work", "status", "seconds")
+    table: list[dict[str, Any]] = [
+        {name: getattr(told, name) for name in own}
+        | {"problems": " ".join(told.problems)}
+        | (finding_content(found) if found else {})
+        for told, found in rows
+    ]
     columns = list(dict.fromkeys(name for row in table for name in row))
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
@@ -188,12 +193,6 @@ def write_summary(
             arrow.Table.from_pylist(table, schema=arrow.schema(kinds.items())), temporary
         )
     return (folder / CSV, folder / PARQUET)
-
-
-def _row(told: DeviceFile, found: Finding | None) -> dict[str, Any]:
-    names = ("device", "batch", "date", "work", "status", "seconds")
-    row = {name: getattr(told, name) for name in names} | {"problems": " ".join(told.problems)}
-    return row if found is None else row | finding_content(found)
 
 
 #: Devices that are submitted for each that can run at once: none waits for the next.
@@ -263,10 +262,10 @@ def batch(
     for job in given:
         told = results.kept(job, keys[job.device])
         if told is not None:
-            ended[job.device] = results.restated(job, told)
+            ended[job.device] = told
     kept = len(ended)
     waiting = [job for job in given if job.device not in ended]
-    pace = _Pace(len(given), kept)
+    started = time.monotonic()
     try:
         with _executor(executor, workers, len(waiting)) as (where, most):
             if executor is None and waiting:
@@ -277,7 +276,8 @@ def batch(
             for task, outcome in outcomes(tasks, where, at_once or most):
                 told = results.write(task.job, o, keys[outcome.device], outcome)
                 ended[outcome.device] = told
-                progress(pace.told(told))
+                elapsed = (time.monotonic() - started) / (len(ended) - kept)
+                progress(_line(told, list(ended.values()), kept, len(given), elapsed))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"{len(ended)} of {len(given)} devices are done. Kept: {output}. The same command goes"
@@ -308,23 +308,15 @@ def _executor(
         own.end()
 
 
-class _Pace:
-    """How far a batch is, and how long the rest will take at the pace so far."""
-
-    def __init__(self, total: int, kept: int) -> None:
-        self._began, self._total, self._kept, self._done = time.monotonic(), total, kept, 0
-        self._lost = 0
-
-    def told(self, last: DeviceFile) -> str:
-        """Count a device that ended and return the line that tells it."""
-        self._done += 1
-        self._lost += last.status != "done"
-        there = self._kept + self._done
-        elapsed = time.monotonic() - self._began
-        left = (self._total - there) * elapsed / self._done
-        lost = f", {self._lost} without a result" if self._lost else ""
-        rest = f", about {_duration(left)} left" if there < self._total else ""
-        return f"{there} of {self._total} devices{lost}{rest} ({last.device}: {last.status})"
+def _line(
+    last: DeviceFile, ended: Sequence[DeviceFile], kept: int, total: int, seconds: float
+) -> str:
+    """Return the line that tells how far a batch is; a device takes so many seconds."""
+    there, left = len(ended), (total - len(ended)) * seconds
+    failed = sum(d.status != "done" for d in ended[kept:])
+    lost = f", {failed} without a result" if failed else ""
+    rest = f", about {_duration(left)} left" if there < total else ""
+    return f"{there} of {total} devices{lost}{rest} ({last.device}: {last.status})"
 
 
 def _duration(seconds: float) -> str:

@@ -2,8 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
 from psa_casadi.diagnosis.diagnose import diagnose
@@ -13,7 +12,7 @@ from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.interruption import Work, interruptible_work
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.own_effects import known_effects, own_effects
-from psa_casadi.records import Record, read_records
+from psa_casadi.records import read_records
 from psa_casadi.report.documents.files import Status, identification_file
 from psa_casadi.simulation.side_by_side import compiled, one_thread
 from psa_casadi.strict_json import json_text
@@ -32,7 +31,11 @@ def work_on(task: DeviceTask) -> DeviceOutcome:
     """
     began = time.monotonic()
     status: Status = "refused"
-    with _part_of(task.run), one_thread():
+    with interruptible_work() as work, one_thread():
+        with _LOCK:
+            if task.run in _STOPPED:
+                raise KeyboardInterrupt
+            _RUNNING.setdefault(task.run, set()).add(work)
         try:
             return _worked(task, began)
         except InputError as error:
@@ -41,6 +44,9 @@ def work_on(task: DeviceTask) -> DeviceOutcome:
             status, problems = "refused", (str(error),)
         except Exception as error:  # noqa: BLE001 - no device may stop the others
             status, problems = "failed", (f"{type(error).__name__}: {error}",)
+        finally:
+            with _LOCK:
+                _RUNNING[task.run].discard(work)
     return DeviceOutcome(task.job.device, status, time.monotonic() - began, problems=problems)
 
 
@@ -52,20 +58,6 @@ def stop(run: str) -> None:
             work.stop()
 
 
-@contextmanager
-def _part_of(run: str) -> Iterator[None]:
-    with interruptible_work() as work:
-        with _LOCK:
-            if run in _STOPPED:
-                raise KeyboardInterrupt
-            _RUNNING.setdefault(run, set()).add(work)
-        try:
-            yield
-        finally:
-            with _LOCK:
-                _RUNNING[run].discard(work)
-
-
 def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
     o = task.options
     effects = [c for module in o.modules for c in own_effects(module).values()]
@@ -73,7 +65,14 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
     records = read_records(
         task.job.files, need_excitation=True, columns=o.columns, sample_time=o.sample_time
     )
-    _refuse_twins(records)
+    seen: dict[str, str] = {}
+    for r in records:
+        if r.sha256 in seen:
+            raise InputError(
+                f"{r.source}: holds the same data as {seen[r.sha256]}; a record counts once: remove"
+                " one of the two."
+            )
+        seen[r.sha256] = r.source
     if o.work == "diagnose":
         d = diagnose(
             records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis,
@@ -92,17 +91,6 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
         files=((name, text), (MODEL, dumps(model))),
         records=tuple((r.name, r.sha256) for r in records),
     )
-
-
-def _refuse_twins(records: tuple[Record, ...]) -> None:
-    seen: dict[str, str] = {}
-    for r in records:
-        if r.sha256 in seen:
-            raise InputError(
-                f"{r.source}: holds the same data as {seen[r.sha256]}; a record counts once: remove"
-                " one of the two."
-            )
-        seen[r.sha256] = r.source
 
 
 def make_ready(job: Job, options: Options) -> None:

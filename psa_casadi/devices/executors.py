@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from typing import IO, Any, Protocol, cast
 
@@ -70,7 +70,14 @@ class Processes:
         self._held.close()
 
     def _called(self, function: Callable[[Any], Any], argument: Any) -> Any:
-        child = self._process()
+        if not hasattr(self._own, "child"):  # the process of this thread
+            started = started_python(
+                "psa_casadi.devices.executors", directory=None, **{VARIABLE: "1"}, **_ONE_THREAD
+            )
+            self._own.child = self._held.enter_context(started)
+            if self._ended:
+                kill(self._own.child)
+        child = cast("Child", self._own.child)
         try:
             pickle.dump((function, argument), cast("IO[bytes]", child.stdin))
             cast("IO[bytes]", child.stdin).flush()
@@ -84,17 +91,6 @@ class Processes:
                 f"The process that worked on this device ended ({how}): killed, out of memory, or"
                 f" crashed. The next run tries it again.{said[-500:]}"
             ) from None
-
-    def _process(self) -> Child:
-        """Return the process of this thread."""
-        if not hasattr(self._own, "child"):
-            started = started_python(
-                "psa_casadi.devices.executors", directory=None, **{VARIABLE: "1"}, **_ONE_THREAD
-            )
-            self._own.child = self._held.enter_context(started)
-            if self._ended:
-                kill(self._own.child)
-        return cast("Child", self._own.child)
 
 
 def main() -> None:
@@ -136,7 +132,11 @@ def outcomes(
                 future.add_done_callback(ended.put)
             if not pending:
                 return
-            future = _next(ended)
+            future = None
+            while future is None:
+                raise_if_stopped()
+                with suppress(queue.Empty):
+                    future = ended.get(timeout=_LOOK)
             yield pending[future][0], _outcome(future, *pending[future])
             del pending[future]
     finally:
@@ -154,15 +154,6 @@ def _submitted(executor: Executor, task: DeviceTask) -> Any:
             f"The executor takes no more work ({error}); what is done is kept. Run the same again"
             " with a new one."
         ) from error
-
-
-def _next(ended: "queue.SimpleQueue[Any]") -> Any:
-    while True:
-        raise_if_stopped()
-        try:
-            return ended.get(timeout=_LOOK)
-        except queue.Empty:
-            continue
 
 
 def _outcome(future: Any, task: DeviceTask, began: float) -> DeviceOutcome:

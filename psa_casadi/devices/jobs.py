@@ -10,7 +10,6 @@ records of a device are its folder or the file of its name. Rows of one device a
 """
 
 import csv
-import hashlib
 import io
 import json
 import os
@@ -18,6 +17,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import date, datetime
+from hashlib import sha256
 from pathlib import Path
 
 from psa_casadi.characters import plain
@@ -247,11 +247,6 @@ def key_of(job: Job, options: Options) -> str:
     Raises:
         OSError: a file cannot be read.
     """
-    files = [(Path(name).name, _hash(Path(name))) for name in job.files]
+    files = [(Path(f).name, sha256(Path(f).read_bytes()).hexdigest()) for f in job.files]
     told = {"version": __version__, "options": asdict(options), "files": files}
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
-
-
-def _hash(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()

@@ -26,7 +26,6 @@ from psa_casadi.shown import Worded
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import settling_time
 from psa_casadi.units import FloatArray
-from psa_casadi.variables import Values
 
 #: Samples of a planned step, multisine, loop (per period) and hold.
 STEP_SAMPLES, MULTISINE_SAMPLES, LOOP_SAMPLES, HOLD_SAMPLES = 2000, 3000, 400, 2000
@@ -39,7 +38,8 @@ _FINEST = 5.0
 #: A loop this much slower than the stack's settling is quasi-static.
 _QUASI_STATIC = 0.05
 _CYCLES = 6
-_PARTS = ("_P", "_B", "")
+#: Parameters that stand for a lag.
+_LAGS = ("tau", "R_s", "c_P", "c_B", "c")
 #: Longest loops worth advising have this frequency [Hz].
 _SLOWEST = 1e-3
 _LONGEST_HOLD = 7200.0
@@ -75,11 +75,22 @@ def plans(models: Sequence[Model], records: Sequence[Record]) -> list[Plan]:
     every one of the models.
     """
     settling = max(settling_time(m) for m in models)
-    shortest = min(_shortest(m.values) for m in models)
     low = min(float(np.min(r.voltage)) for r in records)
     high = max(float(np.max(r.voltage)) for r in records)
-    found = [p for rate in _rates(settling, shortest, records) for p in _fast(rate, low, high)]
-    found += _loops(_loop_frequency(settling, records), settling, low, high)
+    now = 1.0 / min(r.sample_time for r in records)
+    finest = _round(
+        _FINEST / min(_lag(m.values, n) for m in models for n in _LAGS if n in m.values)
+    )
+    lowest = _round(min(now, 20.0 / settling, finest))
+    count = min(_RUNGS, ceil(2.0 * log10(finest / lowest)) + 1)
+    rates = sorted({_round(float(r)) for r in np.geomspace(lowest, finest, count)})
+    found = [p for rate in rates for p in _fast(rate, low, high)]
+    # loops of a frequency at which records cycle slowly, else of a quasi-static one
+    limit = _QUASI_STATIC / settling
+    turns = [(len(reversals(r.voltage)), r.duration) for r in records]
+    cycling = [count / (2.0 * length) for count, length in turns if count >= 2]
+    slow = [f for f in cycling if f <= limit]
+    found += _loops(_round(float(np.median(slow)) if slow else 0.1 * limit), settling, low, high)
     if models[0].effects:
         longest = max(r.duration for r in records)
         lengths = [longest * k for k in (10.0, 100.0) if longest * k <= _LONGEST_HOLD]
@@ -94,32 +105,6 @@ def _round(value: float) -> float:
     """Return the next number of the series 1, 2, 5 upwards."""
     power = 10.0 ** floor(log10(value))
     return next(k * power for k in (1.0, 2.0, 5.0, 10.0) if k * power >= 0.999 * value)
-
-
-def _rates(settling: float, shortest: float, records: Sequence[Record]) -> list[float]:
-    """Return round sampling rates [Hz] between the records' and what the stack can show."""
-    now = 1.0 / min(r.sample_time for r in records)
-    finest = _round(_FINEST / shortest)
-    lowest = _round(min(now, 20.0 / settling, finest))
-    decades = log10(finest / lowest)
-    count = min(_RUNGS, ceil(2.0 * decades) + 1)
-    rates = np.geomspace(lowest, finest, count)
-    return sorted({_round(float(r)) for r in rates})
-
-
-def _shortest(values: Values) -> float:
-    """Return the shortest lag [s]."""
-    lags = [values[f"c{part}"] / values[f"k{part}"] for part in _PARTS if f"c{part}" in values]
-    return min(values["tau"], values["R_s"] * values["C_p"], *lags)
-
-
-def _loop_frequency(settling: float, records: Sequence[Record]) -> float:
-    """Return a round frequency [Hz] at which records cycle slowly, else a quasi-static one."""
-    limit = _QUASI_STATIC / settling
-    turns = [(len(reversals(r.voltage)), r.duration) for r in records]
-    cycling = [count / (2.0 * length) for count, length in turns if count >= 2]
-    slow = [f for f in cycling if f <= limit]
-    return _round(float(np.median(slow)) if slow else 0.1 * limit)
 
 
 def _fast(rate: float, low: float, high: float) -> Iterator[Plan]:
@@ -178,25 +163,20 @@ def scenarios(model: Model, open_names: Collection[str]) -> list[Model]:
     anything, a bound included, so a forecast must not rest on it. Values stay within their bounds.
     """
     names = [n for n in SEARCHABLE if n in model.values and n in open_names]
-    return [_filled(model, names, *case) for case in _CASES]
-
-
-def _filled(
-    model: Model, names: Sequence[str], weights: Mapping[str, float], damping: float
-) -> Model:
-    values = dict(model.values)
-    lags = [n for n in names if n in weights]
-    total = sum(_lag(model.values, n) for n in lags)
-    for name in lags:
-        share = weights[name] / sum(weights[n] for n in lags)
-        values[name] *= share * total / _lag(model.values, name)
-    for name in names:
-        if name not in weights:
-            c, k = (values[q + name[1:]] for q in "ck")
-            values[name] = (0.5 * c / damping) ** 2 / k
-        low, high = model.parameter(name).bounds
-        values[name] = min(max(values[name], low), high)
-    return model.with_values(values)
+    lags = [n for n in names if n in _LAGS]
+    total, found = sum(_lag(model.values, n) for n in lags), []
+    for weights, damping in _CASES:
+        values = dict(model.values)
+        for name in lags:
+            share = weights[name] / sum(weights[n] for n in lags)
+            values[name] *= share * total / _lag(model.values, name)
+        for name in names:
+            if name not in weights:
+                c, k = (values[q + name[1:]] for q in "ck")
+                values[name] = (0.5 * c / damping) ** 2 / k
+            values[name] = float(np.clip(values[name], *model.parameter(name).bounds))
+        found.append(model.with_values(values))
+    return found
 
 
 def _lag(values: Mapping[str, float], name: str) -> float:
@@ -270,8 +250,14 @@ class _Adviser:
         extra = [n for n in SEARCHABLE if n in fit.model.values and n not in found.names]
         self._names = (*found.names, *extra)
         self._noise = max(fit.rms, min(fit.sigma))
-        known = self._at_hand(fit.model)
-        ratio = self._inflation(known)
+        known, count = self._at_hand(fit.model), len(found.names)
+        # by how much the residuals' level and colour widen the intervals, squared
+        prior = prior_information(fit.model, found.names)
+        white = standard_errors(known[:count, :count] + prior)
+        sizes = np.abs(sizes_of(fit.model, found.names))
+        told = np.array([found.standard_errors[n] for n in found.names]) / sizes
+        sure = told < DETERMINED_WIDTH
+        ratio = max(float(np.median((told / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
         errors = standard_errors(known / ratio + prior_information(fit.model, self._names))
         self._open = {
             n
@@ -304,16 +290,6 @@ class _Adviser:
         information: FloatArray = np.sum(parts, axis=0)
         return information
 
-    def _inflation(self, data: FloatArray) -> float:
-        """Return by how much the residuals' level and colour widen the intervals, squared."""
-        names, count = self._found.names, len(self._found.names)
-        prior = prior_information(self._fit.model, names)
-        white = standard_errors(data[:count, :count] + prior)
-        sizes = np.abs(sizes_of(self._fit.model, names))
-        errors = np.array([self._found.standard_errors[n] for n in names]) / sizes
-        sure = errors < DETERMINED_WIDTH
-        return max(float(np.median((errors / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
-
     def all(self, force_scale_given: bool) -> tuple[Advice, ...]:
         """Return the whole advice in its order."""
         results: list[Advice] = []
@@ -321,7 +297,13 @@ class _Adviser:
         options = self._options() if left else []
         for plan, information, gain in self._cover(options, left):
             known, counts[plan] = known + information, 1
-            instead = self._instead(plan, gain, options)
+            instead = tuple(  # plans of the other fast kind that do as well at the same rate
+                other
+                for other, own in options
+                if other.rate == plan.rate
+                and {other.kind, plan.kind} == {"step", "multisine"}
+                and set(gain) <= set(self._gain(self._known + own, self._open))
+            )
             results.append(Advice("single", gain, plan, instead=instead))
         wanted = left & set(self._found.names)
         while wanted and (more := self._more(options, known, wanted)) is not None:
@@ -390,16 +372,3 @@ class _Adviser:
                 best = min(useful, key=lambda g: (-len(g[2]), *self._effort(g[0], g[3])))
                 return best[0], best[1], repeats
         return None
-
-    def _instead(
-        self, plan: Plan, gain: tuple[str, ...], options: Sequence[_Option]
-    ) -> tuple[Plan, ...]:
-        """Return plans of the other fast kind that do as well at the same rate."""
-        fast = {"step", "multisine"}
-        return tuple(
-            other
-            for other, information in options
-            if other.rate == plan.rate
-            and {other.kind, plan.kind} == fast
-            and set(gain) <= set(self._gain(self._known + information, self._open))
-        )

@@ -5,14 +5,13 @@ rest, most of them far above the noise. There the force is nearly right: what it
 voltage's history is quasi-static and hardly depends on the mechanics. So the fit's own force,
 simulated, takes the voltage's place in `linear_start`: poles by vector fitting, placed, refined
 with the ratio k_P/k_B free, and a full fit from each of the best. The play operators of
-`linear_fit` then stand for what is wrong with that force. A better fit has a better force.
+`starting_points` then stand for what is wrong with that force. A better fit has a better force.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import log
 
-import casadi as ca
 import numpy as np
 
 from psa_casadi.errors import PsaError
@@ -21,23 +20,14 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.refitting import (
     Progress,
+    force_of,
     quick_from,
     record_rms,
     refit,
     residual_noise,
 )
-from psa_casadi.identification.start.linear_fit import (
-    Excerpt,
-    LinearFit,
-    cost_of,
-    fastest_part,
-    fit_linear,
-)
-from psa_casadi.identification.start.linear_response import Response, contributions, vector_fit
-from psa_casadi.identification.start.starting_points import arrangements, different
-from psa_casadi.records.record import Record
+from psa_casadi.identification.start.starting_points import Excerpt, fastest_part, placed, sought
 from psa_casadi.records.split import Experiment, fitted
-from psa_casadi.simulation.simulate import record_inputs, simulate_record
 from psa_casadi.units import FloatArray
 
 #: Samples that one record and all together may have, and the fewest that count.
@@ -46,8 +36,8 @@ _MOST, _ALL, _FEWEST = 6_000, 12_000, 16
 _LEAD, _AMID = 0.01, 0.2
 #: Records sampled this much more slowly than the fastest add no dynamics.
 _SLOWER = 30.0
-#: Orders of vector fitting; poles that count are this share of the noise, or of the strongest.
-_ORDERS, _COUNTS = (2, 3, 4, 5, 6), 0.2
+#: Orders of vector fitting.
+_ORDERS = (2, 3, 4, 5, 6)
 #: How many starts get a few evaluations, how many of these a full refinement.
 _ROUNDS = ((12, 6), (4, 25))
 #: How many full fits are begun, with how many evaluations, how many of them are ended, and rounds.
@@ -57,8 +47,6 @@ _BEGUN, _QUICK, _ENDED, _REPEATS = 3, 15, 2, 4
 _MISSED, _BETTER = 1.01, 20.0
 #: Share of the rms that is taken for noise at least.
 _FLOOR = 0.1
-#: Error of the simulated force over its range: far below the noise of what it is fitted to.
-_FORCE_RTOL = 1e-5
 _FREE = ("m_P", "m_B", "k_P")
 _FORCES = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
 
@@ -76,7 +64,10 @@ def retuned(
     if "k_P" not in best.model.values:
         return best
     for _ in range(_REPEATS):
-        if best.interrupted or not (best.rms > reached or _misses(best, experiments)):
+        levels = residual_noise(best, experiments)
+        pairs = zip(record_rms(best, experiments), levels, strict=True)
+        missed = best.rms > reached or any(rms > _MISSED * level for rms, level in pairs)
+        if best.interrupted or not missed:
             return best
         progress("base fit, mechanics again behind the force found")
         try:
@@ -91,43 +82,31 @@ def retuned(
     return best
 
 
-def _misses(best: Fit, experiments: Sequence[Experiment]) -> bool:
-    """Whether a record's residual is larger than its own fast part."""
-    levels = residual_noise(best, experiments)
-    return any(
-        record > _MISSED * level
-        for record, level in zip(record_rms(best, experiments), levels, strict=True)
-    )
-
-
 def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
     parts = list(_parts(best, experiments))
     if not parts:
         return None
+    own = log(best.model.values["k_P"] / best.model.values["k_B"])
+    starts = [s for e in parts for s in placed(e, e.v, _ORDERS, (own, -own), weak=False)]
     names = list(dict.fromkeys([*best.unknowns.names, *_FREE]))
-    begun = [
-        _begun(best, experiments, names, _values(best, linear.theta))
-        for linear in _linear_fits(best, parts)[:_BEGUN]
-    ]
-    found = sorted((f for f in begun if f is not None), key=lambda f: f.data_cost)[:_ENDED]
+    forces = {s.name for s in best.model.structure.states if s.unit == "N"}
+    begun = []
+    for linear in sought(parts, starts, _ROUNDS, ratio_free=True)[0][:_BEGUN]:
+        values = _values(best, linear.theta)
+        scale = values["k_L"] / best.model.values["k_L"]  # memories of forces change with them
+        states = [
+            {n: v * (scale if n in forces else 1.0) for n, v in s.items()} for s in best.starts()
+        ]
+        quick = quick_from(
+            best, best.model.with_values(values), experiments, names,
+            start_states=states, evaluations=_QUICK,
+        )  # fmt: skip
+        begun += [quick] if quick is not None else []
+    found = sorted(begun, key=lambda f: f.data_cost)[:_ENDED]
     ended = [refit(f, experiments, names, sigma=best.sigma, least=best.rms) for f in found]
     if any(f.interrupted for f in (*found, *ended)):
         raise KeyboardInterrupt
     return min(ended, key=lambda f: f.data_cost, default=None)
-
-
-def _begun(
-    best: Fit, experiments: Sequence[Experiment], names: Sequence[str], values: Mapping[str, float]
-) -> Fit | None:
-    """Fit a little from other values; None where these cannot be simulated.
-
-    The memories of forces change with the forces.
-    """
-    scale = values["k_L"] / best.model.values["k_L"]
-    forces = {s.name for s in best.model.structure.states if s.unit == "N"}
-    starts = [{n: v * (scale if n in forces else 1.0) for n, v in s.items()} for s in best.starts()]
-    model = best.model.with_values(values)
-    return quick_from(best, model, experiments, names, start_states=starts, evaluations=_QUICK)
 
 
 def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
@@ -162,47 +141,6 @@ def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
             loop=source,
             static=best.rms,
         )
-
-
-def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
-    """Return a record's simulated force in front of the lag (samples,) [N].
-
-    `number` is the record's place in the fit; the error is far below what sensors see. Raises
-    PsaError where it cannot be simulated.
-    """
-    found = simulate_record(fit.model, record, memory=fit.start(number), rtol=_FORCE_RTOL)
-    s = fit.model.structure
-    states = np.array([found.states[n] for n in fit.model.state_names])
-    inputs = record_inputs(fit.model, record, record.n).T
-    force = ca.Function("force", [s.time, s.x, s.u, s.p], [s.sums["free_force"]])
-    values = force(record.time[None, :], states, inputs, fit.model.parameter_vector())
-    return np.asarray(values, dtype=np.float64).reshape(-1)
-
-
-def _linear_fits(best: Fit, parts: Sequence[Excerpt]) -> list[LinearFit]:
-    """Return fits of the mechanics behind the force, the best first."""
-    own = log(best.model.values["k_P"] / best.model.values["k_B"])
-    starts: list[FloatArray] = []
-    for e in parts:
-        response = [Response(e.h, e.v, e.y, e.valid, e.sigma)]
-        for order in _ORDERS:
-            poles = vector_fit(response, order)
-            share = contributions(response, poles)
-            kept = poles[share >= _COUNTS * min(1.0, share.max())]
-            for placed in arrangements(kept, e.h):
-                for ratio in (own, -own):
-                    theta = np.append(placed, ratio)
-                    if all(np.max(np.abs(theta - s)) > 0.1 for s in starts):
-                        starts.append(theta)
-    starts.sort(key=lambda theta: cost_of(parts, theta))
-    fits: list[LinearFit] = []
-    for count, evaluations in _ROUNDS:
-        fits = [
-            fit_linear(parts, s, ratio_free=True, evaluations=evaluations) for s in starts[:count]
-        ]
-        fits = different(sorted(fits, key=lambda f: f.cost))
-        starts = [f.theta for f in fits]
-    return fits
 
 
 def _values(best: Fit, theta: FloatArray) -> dict[str, float]:

@@ -8,8 +8,7 @@ import numpy as np
 from psa_casadi.errors import InputError
 from psa_casadi.identification.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.fitting.fit import Fit, Objective
-from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
-from psa_casadi.model.compose import Model
+from psa_casadi.identification.fitting.levenberg_marquardt import minimise
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
 
@@ -39,38 +38,25 @@ class Point:
     cost: float
 
 
-class HeldFits:
-    """The fits of all other unknowns while one parameter is held."""
+class _HeldFits:
+    """The fits of all other unknowns while one parameter is held; z is its logarithm or itself."""
 
     def __init__(
-        self,
-        fit: Fit,
-        experiments: Sequence[Experiment],
-        name: str,
-        limit: float,
+        self, fit: Fit, experiments: Sequence[Experiment], name: str, limit: float,
         progress: Progress,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name, self.limit, self._progress = name, limit, progress
-        self.unknowns = fit.unknowns
+        self.unknowns, self._fitted = fit.unknowns, fit.theta
         self.k = self.unknowns.names.index(name)
         self.log = fit.model.parameter(name).log
-        self.estimate = fit.model.values[name]
         self._evaluate = Objective(fit.model, experiments, self.unknowns, fit.sigma, fit.way)
         self._tolerance = float(np.clip(_CLOSE * limit / fit.cost, 1e-9, 1e-5))
-        self._fitted = fit.theta
-        edges = (float(edge[self.k]) for edge in (self.unknowns.low, self.unknowns.high))
-        low, high = (self.coordinate(max(e, 1e-300) if self.log else e) for e in edges)
-        self.edges = (low, high)
+        low, high = (float(edge[self.k]) for edge in (self.unknowns.low, self.unknowns.high))
+        self.edges = (self.coordinate(low), self.coordinate(high))
 
     def coordinate(self, value: float) -> float:
         """Return ln value, or the value itself."""
-        return float(np.log(value)) if self.log else value
-
-    def first_step(self, spread: float) -> float:
-        """Return one standard error as a step, an ordinary change at most."""
-        ordinary = 1.0 if self.log else abs(float(self.unknowns.scale[self.k]))
-        step = spread / self.estimate if self.log else spread
-        return float(np.clip(step, 1e-6 * ordinary, ordinary))
+        return float(np.log(max(value, 1e-300))) if self.log else value
 
     def value(self, z: float) -> float:
         """Return the value at a coordinate."""
@@ -87,10 +73,28 @@ class HeldFits:
             last, other = before[-1], before[-2]
             along = (last.theta - other.theta) * (z - last.z) / (last.z - other.z)
             starts.insert(0, last.theta + along)
+
+        def evaluate(others: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+            theta, by_others = self._whole(z, others)
+            found = self._evaluate(theta)
+            if found is None:
+                return None
+            residual, jacobian = found
+            along = np.delete(jacobian, self.k, 1) + np.outer(jacobian[:, self.k], by_others)
+            row = len(residual) - self.unknowns.size + self.k  # the parameter's own prior
+            return np.delete(residual, row), np.delete(along, row, 0)
+
+        low, high = (np.delete(edge, self.k) for edge in self.unknowns.bounds())
         for start in starts:
-            found = self._fit(z, start)
-            if found is not None:
-                return Point(z, self._whole(z, found.theta)[0], found.cost)
+            found = minimise(
+                evaluate, np.delete(start, self.k), (low, high),
+                tolerance=self._tolerance, evaluations=_EVALUATIONS,
+            )  # fmt: skip
+            if found is None:
+                continue
+            if found.interrupted:
+                raise KeyboardInterrupt
+            return Point(z, self._whole(z, found.theta)[0], found.cost)
         return None
 
     def _whole(self, z: float, others: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -114,29 +118,6 @@ class HeldFits:
         own[: len(u.names)] = -slopes / slopes[self.k]
         return theta, np.delete(own, self.k)
 
-    def _fit(self, z: float, start: FloatArray) -> Minimum | None:
-        def evaluate(others: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-            theta, by_others = self._whole(z, others)
-            found = self._evaluate(theta)
-            if found is None:
-                return None
-            residual, jacobian = found
-            along = np.delete(jacobian, self.k, 1) + np.outer(jacobian[:, self.k], by_others)
-            row = len(residual) - self.unknowns.size + self.k  # the parameter's own prior
-            return np.delete(residual, row), np.delete(along, row, 0)
-
-        low, high = (np.delete(edge, self.k) for edge in self.unknowns.bounds())
-        minimum = minimise(
-            evaluate,
-            np.delete(start, self.k),
-            (low, high),
-            tolerance=self._tolerance,
-            evaluations=_EVALUATIONS,
-        )
-        if minimum is not None and minimum.interrupted:
-            raise KeyboardInterrupt
-        return minimum
-
     def side(self, centre: Point, step: float, points: int) -> list[Point]:
         """Return points outwards from the centre until the limit is crossed or a bound is met."""
         found, failures = [centre], 0
@@ -152,26 +133,21 @@ class HeldFits:
                 failures, step = failures + 1, 0.3 * step
                 continue
             found.append(point)
-            if self._level(point, found) > 1.0:
+            level = self._level(point, found)
+            if level > 1.0:
                 return self._refined(found)[1:]
-            step = self._next_step(found, abs(step))
+            distance = abs(z - centre.z)  # the next level should be reached by proportion
+            aim = _BEFORE if level < 0.5 * _BEFORE else _AT
+            flat = len(found) > 2 and level - self._level(last, found) < _FLAT
+            least, most = (2.0 if flat else 0.1) * abs(step), _GROWTH * distance
+            wanted = distance * (aim / max(level, 1e-9) - 1.0)
+            step = float(np.copysign(np.clip(wanted, min(least, most), most), z - centre.z))
         return found[1:]
 
     def _level(self, point: Point, found: Sequence[Point]) -> float:
         """Return sqrt(increase / limit), which grows in proportion to the distance at first."""
         least = min(p.cost for p in found)
         return float(np.sqrt(max(point.cost - least, 0.0) / self.limit))
-
-    def _next_step(self, found: Sequence[Point], before: float) -> float:
-        """Return the step that should reach the next level, by the last point's distance."""
-        centre, last = found[0].z, found[-1].z
-        distance, level = abs(last - centre), self._level(found[-1], found)
-        aim = _BEFORE if level < 0.5 * _BEFORE else _AT
-        wanted = distance * (aim / max(level, 1e-9) - 1.0)
-        flat = len(found) > 2 and level - self._level(found[-2], found) < _FLAT
-        least = 2.0 * before if flat else 0.1 * before
-        step = float(np.clip(wanted, min(least, _GROWTH * distance), _GROWTH * distance))
-        return step if last > centre else -step
 
     def _refined(self, found: list[Point]) -> list[Point]:
         """Put points where the limit should be crossed, until those around it are close."""
@@ -250,18 +226,17 @@ def profile(
             ]
         )
     spread, ratio = _spread(fit, experiments, name)
-    held = HeldFits(fit, experiments, name, ratio * PROFILE_LIMIT, progress)
-    centre = held.minimum(held.coordinate(held.estimate), [])
+    held = _HeldFits(fit, experiments, name, ratio * PROFILE_LIMIT, progress)
+    parameter, estimate = fit.model.parameter(name), fit.model.values[name]
+    centre = held.minimum(held.coordinate(estimate), [])
     if centre is None:
         raise InputError([f"The fit cannot be simulated where it ended; fit again before '{name}'"])
-    first = held.first_step(spread)
-    sides = [held.side(centre, sign * first, points) for sign in (-1.0, 1.0)]
-    return _profile(fit.model, held, spread, [*sides[0][::-1], centre, *sides[1]])
-
-
-def _profile(model: Model, held: HeldFits, spread: float, points: Sequence[Point]) -> Profile:
-    z = np.array([p.z for p in points])
-    cost = np.array([p.cost for p in points])
+    ordinary = 1.0 if held.log else abs(float(fit.unknowns.scale[held.k]))
+    first = spread / estimate if held.log else spread  # one standard error
+    first = float(np.clip(first, 1e-6 * ordinary, ordinary))
+    below, above = (held.side(centre, sign * first, points) for sign in (-1.0, 1.0))
+    found = [*below[::-1], centre, *above]
+    z, cost = np.array([p.z for p in found]), np.array([p.cost for p in found])
     level: FloatArray = np.sqrt((cost - cost.min()) / held.limit)
     least = int(np.argmin(cost))
     ends = [
@@ -269,14 +244,13 @@ def _profile(model: Model, held: HeldFits, spread: float, points: Sequence[Point
         _crossing(z[least:], level[least:]),
     ]
     low, high = (None if end is None else held.value(end) for end in ends)
-    parameter = model.parameter(held.name)
     return Profile(
-        name=held.name,
+        name=name,
         unit=parameter.unit,
         display_unit=parameter.display_unit or parameter.unit,
         log=held.log,
         bounds=parameter.bounds,
-        estimate=held.estimate,
+        estimate=estimate,
         standard_error=spread,
         values=np.array([held.value(float(q)) for q in z]),
         increase=PROFILE_LIMIT * level**2,

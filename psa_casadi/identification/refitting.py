@@ -15,6 +15,7 @@ creep lag, and the oscillator as fast as the other one.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from psa_casadi.errors import PsaError
@@ -24,7 +25,9 @@ from psa_casadi.identification.fitting.prediction import measured, predict
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, Level
+from psa_casadi.simulation.simulate import record_inputs, simulate_record
 from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
@@ -88,19 +91,13 @@ def quick_rtol(sigma: Sequence[float], experiments: Sequence[Experiment]) -> flo
 
     The error is a share of all that the voltage moves from 0, not only of the record's range.
     """
-    parts = [_moved(e) for e in experiments]
-    shares = [
-        s / max(float(np.ptp(y)), 1e-300) for s, y in zip(sigma, parts, strict=True) if y.size
-    ]
+    shares = []
+    for s, e in zip(sigma, experiments, strict=True):
+        y, v = measured(e.record)[e.used], e.record.voltage
+        if y.size:
+            stretch = float(np.max(np.abs(v))) / max(float(np.ptp(v)), 1e-300)
+            shares.append(s / max(float(np.ptp(y * max(1.0, stretch))), 1e-300))
     return float(np.clip(_OF_NOISE * min(shares, default=1.0), FIT_RTOL, _QUICK_RTOL))
-
-
-def _moved(e: Experiment) -> FloatArray:
-    """Return the used displacement (n,) [m], as large as if the voltage's range began at 0."""
-    v = e.record.voltage
-    stretch = float(np.max(np.abs(v))) / max(float(np.ptp(v)), 1e-300)
-    moved: FloatArray = measured(e.record)[e.used] * max(1.0, stretch)
-    return moved
 
 
 def record_rms(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
@@ -276,8 +273,22 @@ def exchanged(
         different: set[str] = set()
         before = best
         for what, values in exchanges(best.model.values):
-            other = _from(best, values, experiments, progress, what)
-            if other is None:
+            progress(f"exchanged: {what}")
+            bounds = {n: best.model.parameter(n).bounds for n in values}
+            moved = {n: float(np.clip(v, *bounds[n])) for n, v in values.items()}
+            other = quick_from(
+                best, best.model.with_values(moved), experiments, best.unknowns.names,
+                start_states=best.starts(), evaluations=_FIRST,
+            )  # fmt: skip
+            near = other and other.data_cost <= _HOPEFUL * best.data_cost
+            if other is None or other.interrupted or not near:
+                continue
+            try:
+                other = fit(
+                    other.model, experiments, best.unknowns.names, sigma=best.sigma,
+                    start_states=other.starts(), evaluations=_LAST,
+                )  # fmt: skip
+            except PsaError:
                 continue
             different |= set(differing(best, other, experiments))
             if other.data_cost < best.data_cost and (other.interrupted or not equal(best, other)):
@@ -288,50 +299,13 @@ def exchanged(
     return best, ()
 
 
-def _from(
-    best: Fit,
-    values: Mapping[str, float],
-    experiments: Sequence[Experiment],
-    progress: Progress,
-    what: str,
-) -> Fit | None:
-    """Fit from exchanged values, quickly, and to the end if that is near; None if it is not."""
-    progress(f"exchanged: {what}")
-    free = best.unknowns.names
-    states = best.starts()
-    low_high = {n: best.model.parameter(n).bounds for n in values}
-    moved = {n: min(max(v, low_high[n][0]), low_high[n][1]) for n, v in values.items()}
-    model = best.model.with_values(moved)
-    quick = quick_from(best, model, experiments, free, start_states=states, evaluations=_FIRST)
-    if quick is None or quick.interrupted or quick.data_cost > _HOPEFUL * best.data_cost:
-        return None
-    try:
-        return fit(
-            quick.model,
-            experiments,
-            free,
-            sigma=best.sigma,
-            start_states=quick.starts(),
-            evaluations=_LAST,
-        )
-    except PsaError:
-        return None
-
-
 def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
     """Whether a further parameter would have a standard error below half a logarithmic unit."""
-    free = best.unknowns.names
-    names = [*free, name]
+    known, count = best.unknowns, len(best.unknowns.names)
     none: list[dict[str, float]] = [{} for _ in experiments]
-    known = best.unknowns
-    fresh = unknowns_of(best.model, names, none, known.first_voltage, known.offset_scale)
-    count = len(free)
-    unknowns = replace(
-        fresh,
-        started=best.unknowns.started,
-        start_scale=best.unknowns.start_scale,
-        prior=np.concatenate([fresh.prior[: count + 1], best.unknowns.prior[count:]]),
-    )
+    fresh = unknowns_of(best.model, [*known.names, name], none, known.offset_scale)
+    prior = np.concatenate([fresh.prior[: count + 1], known.prior[count:]])
+    unknowns = replace(fresh, started=known.started, start_scale=known.start_scale, prior=prior)
     theta = np.concatenate([np.zeros(count + 1), best.theta[count:]])
     try:
         parts = predict(best.model, experiments, unknowns, theta, way=best.way)
@@ -343,3 +317,22 @@ def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
     scaled = jacobian / max(best.rms, min(best.sigma))
     information = scaled.T @ scaled + np.diag(1.0 / unknowns.prior**2)
     return bool(np.sqrt(np.linalg.pinv(information, hermitian=True)[count, count]) < 0.5)
+
+
+#: Error of the simulated force over its range: far below the noise of what it is fitted to.
+_FORCE_RTOL = 1e-5
+
+
+def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
+    """Return a record's simulated force in front of the lag (samples,) [N].
+
+    `number` is the record's place in the fit; the error is far below what sensors see. Raises
+    PsaError where it cannot be simulated.
+    """
+    found = simulate_record(fit.model, record, memory=fit.start(number), rtol=_FORCE_RTOL)
+    s = fit.model.structure
+    states = np.array([found.states[n] for n in fit.model.state_names])
+    inputs = record_inputs(fit.model, record, record.n).T
+    force = ca.Function("force", [s.time, s.x, s.u, s.p], [s.sums["free_force"]])
+    values = force(record.time[None, :], states, inputs, fit.model.parameter_vector())
+    return np.asarray(values, dtype=np.float64).reshape(-1)

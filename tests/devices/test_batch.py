@@ -1,7 +1,5 @@
 """Many devices: real work on two, jobs from tables, what is kept, what a failure does."""
 
-import csv
-import json
 import os
 import signal
 import subprocess
@@ -15,7 +13,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -25,7 +22,7 @@ from psa_casadi.cli.app import app
 from psa_casadi.devices import device, executors
 from psa_casadi.devices.batch import batch
 from psa_casadi.devices.executors import Processes, outcomes
-from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options, jobs_given, key_of
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options, jobs_given
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.model.model_file import load_model
@@ -37,7 +34,6 @@ from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.strict_json import json_text
 from tests.report.report_cases import identification
-from tests.report.test_schemas import shipped
 from tests.tiers import slow
 
 TIME = np.arange(240) * 1e-2
@@ -68,35 +64,6 @@ def records(tmp_path: Path) -> Path:
 
 def stamps(folder: Path) -> dict[str, int]:
     return {str(p): p.stat().st_mtime_ns for p in folder.rglob("*/*.json")}
-
-
-@pytest.mark.xdist_group("identification")
-def test_two_devices_are_identified_and_the_third_does_not_stop_them(
-    records: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "results"
-    ended = CliRunner().invoke(app, ["batch", str(records), "-o", str(out)])
-    assert ended.exit_code == 0, ended.stderr
-    assert "3 devices: 2 done, 1 refused." in ended.stdout
-    assert "third: refused:" in ended.stdout
-    for name in ("first", "second"):
-        for kind in ("identification", "device", "model"):
-            content = json.loads((out / name / f"{kind}.json").read_text("utf-8"))
-            jsonschema.Draft202012Validator(shipped(kind)).validate(content)
-    with (out / "summary.csv").open(encoding="utf-8") as stream:
-        rows = {row["device"]: row for row in csv.DictReader(stream)}
-    ratio = float(rows["second"]["k_L [N/V]"]) / float(rows["first"]["k_L [N/V]"])
-    assert 1.03 < ratio < 1.07
-    assert rows["third"]["k_L [N/V]"] == ""
-    assert "line 2" in rows["third"]["problems"]
-    before = stamps(out)
-    write_device(records / "second.csv", 1.06, seed=3)
-    again = batch(records, out, workers=1)
-    assert again.kept == 2
-    assert again.counts == {"done": 2, "refused": 1}
-    changed = {p for p, when in stamps(out).items() if before[p] != when}
-    assert changed == {str(p) for p in (out / "second").iterdir()}
-    assert [f.device for f in again.findings] == ["first", "second"]
 
 
 def stand_in(
@@ -241,15 +208,6 @@ def test_a_damaged_result_is_named_and_made_again(
     assert (again.kept, again.counts, len(again.findings)) == (4, {"done": 5}, 5)
     assert seen[5:] == ["d1"]
     assert (out / "d1" / "identification.json").stat().st_size > 300
-
-
-def test_the_key_is_of_files_and_options(tmp_path: Path) -> None:
-    (task,) = tasks(tmp_path, 1)
-    key = key_of(task.job, task.options)
-    assert key == key_of(task.job, Options())
-    assert key != key_of(task.job, Options(work="diagnose"))
-    Path(task.job.files[0]).write_text("other")
-    assert key != key_of(task.job, task.options)
 
 
 def test_a_table_of_jobs_is_read(records: Path) -> None:

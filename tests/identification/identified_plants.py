@@ -1,7 +1,7 @@
 """Records of plants whose truth is known, identified; each once per process."""
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
@@ -10,14 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from psa_casadi.components import BASE
-from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, read_record
-from psa_casadi.records.split import Experiment, whole
+from psa_casadi.records.split import whole
 from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.stack import Stack, loop_width
 
@@ -72,23 +71,6 @@ def combinations(p: Mapping[str, float]) -> dict[str, float]:
         "n": p["n"],
         "lag": lag - (p["c_P"] + p["c_B"]) / (p["k_P"] + p["k_B"]),
     }
-
-
-def standard_errors(
-    found: Fit, experiments: Sequence[Experiment], extra: Mapping[str, float]
-) -> dict[str, float]:
-    """Return the standard errors of the combinations, from the fit's covariance."""
-    count = len(found.unknowns.names)
-    slopes = found.unknowns.slopes(found.theta)
-    covariance = slopes @ covariance_of(found, experiments)[:count, :count] @ slopes.T
-    p = {**found.model.values, **extra}
-    gradients: dict[str, list[float]] = {}
-    for name in found.unknowns.names:
-        step = 1e-4 * abs(p[name])
-        up, down = (combinations({**p, name: p[name] + h}) for h in (step, -step))
-        for key, value in up.items():
-            gradients.setdefault(key, []).append((value - down[key]) / (2 * step))
-    return {k: float(np.sqrt(np.array(g) @ covariance @ np.array(g))) for k, g in gradients.items()}
 
 
 #: What `psa identify` finds for a named stack with a record of its own.

@@ -25,14 +25,6 @@ def compliance(p: dict[str, float]) -> float:
     return 1.0 / p["k_P"] + 1.0 / p["k_B"]
 
 
-def transfer(p: dict[str, float], s: complex) -> complex:
-    """Return (13) over (14) as the paper writes it, from (10)."""
-    wafers = p["m_P"] * s**2 + p["c_P"] * s + p["k_P"]
-    bonding = p["m_B"] * s**2 + p["c_B"] * s + p["k_B"]
-    both = (p["c_B"] + p["c_P"]) * s + p["k_B"] + p["k_P"]
-    return both / (wafers * bonding) / (p["tau"] * s + 1.0) / compliance(p)
-
-
 def poles(p: dict[str, float]) -> NDArray[np.complex128]:
     parts = [np.roots([p[f"m_{q}"], p[f"c_{q}"], p[f"k_{q}"]]) for q in "PB"]
     return np.concatenate([[-1.0 / p["tau"]], *parts]).astype(np.complex128)

@@ -2,12 +2,12 @@
 
 import pytest
 
-from psa_casadi.identification.advice import Advice, advice, plans, scenarios
+from psa_casadi.identification.advice import Advice, advice, plans
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.records import Record
 from psa_casadi.records.split import whole
-from psa_casadi.report.words.advice_words import plan_words, quantity
+from psa_casadi.report.words.advice_words import plan_words
 from tests.identification.loop_fits import FREE, NOISE, loops, measured
 from tests.model.stack_models import stack
 from tests.studies.benchmarks.records import loop_voltage
@@ -95,28 +95,3 @@ def test_plans_stay_within_the_records_voltages() -> None:
     rates = [p.rate for p in found if p.kind == "step"]
     assert rates == sorted(rates)
     assert len(rates) <= 6
-
-
-def test_scenarios_keep_what_the_records_know() -> None:
-    model = stack("P-885.51").with_values({"tau": 1e-7})
-    both = scenarios(model, {"tau", "R_s", "c_B", "m_B"})
-    sums = [
-        p["tau"] + p["R_s"] * p["C_p"] + p["c_B"] / p["k_B"]
-        for p in (model.values, *(m.values for m in both))
-    ]
-    assert sums[1:] == pytest.approx([sums[0]] * 2, rel=1e-12)
-    for m in both:
-        assert m.values["tau"] > 1e-6
-        assert {n for n in m.values if m.values[n] != model.values[n]} == {
-            "tau", "R_s", "c_B", "m_B",
-        }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [(2e5, "Hz", "200 kHz"), (0.015, "s", "15 ms"), (0.0, "V", "0 V"), (-20.0, "V", "-20 V"),
-     (65.554, "V", "65.6 V"), (120.0, "s", "120 s"), (999.9996, "Hz", "1 kHz"),
-     (0.5, "Hz", "500 mHz")],
-)  # fmt: skip
-def test_quantities_are_written_for_people(value: float, unit: str, text: str) -> None:
-    assert quantity(value, unit) == text

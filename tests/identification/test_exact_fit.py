@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.search import free_parameters
@@ -48,10 +47,6 @@ def fitted(experiments: list[Experiment], sigma: float, rtol: float = FIT_RTOL) 
 
 def allowed(experiment: Experiment, sigma: float) -> float:
     return max(0.03 * sigma, 1e-6 * float(np.ptp(measured(experiment.record)[experiment.used])))
-
-
-def standard_errors(found: Fit, experiments: list[Experiment]) -> FloatArray:
-    return np.asarray(np.sqrt(np.diag(covariance_of(found, experiments))))
 
 
 def test_a_fit_tells_way_and_error_of_each_record() -> None:
@@ -97,15 +92,6 @@ def jittered(sigma: float, seed: int = 1) -> Record:
     shift = 1e-3 * STEP * np.random.default_rng(5).standard_normal(SAMPLES)
     shift[0] = 0.0
     return record_at(time_grid(STEP * SAMPLES, STEP) + shift, sigma, seed)
-
-
-def test_both_ways_find_the_same_values() -> None:
-    even, uneven = regular(), jittered(SIGMA)
-    found = [fitted([whole(r)], SIGMA) for r in (even, uneven)]
-    assert [f.simulated[0].way for f in found] == [EXACT, STEPPER]
-    assert [f.converged for f in found] == [True, True]
-    spread = standard_errors(found[0], [whole(even)])
-    assert np.all(np.abs(found[0].theta - found[1].theta) <= 0.5 * spread)
 
 
 BASE_UNKNOWNS = ("R_s", "C_p", "k_L", "A", "beta", "gamma", "delta", "n", "tau", "k_P", "c_B")

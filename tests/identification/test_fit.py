@@ -58,7 +58,7 @@ def test_coordinates_invert_values_and_slopes_are_their_derivatives(
     effects: tuple[str, ...], seed: int
 ) -> None:
     model = model_with(*effects)
-    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], [2.0, 3.0], 1e-6)
+    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], 1e-6)
     count = len(unknowns.names)
     at_reference = unknowns.values(np.zeros(unknowns.size))
     for name in unknowns.names:
@@ -75,19 +75,6 @@ def test_coordinates_invert_values_and_slopes_are_their_derivatives(
         assert np.all(np.abs((up - down) / 2e-6 - slopes[:, k]) <= 1e-7 * (size + 1e-3))
 
 
-def test_without_the_whole_loop_free_each_parameter_is_its_own_coordinate() -> None:
-    model = model_with()
-    unknowns = unknowns_of(model, ["k_L", "A", "tau"], [{}], [0.0], 1e-6)
-    assert unknowns.loop is None
-    theta = np.array([0.2, -0.5, -0.1, 0.0, 0.0])
-    values = unknowns.values(theta)
-    assert values["k_L"] == pytest.approx(model.values["k_L"] * np.exp(0.2), rel=1e-14)
-    assert values["tau"] == pytest.approx(model.values["tau"] * np.exp(-0.1), rel=1e-14)
-    scale = model.parameter("A").typical(model.values)
-    assert values["A"] == pytest.approx(model.values["A"] - 0.5 * scale, rel=1e-14)
-    np.testing.assert_allclose(unknowns.coordinates(values), theta[:3], rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize(
     "effects", [(), pytest.param(("slow_creep", "rate_independent_asymmetry"), marks=slow)]
 )
@@ -95,7 +82,7 @@ def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, 
     """Two runs differ by up to 4e-7 of the range beside the step, for they step differently."""
     model = model_with(*effects)
     experiments = [whole(record_of(model, seed, 120)) for seed in (1, 2)]
-    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], [2.0, 3.0], 1e-6)
+    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], 1e-6)
     theta, step = moved(unknowns, 4), 1e-2
 
     def predicted(point: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components.outputs import MONITOR
 from psa_casadi.components.surroundings import FLEXURE
 from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.effects import EFFECTS
@@ -28,7 +27,7 @@ from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
 from psa_casadi.report.page.results import write_report
-from psa_casadi.simulation.simulate import Way, simulate
+from psa_casadi.simulation.simulate import Way
 from tests.studies.plants import further_columns as plants
 from tests.studies.plants.excitations import ExcitationKind
 from tests.tiers import slow
@@ -139,23 +138,6 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
     assert "does not follow the voltage as a capacitance's does" in str(said)
     with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
         replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
-
-
-def test_a_monitor_goes_along_into_plant_and_file(tmp_path: Path) -> None:
-    time, voltage, displacement = _line()
-    r = Record(name="r", time=time, voltage=voltage, displacement=displacement)
-    model = starting_model([r])
-    model = model.with_components((*model.components, MONITOR))
-    psa.save_model(model, tmp_path / "m.json")
-    again = psa.load_model(tmp_path / "m.json").plant()
-    assert "monitor_voltage" in again.output_names
-    run = simulate(again.with_values({"monitor_scale": 0.1}), time, voltage)
-    np.testing.assert_allclose(run.outputs["monitor_voltage"], 0.1 * run.states["u"])
-
-
-def _line() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    time = np.linspace(0.0, 1.0, 50)
-    return time, 20.0 * time, 1e-6 * time
 
 
 def test_a_turned_sign_is_told() -> None:

@@ -1,26 +1,22 @@
 """The paper's method: exact where its assumptions hold, and a sentence wherever they do not."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
-from psa_casadi.errors import InputError
-from psa_casadi.identification.paper.hysteresis import hysteresis_part
-from psa_casadi.identification.paper.linear import (
+from psa_casadi.identification.paper import (
     COEFFICIENTS,
     coefficients_of_limits,
     find_loops,
     find_steps,
+    hysteresis_part,
+    identify_by_paper,
     linear_part,
     mechanics_of,
     moment_coefficients,
+    paper_method,
 )
-from psa_casadi.identification.paper.method import identify_by_paper, paper_method
-from psa_casadi.model.model_file import load_model
 from psa_casadi.records import (
     Record,
     decaying_triangle,
@@ -28,7 +24,6 @@ from psa_casadi.records import (
     steps,
     time_grid,
     triangle,
-    write_record,
 )
 from tests.identification.paper_cases import (
     LEADING,
@@ -43,22 +38,12 @@ from tests.identification.paper_cases import (
     real_step,
     residues,
     step_response,
-    transfer,
     values,
 )
 from tests.model.stack_models import PAPER_STACKS
 from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
-
-
-@pytest.mark.parametrize("name", PAPER_STACKS)
-def test_the_coefficients_are_those_of_the_transfer_function(name: str) -> None:
-    p = values(name)
-    *a, b_1 = coefficients_of_values(p)
-    for s in (1e3 + 2e3j, 5e4j, -2e4 + 1e5j):
-        denominator = 1.0 + sum(c * s ** (i + 1) for i, c in enumerate(a))
-        assert (b_1 * s + 1.0) / denominator == pytest.approx(transfer(p, s), rel=1e-10)
 
 
 @pytest.mark.parametrize("name", PAPER_STACKS)
@@ -245,48 +230,13 @@ def test_nothing_is_said_against_a_step_that_serves() -> None:
     assert set(found.found) >= {"k_L", "A", "beta", "gamma", "delta", "n", "tau", "m_B", "c_B"}
 
 
-def test_without_a_step_the_loop_is_still_met() -> None:
-    found = identify_by_paper([loop()])
-    assert found.fit.rms < 0.02 * loop().range_m
-    assert "tau" not in found.model.provenance.notes[-1].split("all other")[0].split()
-    assert found.model.provenance.force_scale == "assumed"
-
-
 def test_a_hysteresis_that_runs_away_is_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
     real = paper_method([loop()])
     wild = real.model.with_values({"beta": -2e3, "gamma": 0.0, "A": -50.0, "n": 4.0})
     monkeypatch.setattr(
-        "psa_casadi.identification.paper.method.paper_method",
+        "psa_casadi.identification.paper.paper_method",
         lambda records, stiffness: type(real)(**{**vars(real), "model": wild}),
     )
     found = identify_by_paper([loop()])
     assert "cannot be simulated on the records" in found.warnings[-1]
     assert np.isfinite(found.fit.rms)
-
-
-def test_a_record_without_displacement_is_refused() -> None:
-    time = time_grid(1.0, 1e-3)
-    with pytest.raises(InputError, match="has no displacement"):
-        paper_method([Record(name="planned", time=time, voltage=triangle(time, 0.0, 60.0, 2.0))])
-
-
-@slow
-@pytest.mark.parametrize("with_step", slow_but([True], [True, False]))
-def test_the_command(tmp_path: Path, with_step: bool) -> None:
-    paths = []
-    for k, r in enumerate([loop(), real_step(120.0)][: 1 + with_step]):
-        paths.append(tmp_path / f"r{k}.csv")
-        columns = {"time [s]": r.time, "voltage [V]": r.voltage}
-        write_record(paths[-1], {**columns, "displacement [m]": np.asarray(r.displacement)})
-    out, page = tmp_path / "m.json", tmp_path / "fit.html"
-    arguments = ["identify", *paths, "--method", "paper", "-o", out, "--report", page]
-    result = CliRunner().invoke(app, [str(a) for a in [*arguments, "--stiffness", 5e7]])
-    assert result.exit_code == 0, result.output
-    said = " ".join(result.stdout.split())
-    assert "Identified by the paper's method" in said
-    assert ("No record is a step" in said) != with_step
-    assert ("holds what the hysteresis adds" in said) == with_step
-    model = load_model(out)
-    assert model.provenance.force_scale == "given"
-    assert model.values["k_B"] == 5e7
-    assert "Yang and Zhu 2015" in page.read_text(encoding="utf-8")

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps
@@ -45,17 +43,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     before.write_text(diagnosis("cause_named").to_json(), encoding="utf-8")
     after.write_text(diagnosis("adequate").to_json(), encoding="utf-8")
     return before, after
-
-
-def test_two_diagnoses_are_side_by_side(files: tuple[Path, Path], tmp_path: Path) -> None:
-    page = tmp_path / "compare.html"
-    ended = CliRunner().invoke(app, ["compare", *map(str, files), "-o", str(page)])
-    assert ended.exit_code == 0, ended.stderr
-    assert "Verdicts differ (before: cause named and after: adequate)" in ended.stdout
-    shown = Page(page.read_text(encoding="utf-8"))
-    assert shown.loaded == []
-    for words in ("slow creep (97 %)", "cause named", "adequate", "before", "after"):
-        assert words in shown.text
 
 
 def test_a_model_and_a_finding_of_the_same_records_are_one_device(tmp_path: Path) -> None:

@@ -62,12 +62,6 @@ def test_tau_is_where_q_is_expected() -> None:
     assert fit.interval() == pytest.approx((mean - half, mean + half), rel=1e-7)
 
 
-def test_units_do_not_matter() -> None:
-    y, s = vaccine()
-    small = mixed_regression(1e-9 * y, 1e-9 * s)
-    assert small.tau == pytest.approx(1e-9 * mixed_regression(y, s).tau, rel=1e-6)
-
-
 @pytest.mark.parametrize("tau", slow_but([1.0], [0.0, 1.0]))
 def test_intervals_cover_and_few_are_told_without_cause(tau: float) -> None:
     rng = np.random.default_rng(3)

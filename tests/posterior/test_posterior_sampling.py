@@ -97,14 +97,6 @@ def test_the_gradient_is_that_of_the_density() -> None:
     assert density(np.full(density.size, 1e6))[0] == -np.inf
 
 
-def test_priors_are_centred_where_they_are_declared() -> None:
-    """Not where a fit begins or ends: another start gives the same density."""
-    other = task_of(TRUTH.with_values({"k_L": 1.05 * TRUTH.values["k_L"]}), [record()], free=FREE)
-    np.testing.assert_array_equal(other.unknowns.reference, task().unknowns.reference)
-    given = task_of(TRUTH, [record()], free=FREE, prior={"k_L": 9.0}, widths={"k_L": 1e-4})
-    assert given.unknowns.values(given.theta)["k_L"] == pytest.approx(9.0, rel=0.01)
-
-
 @pytest.mark.slow
 def test_the_command_finds_the_truth(tmp_path: Path) -> None:
     arviz = pytest.importorskip("arviz")

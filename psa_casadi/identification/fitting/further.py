@@ -16,7 +16,7 @@ from psa_casadi.identification.fitting.prediction import trace_record, traced_by
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, Level
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Way
 from psa_casadi.units import FloatArray
@@ -85,17 +85,14 @@ class Further:
         """What is left of the column, and what is odd about it."""
         unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
         named = "" if unit == "1" else f" {unit}"
-        return (
-            note("column", column=self.column, rms=self.rms, unit=named, share=share),
-            *self.turned,
-        )
+        left = note("column", column=self.column, rms=self.rms, unit=named, share=share)
+        return left, *self.turned
 
     @property
     def turned(self) -> tuple[Note, ...]:
         """Say so where a column falls while what it shows rises."""
-        if COLUMNS[self.column].scale is not None or self.factors[0] >= 0.0:
-            return ()
-        return (note("turned_column", column=self.column),)
+        falls = COLUMNS[self.column].scale is None and self.factors[0] < 0.0
+        return (note("turned_column", column=self.column),) if falls else ()
 
     @property
     def rms(self) -> float:
@@ -112,24 +109,7 @@ def further_of(
     way: Way,
 ) -> tuple[Further, ...]:
     """Return the fit of every further column at theta, at the used samples. Raises PsaError."""
-    levels = experiments[0].further if experiments else ()
-    return tuple(
-        _further(model, experiments, unknowns, theta, level.column, level.value, way)
-        for level in levels
-    )
-
-
-def _further(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    theta: FloatArray,
-    column: str,
-    level: float,
-    way: Way,
-) -> Further:
-    records = with_column(experiments, column)
-    outputs, slopes = COLUMNS[column].outputs, unknowns.slopes(theta)
+    slopes = unknowns.slopes(theta)
 
     def one(task: tuple[int, str]) -> tuple[FloatArray, FloatArray]:
         index, output = task
@@ -141,22 +121,40 @@ def _further(
         used = e.used[: e.stop]
         return shown[used], by_theta[used]
 
-    runs = side_by_side(one, [(k, output) for output in outputs for k in records])
-    count = len(records)
-    per_output = [runs[k : k + count] for k in range(0, len(runs), count)]
-    given = np.concatenate([measured_in(experiments[k], column) for k in records])
-    lengths = tuple(int(experiments[k].used.sum()) for k in records)
-    shown = np.column_stack([np.concatenate([x for x, _ in own]) for own in per_output])
-    centred, target = _centred(shown, lengths), _centred(given, lengths)
+    found = []
+    for level in experiments[0].further if experiments else ():
+        records = with_column(experiments, level.column)
+        tasks = [(k, output) for output in COLUMNS[level.column].outputs for k in records]
+        runs, count = side_by_side(one, tasks), len(records)
+        per_output = [runs[k : k + count] for k in range(0, len(runs), count)]
+        given = [measured_in(experiments[k], level.column) for k in records]
+        found.append(_projected(level, given, per_output))
+    return tuple(found)
+
+
+def _projected(
+    level: Level,
+    given: Sequence[FloatArray],
+    shown: Sequence[Sequence[tuple[FloatArray, FloatArray]]],
+) -> Further:
+    """Return the fit of a column `given` per record by what outputs have `shown` of each record.
+
+    Offsets and factors are projected out.
+    """
+    lengths = tuple(len(y) for y in given)
+    centred = _centred(np.column_stack([np.concatenate([x for x, _ in o]) for o in shown]), lengths)
+    target = _centred(np.concatenate(given), lengths)
     size = np.maximum(np.linalg.norm(centred, axis=0), 1e-300)
     factors = np.linalg.lstsq(centred / size, target, rcond=1e-10)[0] / size
-    basis = _basis(centred / size, lengths)
-    moved = sum(
-        f * np.vstack([j for _, j in own]) for f, own in zip(factors, per_output, strict=True)
-    )
+    ones = np.zeros((len(target), len(lengths)))
+    for k, last in enumerate(np.cumsum(lengths)):
+        ones[last - lengths[k] : last, k] = 1.0 / np.sqrt(lengths[k])
+    u, s, _ = np.linalg.svd(centred / size, full_matrices=False)
+    basis = np.hstack([ones, u[:, s > 1e-10 * max(float(s[0]), 1e-300)]])
+    moved = sum(f * np.vstack([j for _, j in own]) for f, own in zip(factors, shown, strict=True))
     return Further(
-        column=column,
-        level=level,
+        column=level.column,
+        level=level.value,
         spread=float(np.sqrt(np.mean(target**2))),
         residuals=target - basis @ (basis.T @ target),
         jacobian=moved - basis @ (basis.T @ moved),
@@ -228,15 +226,3 @@ def _centred(values: FloatArray, lengths: Sequence[int]) -> FloatArray:
     """Return values (n,) or columns less their mean in every record."""
     parts = np.split(values, np.cumsum(lengths)[:-1])
     return np.concatenate([part - np.mean(part, axis=0) for part in parts])
-
-
-def _basis(shown: FloatArray, lengths: Sequence[int]) -> FloatArray:
-    """Return an orthonormal basis of the records' offsets and of what is shown (n, k)."""
-    n = sum(lengths)
-    ones = np.zeros((n, len(lengths)))
-    first = 0
-    for k, length in enumerate(lengths):
-        ones[first : first + length, k] = 1.0 / np.sqrt(length)
-        first += length
-    u, s, _ = np.linalg.svd(shown, full_matrices=False)
-    return np.hstack([ones, u[:, s > 1e-10 * max(float(s[0]), 1e-300)]])

@@ -176,11 +176,12 @@ def traced_by_theta(
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
     found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
-    count = len(unknowns.names)
-    start_slopes = unknowns.place_slopes(theta, index)[0]
-    by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
-    by_theta[:count, :count] = slopes
-    return found.output, found.sensitivity @ by_theta, found.way
+    count, first = len(unknowns.names), unknowns.first(index)
+    by_theta = np.zeros((len(found.output), unknowns.size))
+    by_theta[:, :count] = found.sensitivity[:, :count] @ slopes
+    by_start = found.sensitivity[:, count:] * unknowns.start_scale[index]
+    by_theta[:, first : first + len(start)] = by_start
+    return found.output, by_theta, found.way
 
 
 def predict(
@@ -215,7 +216,7 @@ def predict(
         x, jacobian, way_taken = traced_by_theta(
             model, experiment.record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
         )
-        jacobian += unknowns.place_slopes(theta, index)[1]
+        jacobian[:, unknowns.first(index + 1) - 1] = unknowns.offset_scale
         return Prediction(x + unknowns.offset(theta, index), jacobian, way_taken)
 
     return side_by_side(one, range(len(experiments)))

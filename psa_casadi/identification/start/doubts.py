@@ -62,25 +62,16 @@ def refuse_still(records: Sequence[Record]) -> None:
         raise InputError([_TWO.format(*max(values, key=np.ptp))])
 
 
-def _usual(records: Sequence[Record]) -> tuple[float, int]:
-    """Return the reading that is there most often in a record, and how many are others in all."""
-    usual, most, others = 0.0, 0, 0
-    for r in records:
-        values, counts = np.unique(measured(r)[r.mask], return_counts=True)
-        if counts.size:
-            others += int(counts.sum() - counts.max())
-            if counts.max() > most:
-                usual, most = float(values[np.argmax(counts)]), int(counts.max())
-    return usual, others
-
-
 def refuse_few(given: Sequence[Record], kept: Sequence[Record], said: Sequence[str]) -> None:
     """Raise InputError where masking left hardly a reading; `said` is what it was done for."""
     before, after = (sum(int(r.mask.sum()) for r in records) for records in (given, kept))
     if after < min(before, FEWEST_SAMPLES):
         raise InputError([*said, _FEW.format(after, before, FEWEST_SAMPLES)])
-    usual, others = _usual(kept)
+    found = [np.unique(measured(r)[r.mask], return_counts=True) for r in kept if r.mask.any()]
+    others = after - sum(int(counts.max()) for _, counts in found)
     if others < min(after, FEWEST_SAMPLES):
+        values, counts = max(found, key=lambda f: int(f[1].max()))  # the reading that is there most
+        usual = float(values[np.argmax(counts)])
         raise InputError([*said, _HARDLY.format(others, usual, FEWEST_SAMPLES)])
 
 
@@ -140,7 +131,12 @@ def _faster(records: Sequence[Record], limit: float) -> str:
         if np.ptp(record.voltage) == 0.0:
             continue
         pace, _ = _paces(record)
-        speed = pace * _stroke(record)
+        y = measured(record)[record.mask]
+        if record.displacement_unit == "counts":
+            stroke = _CHIP * float(np.ptp(record.voltage))
+        else:
+            stroke = min(float(np.ptp(y)), _STROKE) if y.size else 0.0
+        speed = pace * stroke
         if speed > limit:
             bound = "none can at more than" if limit == FASTEST else "few tests are above"
             return (
@@ -150,13 +146,6 @@ def _faster(records: Sequence[Record], limit: float) -> str:
                 f" {_advice(pace, (3, 6, 9))}"
             )
     return ""
-
-
-def _stroke(record: Record) -> float:
-    if record.displacement_unit == "counts":
-        return _CHIP * float(np.ptp(record.voltage))
-    y = measured(record)[record.mask]
-    return min(float(np.ptp(y)), _STROKE) if y.size else 0.0
 
 
 def _paces(record: Record) -> tuple[float, float]:
@@ -237,34 +226,26 @@ def doubtful_quantity(records: Sequence[Record]) -> str:
     A stack behind a lag that is long beside the voltage's changes looks so too. Nothing is said of
     a record of which less than half is read: what it shows may follow the rate by itself.
     """
-    return next((s for r in records if (s := _rate_or_integral(r) or _rectified(r))), "")
-
-
-def _rate_or_integral(record: Record) -> str:
-    y, v = _readings(record)
-    if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
-        return ""
-    step = np.diff(record.time[record.mask])
-    rate = _correlation(np.diff(y) / step, 0.5 * (v[1:] + v[:-1]))
-    if abs(rate) > _FOLLOWS:
-        return _OTHER.format(record.name, "rate of", rate, own, "an integral of")
-    line = np.column_stack([np.ones(step.size), np.cumsum(step)])
-    both = np.column_stack([np.cumsum(0.5 * (y[1:] + y[:-1]) * step), v[1:]])
-    summed, moved = (both - line @ np.linalg.lstsq(line, both, rcond=None)[0]).T
-    integral = _correlation(summed, moved)
-    if abs(integral) > _FOLLOWS:
-        return _OTHER.format(record.name, "integral of", integral, own, "the rate of")
+    for record in records:
+        y, v = _readings(record)
+        if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
+            continue
+        step = np.diff(record.time[record.mask])
+        rate = _correlation(np.diff(y) / step, 0.5 * (v[1:] + v[:-1]))
+        line = np.column_stack([np.ones(step.size), np.cumsum(step)])
+        both = np.column_stack([np.cumsum(0.5 * (y[1:] + y[:-1]) * step), v[1:]])
+        summed, moved = (both - line @ np.linalg.lstsq(line, both, rcond=None)[0]).T
+        integral = _correlation(summed, moved)
+        for found, is_it, holds in (
+            (rate, "rate of", "an integral of"), (integral, "integral of", "the rate of"),
+        ):  # fmt: skip
+            if abs(found) > _FOLLOWS:
+                return _OTHER.format(record.name, is_it, found, own, holds)
+        turns = np.quantile(v, _TURNS)
+        found, at = max((abs(_correlation(np.where(v < u, -y, y), v)), u) for u in turns)
+        if found > _FOLLOWS:
+            return _TURNED.format(record.name, at, found, own)
     return ""
-
-
-def _rectified(record: Record) -> str:
-    """Say that a displacement follows the voltage where its sign is turned below one voltage."""
-    y, v = _readings(record)
-    if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
-        return ""
-    turned = [(abs(_correlation(np.where(v < u, -y, y), v)), u) for u in np.quantile(v, _TURNS)]
-    found, at = max(turned)
-    return _TURNED.format(record.name, at, found, own) if found > _FOLLOWS else ""
 
 
 def _readings(record: Record) -> tuple[FloatArray, FloatArray]:
@@ -298,6 +279,18 @@ _LENGTHS = {-3: "um, not mm", -6: "um, not m", -9: "nm, not m",
 _VOLTAGES = {-3: "mV, not V", -6: "uV, not V", -9: "uV, not kV",
              3: "kV, not V", 6: "kV, not mV", 9: "kV, not uV"}  # fmt: skip
 
+_HIGH = (
+    "The voltage reaches {:.2g} V, and changes by {:.2g} V: no stack bears that. Its unit is"
+    " probably another, it has an offset, or the column holds something else"
+)
+_LOW = (
+    "The voltage changes by {:.2g} V only: that drives no stack. Its unit is probably another, or"
+    " the column holds something else"
+)
+_STRANGE = (
+    "The displacement changes by {:.2g} m, {} than a stack with any sensor: its unit is probably"
+    " another{}."
+)
 _CONSTANT = (
     "The voltage is {:g} V throughout: a stack shows itself only where its voltage changes. Give a"
     " record in which it does, or name its column (--columns voltage=...)."
@@ -314,33 +307,15 @@ def refuse_unusable(records: Sequence[Record]) -> None:
     stroke = max(r.range_m for r in records)
     counts = any(r.displacement_unit == "counts" for r in records)
     low, high = _USABLE_SPANS
+    said = stray(records)
     if not low <= max(span, top) <= high or span < 1e-9 * top or span < low:
-        said = stray(records)
         other = _suggestion(stroke, span) if top < _OFFSET * span else ""
-        raise InputError(said or [f"{_voltage(span, top)}{other}."])
+        about = _HIGH.format(top, span) if top > high else _LOW.format(span)
+        raise InputError(said or [f"{about}{other}."])
     low, high = _USABLE_STROKES
     if not counts and not low <= stroke <= high:
         side = "more" if stroke > high else "less"
-        said = stray(records)
-        raise InputError(
-            said
-            or [
-                f"The displacement changes by {stroke:.2g} m, {side} than a stack with any sensor:"
-                f" its unit is probably another{_suggestion(stroke, span)}."
-            ]
-        )
-
-
-def _voltage(span: float, top: float) -> str:
-    if top > _USABLE_SPANS[1]:
-        return (
-            f"The voltage reaches {top:.2g} V, and changes by {span:.2g} V: no stack bears that."
-            " Its unit is probably another, it has an offset, or the column holds something else"
-        )
-    return (
-        f"The voltage changes by {span:.2g} V only: that drives no stack. Its unit is probably"
-        " another, or the column holds something else"
-    )
+        raise InputError(said or [_STRANGE.format(stroke, side, _suggestion(stroke, span))])
 
 
 def stray(records: Sequence[Record]) -> list[str]:
@@ -439,12 +414,13 @@ def doubtful_sign(records: Sequence[Record]) -> str:
 
 def _suggestion(stroke: float, span: float) -> str:
     """Say which column would be ordinary in which other unit; "" where no single change helps."""
-    fits = []
-    for length, voltage in product(_POWERS, _POWERS):
-        x, v = stroke * 10.0**length, span * 10.0**voltage
-        ordinary = _STROKES[0] <= x <= _STROKES[1] and _SPANS[0] <= v <= _SPANS[1]
-        if ordinary and ORDINARY_STROKE[0] <= x / v <= ORDINARY_STROKE[1]:
-            fits.append((length, voltage))
+    fits = [
+        (length, voltage)
+        for length, voltage in product(_POWERS, _POWERS)
+        if _STROKES[0] <= (x := stroke * 10.0**length) <= _STROKES[1]
+        and _SPANS[0] <= (v := span * 10.0**voltage) <= _SPANS[1]
+        and ORDINARY_STROKE[0] <= x / v <= ORDINARY_STROKE[1]
+    ]
     power = min(fits, key=lambda p: abs(p[0]) + abs(p[1]), default=(0, 0))
     told = [
         f"the {name} is in {units[p]} (or in units as far apart): correct the header, or give"

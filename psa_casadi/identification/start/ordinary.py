@@ -199,12 +199,10 @@ _CAPACITANCE = 1.6e-6
 _HYSTERESIS_SHARE = 0.1
 
 #: Shapes of loop to start from: A, beta, gamma over k_L, and n. The second saturates early, far
-#: within the range; from the others a fit of such a loop ends with a steep A and no bend.
+#: within the range; from the first a fit of such a loop ends with a steep A and no bend.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
     {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
     {"A": -0.35, "beta": 0.6, "gamma": 0.02, "n": 1.4},
-    {"A": -0.15, "beta": 0.05, "gamma": 0.05, "n": 1.1},
-    {"A": -0.3, "beta": 0.1, "gamma": 0.1, "n": 1.05},
 )
 
 
@@ -277,12 +275,12 @@ def with_stiffness(model: Model, stiffness: float) -> Model:
     return model.with_values({p.name: model.values[p.name] * stiffness / own for p in forces})
 
 
-def loop_starts(model: Model) -> list[dict[str, float]]:
-    """Return starting values for the hysteresis, scaled to the model's k_L."""
+def loop_starts(model: Model) -> list[tuple[str, dict[str, float]]]:
+    """Return starting values for the hysteresis by name, scaled to the model's k_L."""
     k_l = model.values["k_L"]
     return [
-        {name: value if name == "n" else value * k_l for name, value in shape.items()}
-        for shape in LOOP_SHAPES
+        (f"loop shape {k}", {n: v if n == "n" else v * k_l for n, v in shape.items()})
+        for k, shape in enumerate(LOOP_SHAPES, 1)
     ]
 
 

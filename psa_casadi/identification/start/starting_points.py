@@ -1,4 +1,4 @@
-"""Starting points of a search: dynamics and loops that the records show, ordinary shapes.
+"""Starting points of a search: dynamics that the records show, ordinary loops.
 
 Starting values of the linear part, from the records alone.
 
@@ -9,41 +9,36 @@ Starting values of the linear part, from the records alone.
 4. Every such start refined by least squares with the exact response (`linear_fit`), the best ones
    to the end, and k_P/k_B as well where that explains more.
 
-Starting values of the hysteresis: the paper's formulas (26) to (35) in integrated form.
+The linear part fitted to excerpts: eqs. (13), (15) behind a drive and a static loop.
 
-The paper reads A and delta at the crossings of h and n, beta, gamma from logarithms of velocities.
-Noise spoils velocities, and h must cross zero. Integrated over time, eq. (26) needs neither:
+    u = v/(T s + 1),   f = g_0 u + sum_j g_j play_j(u),   y = H f + constant,
 
-    x - x_0 = s (u - u_0) - beta I_1 - gamma I_2 + delta I_3,    s = k + A,
-    I_1 = int |h|^(n-1) h |du|,  I_2 = int |h|^n du,  I_3 = int u sgn(u') dt,
-
-with h = h_0 + (x - x_0) - k (u - u_0) from the measured x, so that s, beta, gamma and delta follow
-by linear least squares at given k, n and h_0. Those are searched (variable projection).
+H the mechanics and the creep lag with gain 1 at rest. The weights g, which every excerpt has for
+itself, and the constants are linear: they are eliminated at every theta (variable projection, with
+Kaufman's derivative, BIT 15 (1975), 49). A loop of Bouc and Wen is odd play operators to about a
+percent, so the rates at which it runs do not mislead the time constants.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
-import scipy
+import numpy.typing as npt
 
 from psa_casadi.components import BASE
-from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.fitting.levenberg_marquardt import minimise
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.doubts import static_slope
-from psa_casadi.identification.start.linear_fit import (
-    COORDINATES,
-    Excerpt,
-    LinearFit,
-    cost_of,
-    excerpts,
-    fit_linear,
-)
 from psa_casadi.identification.start.linear_response import (
     ComplexArray,
     Response,
     contributions,
+    first_order,
+    mechanics_poles,
+    numerator_time,
+    orthonormal,
+    plays,
+    respond,
     vector_fit,
 )
 from psa_casadi.identification.start.ordinary import has_loop, loop_starts
@@ -53,8 +48,375 @@ from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 
+BoolArray = npt.NDArray[np.bool_]
+
+#: Samples that all excerpts together may have, and that one may.
+SAMPLES, MOST = 8_000, 4_000
+#: Radii of the play operators that stand for the loop, over the range of the voltage.
+RADII = tuple(k / 16.0 for k in range(1, 9))
+#: Share of its range that a static loop must miss in a record: with a voltage that crosses its
+#: range within `_FAST` samples, and with a slower one, where the shape of the loop may be missed.
+_SHOWS_FAST, _SHOWS_SLOW, _FAST = 0.01, 0.03, 16.0
+#: A record whose voltage takes this many times longer than that of the fastest adds no dynamics.
+_SLOWER = 30.0
+#: Least noise over the range, and the largest where fast motion looks like noise to its estimate.
+_NOISE = (2e-3, 2e-2)
+_FEWEST = 16
+#: Share of the range within which a response has settled, and within which it is all but over.
+_SETTLED, _OVER = 0.01, 0.05
+#: Share of an excerpt that begins in motion and is given to its transient.
+_LEAD = 0.2
+#: A motion that begins with less than this share of its ordinary rate begins at rest.
+_SLOWLY = 0.2
+#: Voltages alike within this share of the range are one level.
+_LEVEL = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """Uniform samples h [s] apart of one record, from (nearly) rest; all arrays (n,).
+
+    `v` [V] and `y` [m] are deviations from the start; `valid` marks measured samples that count,
+    elsewhere y is a stand-in; `sigma` [m] is the white noise, within `_NOISE`; `loop` [m] is the
+    best static loop for y, 0 at the start, and `static` [m] the root mean square that it leaves.
+    No time constant of a stack exceeds `longest` [s]: a hold shows when the response is over.
+    """
+
+    name: str
+    h: float
+    longest: float
+    v: FloatArray
+    y: FloatArray
+    valid: BoolArray
+    sigma: float
+    loop: FloatArray
+    static: float
+
+    @property
+    def range(self) -> float:
+        """Range of the displacement [m]."""
+        return float(np.ptp(self.y[self.valid]))
+
+    @property
+    def missed(self) -> float:
+        """Root mean square that a static loop leaves beyond the noise [m]."""
+        return float(np.sqrt(max(self.static**2 - self.sigma**2, 0.0)))
+
+    @property
+    def crossing(self) -> float:
+        """Time in which the voltage crosses its range at its fastest [s]."""
+        return self.h * float(np.ptp(self.v) / np.max(np.abs(np.diff(self.v))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Uniform samples of a record, as they stand: nan where no displacement was measured."""
+
+    h: float
+    longest: float
+    v: FloatArray
+    y: FloatArray
+
+    def part(self, start: int, stop: int, every: int = 1) -> "_Samples":
+        cut = slice(max(start, 0), stop, every)
+        return _Samples(self.h * every, self.longest, self.v[cut], self.y[cut])
+
+
+def excerpts(records: Sequence[Record]) -> list[Excerpt]:
+    """Return the excerpts in which a static loop misses what is there, the clearest first."""
+    found = [e for r in records for e in _of_record(r)]
+    shown = [
+        e
+        for e in found
+        if (e.static > _SHOWS_FAST * e.range if _fast(e) else e.missed > _SHOWS_SLOW * e.range)
+    ]
+    shown.sort(key=lambda e: e.range / e.static)
+    fastest = min((e.crossing for e in shown), default=0.0)
+    kept: list[Excerpt] = []
+    for e in shown:
+        room = not kept or sum(k.y.size for k in kept) + e.y.size <= SAMPLES
+        if room and e.crossing <= _SLOWER * fastest:
+            kept.append(e)
+    return kept
+
+
+def _fast(e: Excerpt) -> bool:
+    return e.crossing <= _FAST * e.h
+
+
+def _of_record(record: Record) -> list[Excerpt]:
+    """Return the excerpts of one record: all of it, or its fastest part and a coarse whole."""
+    if record.displacement is None or record.mask.sum() < _FEWEST or not np.ptp(record.voltage):
+        return []
+    whole = _without_rests(_uniform(record))
+    if whole.v.size <= MOST:
+        return _excerpt(record.name, whole)
+    start = fastest_part(whole.v, MOST)
+    found = _excerpt(f"{record.name}, fastest part", whole.part(start, start + MOST))
+    coarse = whole.part(0, whole.v.size, -(-whole.v.size // MOST))
+    at = np.arange(whole.v.size) * whole.h
+    missed = np.interp(at, np.arange(coarse.v.size) * coarse.h, coarse.v) - whole.v
+    if np.std(missed) < 0.02 * np.ptp(whole.v):
+        found += _excerpt(f"{record.name}, coarse", coarse)
+    return found
+
+
+def _excerpt(name: str, samples: _Samples) -> list[Excerpt]:
+    """Return the samples as an excerpt, or nothing where too little was measured or moved."""
+    v, y = samples.v, samples.y
+    valid = np.isfinite(y)
+    rest = _leading_rest(v)
+    lead = int(_LEAD * v.size)
+    if rest == 0 and np.ptp(v[lead:]) > 0.5 * np.ptp(v):
+        valid[:lead] = False
+    if valid.sum() < _FEWEST or not np.ptp(v) or not np.ptp(y[valid]):
+        return []
+    filled = np.interp(np.arange(y.size), np.flatnonzero(np.isfinite(y)), y[np.isfinite(y)])
+    moved = filled - np.mean(filled[: max(rest, 1)])
+    loop, static = _static_loop(v - v[0], moved, valid)
+    found = Excerpt(name, samples.h, samples.longest, v - v[0], moved, valid, 0.0, loop, static)
+    noise = max(high_frequency_noise(filled[valid]), _NOISE[0] * found.range)
+    return [replace(found, sigma=min(noise, _NOISE[1] * found.range) if _fast(found) else noise)]
+
+
+def _static_loop(v: FloatArray, y: FloatArray, valid: BoolArray) -> tuple[FloatArray, float]:
+    """Return the best static loop for y, 0 at the start, and the rms [m] that it leaves."""
+    span = float(np.ptp(v))
+    columns = np.column_stack([v, plays(v, [span * r for r in RADII]), np.full(v.size, span)])
+    q, transform = orthonormal(columns[valid])
+    weights = transform @ (q.T @ y[valid])
+    fitted = columns @ weights
+    return fitted - fitted[0], float(np.sqrt(np.mean((y[valid] - fitted[valid]) ** 2)))
+
+
+def _uniform(record: Record) -> _Samples:
+    """Return the record on uniform instants; a displacement counts within half an interval."""
+    t, y = record.time, np.asarray(record.displacement, dtype=np.float64)
+    steps = np.diff(t)
+    if np.ptp(steps) < 0.01 * record.sample_time:
+        return _Samples(record.duration / steps.size, record.duration, record.voltage, y)
+    h = max(float(np.quantile(steps, 0.1)), record.duration / (20.0 * MOST))
+    grid = t[0] + h * np.arange(int(record.duration / h) + 1)
+    measured = t[record.mask]
+    after = np.searchsorted(measured, grid).clip(1, measured.size - 1)
+    distance = np.minimum(np.abs(grid - measured[after - 1]), np.abs(measured[after] - grid))
+    displacement = np.interp(grid, measured, y[record.mask])
+    displacement[distance > 0.5 * h] = np.nan
+    return _Samples(h, record.duration, np.interp(grid, t, record.voltage), displacement)
+
+
+def _without_rests(s: _Samples) -> _Samples:
+    """Return the samples up to where the last response has settled, and settled ones made nan.
+
+    A rest before the first change of voltage is cut short. Where the longest hold is more than
+    twice as long as the response to within 5 %, that response limits the time constants.
+    """
+    y, size = s.y.copy(), float(np.nanmax(s.y) - np.nanmin(s.y))
+    still = np.abs(np.diff(s.v)) <= _LEVEL * np.ptp(s.v)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still, [0]])))
+    holds = [(int(a), int(b) + 1) for a, b in zip(edges[::2], edges[1::2], strict=True) if a > 0]
+    over = [(last - first, _settled(s.y[first:last], _OVER * size)) for first, last in holds]
+    length, response = max(over, default=(0, 0))
+    longest = s.longest
+    if 2 * response < length:
+        longest = min((max(r for n, r in over if 2 * r < n) + 8) * s.h, longest)
+    for first, last in holds:
+        y[first + 2 * _settled(s.y[first:last], _SETTLED * size) + _FEWEST : last] = np.nan
+    start = max(_leading_rest(s.v) - max(s.v.size // 50, 8), 0)
+    whole = _Samples(s.h, longest, s.v, y)
+    return whole.part(start, int(np.flatnonzero(np.isfinite(y))[-1]) + 1)
+
+
+def _settled(y: FloatArray, tolerance: float) -> int:
+    """Return the number of samples until a hold stays at its last level; all where that is open."""
+    third = y[2 * y.size // 3 :]
+    if np.isfinite(third).sum() < _FEWEST:
+        return int(y.size)
+    noise = high_frequency_noise(y[np.isfinite(y)])
+    away = np.flatnonzero(np.abs(y - np.nanmedian(third)) > max(tolerance, 3.0 * noise))
+    return int(away[-1]) + 1 if away.size else 0
+
+
+def _leading_rest(v: FloatArray) -> int:
+    """Return how many samples at the start have the first voltage; 0 if it was moving before.
+
+    A single sample counts as a rest where the voltage jumps to a level or begins to move slowly.
+    """
+    level = _LEVEL * float(np.ptp(v))
+    changed = np.flatnonzero(np.abs(v - v[0]) > level)
+    rest = int(changed[0]) if changed.size else v.size
+    moves = np.diff(v)
+    slow = np.max(np.abs(moves[:3])) < _SLOWLY * np.sqrt(np.mean(moves**2))
+    return 0 if rest == 1 and np.ptp(v[1:4]) > level and not slow else rest
+
+
+def fastest_part(v: FloatArray, length: int) -> int:
+    """Return the start of the part with the largest jumps of voltage from sample to sample.
+
+    Of equal parts the last, a little before.
+    """
+    energy = np.concatenate([[0.0], np.cumsum(np.diff(v) ** 2)])
+    inside = energy[length - 1 :] - energy[: v.size - length + 1]
+    best = int(np.flatnonzero(inside >= (1.0 - 1e-9) * inside.max())[-1])
+    return max(best - length // 50, 0)
+
+
+IndexArray = npt.NDArray[np.intp]
+
+#: Names of the coordinates: natural logarithms of times T, tau, a, of squares of times q, and of
+#: r = k_P/k_B, as in `linear_response`.
+COORDINATES = ("T", "tau", "a_P", "q_P", "a_B", "q_B", "r")
+#: Standard deviations of the weak priors of the coordinates, centred where a fit starts.
+_PRIOR = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0])
+#: Weak priors, all with standard deviation 1.5: ln of the damping ratios a/(2 sqrt(q)) about 0.7,
+#: which keeps a pole and the zero from cancelling far below the band, and ln (m_P/m_B) about 0,
+#: since wafers and bonding layers with their places exchanged respond alike.
+_TYPICAL = np.array(
+    [[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0], [0, 0, 0, 1, 0, -1, 1]]
+) / 1.5  # fmt: skip
+_TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
+#: Mean and standard deviation of the prior of a play operator's weight, over the slope, where the
+#: voltage turns; and where it does not: there only the prior keeps a curve that bends the other
+#: way from standing for a fast response behind a slow drive.
+_LOOP_PRIOR, _CURVE_PRIOR = (0.03, 0.1), (0.03, 0.02)
+#: The same for a shift of the voltage in time, in samples, where it jumps within `_JUMP` samples:
+#: the record does not tell when, between two of them.
+_SHIFT_PRIOR, _JUMP = (0.0, 0.3), 2.0
+#: Step of the derivatives by differences, in natural logarithms.
+_STEP = 1e-3
+#: A fit ends when two steps in a row lower the cost by less than this share of it.
+_TOLERANCE = 1e-3
+#: Shortest time constant over the shortest interval.
+_SHORTEST = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """Where a fit ended: theta (7,), standard errors (7,), weighted cost, and what is left over.
+
+    `left` holds the root mean square of the residual of every excerpt [m], `white` that of its
+    white part; a coordinate that was held has no standard error (nan).
+    """
+
+    theta: FloatArray
+    errors: FloatArray
+    cost: float
+    left: tuple[float, ...]
+    white: tuple[float, ...]
+
+
+def fit_linear(
+    parts: Sequence[Excerpt], start: FloatArray, *, ratio_free: bool, evaluations: int
+) -> LinearFit:
+    """Fit theta (7,) to the excerpts, from `start`; r stays there unless it is free."""
+    free = np.arange(7 if ratio_free else 6)
+    low, high = _bounds(parts)
+    weights = 1.0 / _PRIOR[free]
+
+    def evaluate(coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (of every excerpt and its loop's prior, then priors) and Jacobian."""
+        theta = start.copy()
+        theta[free] = coordinates
+        each = [_eliminated(e, theta, free) for e in parts]
+        priors = [weights * (coordinates - start[free]), _TYPICAL @ theta - _TYPICAL_AT]
+        residual = np.concatenate([*(r for r, _ in each), *priors])
+        return residual, np.vstack([*(j for _, j in each), np.diag(weights), _TYPICAL[:, free]])
+
+    found = minimise(
+        evaluate, start[free], (low[free], high[free]),
+        tolerance=_TOLERANCE, evaluations=evaluations,
+    )  # fmt: skip
+    if found is None:  # the objective is finite wherever the bounds allow
+        raise ArithmeticError("The linear fit has no value at its start.")
+    theta = start.copy()
+    theta[free] = found.theta
+    data, first = [], 0
+    for e in parts:
+        count = int(e.valid.sum())
+        data.append(found.residual[first : first + count])
+        first += count + _weights_of(e)
+    level = max(1.0, float(np.mean(np.concatenate(data) ** 2)))
+    information = found.jacobian.T @ found.jacobian / level
+    errors = np.full(7, np.nan)
+    errors[free] = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
+    residuals = [e.sigma * r for e, r in zip(parts, data, strict=True)]
+    return LinearFit(
+        theta=theta,
+        errors=errors,
+        cost=found.cost,
+        left=tuple(float(np.sqrt(np.mean(r**2))) for r in residuals),
+        white=tuple(high_frequency_noise(r) for r in residuals),
+    )
+
+
+def _cost_of(parts: Sequence[Excerpt], theta: FloatArray) -> float:
+    """Return the weighted sum of squares that theta (7,) leaves, without its prior."""
+    inside = np.clip(theta, *_bounds(parts))
+    none = np.arange(0)
+    return sum(float(np.sum(_eliminated(e, inside, none)[0] ** 2)) for e in parts)
+
+
+def _bounds(parts: Sequence[Excerpt]) -> tuple[FloatArray, FloatArray]:
+    shortest = np.log(_SHORTEST * min(e.h for e in parts))
+    longest = np.log(min(e.longest for e in parts))
+    power = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0])
+    ratio = np.log([0.05, 100.0])
+    return np.append(power * shortest, ratio[0]), np.append(power * longest, ratio[1])
+
+
+def _weights_of(e: Excerpt) -> int:
+    """Return how many weights of an excerpt's loop have a prior: of plays, and a jump's shift."""
+    return len(RADII) + int(e.crossing < _JUMP * e.h)
+
+
+def _eliminated(e: Excerpt, theta: FloatArray, free: IndexArray) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted residual that the best weights leave, with its priors, and its Jacobian.
+
+    Kaufman's, with a column for each free coordinate.
+    """
+    force = _force(e, theta)
+    count, extra = int(e.valid.sum()), _weights_of(e)
+    slope = float(np.polyfit(e.v[e.valid], e.y[e.valid], 1)[0])
+    priors = [_LOOP_PRIOR if turns(e.v) else _CURVE_PRIOR] * len(RADII)
+    mean, deviation = np.array([*priors, _SHIFT_PRIOR][:extra]).T
+    matrix = np.zeros((count + extra, extra + 2))
+    matrix[:count, :-1] = _behind(e, theta, force)[e.valid] / e.sigma
+    matrix[:count, -1] = 1.0 / e.sigma
+    matrix[count:, 1:-1] = np.diag(1.0 / (deviation * abs(slope)))
+    target = np.append(e.y[e.valid] / e.sigma, np.sign(slope) * mean / deviation)
+    q, transform = orthonormal(matrix)
+    weights = (transform @ (q.T @ target))[:-1]
+    jacobian = np.zeros((target.size, free.size))
+    if free.size:
+        total = force @ weights
+        here = _behind(e, theta, total)[e.valid]
+        for k, place in enumerate(free):
+            moved = theta.copy()
+            moved[place] += _STEP
+            source = _force(e, moved) @ weights if place == 0 else total
+            jacobian[:count, k] = (_behind(e, moved, source)[e.valid] - here) / (_STEP * e.sigma)
+    return q @ (q.T @ target) - target, jacobian - q @ (q.T @ jacobian)
+
+
+def _force(e: Excerpt, theta: FloatArray) -> FloatArray:
+    """Return the drive's voltage, the play operators on it and, for a jump, its shift, (n, k)."""
+    u = first_order(float(np.exp(theta[0])), e.v, e.h)
+    span = float(np.ptp(e.v))
+    columns = [u[:, None], plays(u, [span * r for r in RADII])]
+    if e.crossing < _JUMP * e.h:
+        columns.append(np.gradient(u)[:, None])
+    return np.hstack(columns)
+
+
+def _behind(e: Excerpt, theta: FloatArray, x: FloatArray) -> FloatArray:
+    """Return x behind the creep lag and the mechanics, gain 1 at rest."""
+    return respond(mechanics_poles(theta), numerator_time(theta), x, e.h)
+
+
 #: Number of candidates at most, and of poles that vector fitting looks for.
 CANDIDATES, ORDERS = 4, (1, 2, 3, 4, 5)
+#: Poles count that are this share of the noise, or of the strongest.
+_COUNTS = 0.2
 #: Excerpts whose poles are sought.
 _SOURCES = 3
 #: Rounds of the search: how many of the best starts go on, for how many evaluations; the last one.
@@ -98,22 +460,17 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
     `values` gives C_p [F], k_P and k_B [N/m], which voltage and displacement do not determine.
     None where the records show no dynamics: loops that a static loop explains.
     """
-    parts = excerpts(records)
+    parts: Sequence[Excerpt] = excerpts(records)
     if not parts:
         return None
-    starts = _starts(parts, log(values["k_P"] / values["k_B"]))
-    starts = sorted(starts, key=lambda theta: cost_of(parts, theta))
-    best: Sequence[LinearFit] = ()
-    for count, evaluations in _ROUNDS:
-        fits = [
-            fit_linear(parts, s, ratio_free=False, evaluations=evaluations) for s in starts[:count]
-        ]
-        best = different(sorted(fits, key=lambda f: f.cost))
-        starts = [f.theta for f in best]
-        parts = _reweighted(parts, best[0])
-    best = best[:CANDIDATES]
-    fits = [_refined(parts, f) for f in best]
-    fits = different(sorted(fits, key=lambda f: f.cost))
+    starts: list[FloatArray] = []
+    for e in parts[:_SOURCES]:
+        v, y = e.v[e.valid] - np.mean(e.v[e.valid]), e.y[e.valid]
+        scaled = e.v * float(v @ (y - np.mean(y)) / (v @ v))  # the voltage in metres
+        for source in (scaled, e.loop):
+            starts += placed(e, source, ORDERS, [log(values["k_P"] / values["k_B"])], weak=True)
+    best, parts = sought(parts, starts, _ROUNDS, ratio_free=False, reweigh=True)
+    fits = _different(_refined(parts, f) for f in best[:CANDIDATES])
     kept = [f for f in fits if _explains(parts, f)]
     if not kept:
         return None
@@ -124,16 +481,42 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
     )
 
 
-def _reweighted(parts: Sequence[Excerpt], fit: LinearFit) -> list[Excerpt]:
-    """Return the excerpts with the noise that a fit leaves.
+def sought(
+    parts: Sequence[Excerpt],
+    starts: Sequence[FloatArray],
+    rounds: Sequence[tuple[int, int]],
+    *,
+    ratio_free: bool,
+    reweigh: bool = False,
+) -> tuple[list[LinearFit], Sequence[Excerpt]]:
+    """Return the best fits from starts (7,), unlike each other, and the excerpts as last weighted.
 
-    The rest of the residual, which the model misses and which is not white, counts many times.
+    In rounds: how many of the best go on, and for how many evaluations. `reweigh` gives excerpts
+    the noise that the best fit leaves, in which what the model misses and which is not white counts
+    many times.
     """
-    found = []
-    for e, left, white in zip(parts, fit.left, fit.white, strict=True):
-        missed = _MISSED * np.sqrt(max(left**2 - white**2, 0.0))
-        found.append(replace(e, sigma=float(max(np.hypot(white, missed), _FLOOR * e.range))))
-    return found
+    kept: list[FloatArray] = []
+    for theta in starts:
+        if all(np.max(np.abs(theta - k)) > _ALIKE for k in kept):
+            kept.append(theta)
+    kept.sort(key=lambda theta: _cost_of(parts, theta))
+    best: list[LinearFit] = []
+    for count, evaluations in rounds:
+        best = _different(
+            fit_linear(parts, s, ratio_free=ratio_free, evaluations=evaluations)
+            for s in kept[:count]
+        )
+        kept = [f.theta for f in best]
+        if reweigh:
+            levels = [
+                np.hypot(white, _MISSED * np.sqrt(max(left**2 - white**2, 0.0)))
+                for left, white in zip(best[0].left, best[0].white, strict=True)
+            ]
+            parts = [
+                replace(e, sigma=float(max(level, _FLOOR * e.range)))
+                for e, level in zip(parts, levels, strict=True)
+            ]
+    return best, parts
 
 
 def _explains(parts: Sequence[Excerpt], fit: LinearFit) -> bool:
@@ -159,10 +542,10 @@ def _refined(parts: Sequence[Excerpt], fit: LinearFit) -> LinearFit:
     return free if told else fixed
 
 
-def different(fits: Sequence[LinearFit]) -> list[LinearFit]:
+def _different(fits: Iterable[LinearFit]) -> list[LinearFit]:
     """Return the fits, best first, without those that repeat a better one within 10 %."""
     kept: list[LinearFit] = []
-    for f in fits:
+    for f in sorted(fits, key=lambda f: f.cost):
         if all(np.max(np.abs(f.theta - k.theta)) > _ALIKE for k in kept):
             kept.append(f)
     return kept
@@ -170,49 +553,41 @@ def different(fits: Sequence[LinearFit]) -> list[LinearFit]:
 
 def _candidate(fit: LinearFit, values: Mapping[str, float], misfit: float) -> LinearCandidate:
     size = dict(zip(COORDINATES, np.exp(fit.theta).tolist(), strict=True))
-    k_B = values["k_B"]
-    k_P = values["k_P"] if np.isnan(fit.errors[-1]) else size["r"] * k_B
+    ratio_free, k_B = not np.isnan(fit.errors[-1]), values["k_B"]
+    k_P = size["r"] * k_B if ratio_free else values["k_P"]
     found = {
-        "tau": size["tau"],
         "R_s": size["T"] / values["C_p"],
+        "tau": size["tau"],
         "c_P": size["a_P"] * k_P,
         "m_P": size["q_P"] * k_P,
         "c_B": size["a_B"] * k_B,
         "m_B": size["q_B"] * k_B,
         "k_P": k_P,
     }
-    names = dict(zip(COORDINATES, ("R_s", "tau", "c_P", "m_P", "c_B", "m_B", "k_P"), strict=True))
-    if np.isnan(fit.errors[-1]):
+    told = tuple(n for n, e in zip(found, fit.errors, strict=True) if e < 0.5)
+    if not ratio_free:
         del found["k_P"]
     bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
-    return LinearCandidate(
-        values={n: float(np.clip(v, *bounds[n])) for n, v in found.items()},
-        misfit=misfit,
-        told=tuple(names[c] for c, e in zip(COORDINATES, fit.errors, strict=True) if e < 0.5),
-    )
+    within = {n: float(np.clip(v, *bounds[n])) for n, v in found.items()}
+    return LinearCandidate(within, misfit, told)
 
 
-def _starts(parts: Sequence[Excerpt], ratio: float) -> list[FloatArray]:
-    """Return theta (7,) for every way to place the poles of every order, of every excerpt."""
-    found: list[FloatArray] = []
-    for e in parts[:_SOURCES]:
-        for source in (_scaled(e), e.loop):
-            response = [Response(e.h, source, e.y, e.valid, e.sigma)]
-            for order in ORDERS:
-                poles = vector_fit(response, order)
-                share = contributions(response, poles)
-                for least in {min(1.0, share.max()), share.max()}:
-                    for placed in arrangements(poles[share >= 0.2 * least], e.h):
-                        theta = np.append(placed, ratio)
-                        if all(np.max(np.abs(theta - f)) > _ALIKE for f in found):
-                            found.append(theta)
-    return found
+def placed(
+    e: Excerpt, source: FloatArray, orders: Sequence[int], ratios: Sequence[float], *, weak: bool
+) -> Iterator[FloatArray]:
+    """Yield theta (7,) for every way to place the poles of an excerpt's response to a source (n,).
 
-
-def _scaled(e: Excerpt) -> FloatArray:
-    """Return the voltage in metres: times the slope of displacement on voltage."""
-    v = e.v[e.valid] - np.mean(e.v[e.valid])
-    return e.v * float(v @ (e.y[e.valid] - np.mean(e.y[e.valid])) / (v @ v))
+    Poles that hardly show are left out; with `weak` also those that do beside the strongest.
+    """
+    response = [Response(e.h, source, e.y, e.valid, e.sigma)]
+    for order in orders:
+        poles = vector_fit(response, order)
+        share = contributions(response, poles)
+        least = min(1.0, share.max())
+        for level in {least, share.max()} if weak else {least}:
+            for own in arrangements(poles[share >= _COUNTS * level], e.h):
+                for ratio in ratios:
+                    yield np.append(own, ratio)
 
 
 def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
@@ -241,123 +616,6 @@ def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
     return found
 
 
-#: Loops that take part, samples of each, and how much faster than the slowest they may be.
-_LOOPS, _SAMPLES, _FASTER = 4, 2000, 5.0
-#: Ranges of n, and of k over the slope of displacement on voltage.
-_N, _K = (1.0, 3.0), (0.5, 3.5)
-#: k over the slope, and n, from which the search starts.
-_STARTS = ((1.1, 1.2), (1.6, 1.2), (2.5, 1.05))
-#: How many standard deviations h_0 may be off: the noise at rest, an ordinary hysteresis elsewhere.
-_DOUBT = 4.0
-#: Least noise over the range: what formulas without lags miss.
-_LOOP_FLOOR = 1e-3
-#: A sample's voltage counts as held where it moves less than this share of the mean step.
-_HELD = 1e-2
-
-
-@dataclass(frozen=True, eq=False)
-class _Loop:
-    """Displacement x [m], voltage u [V], both (n,) from the first sample, and what is fixed."""
-
-    x: FloatArray
-    u: FloatArray
-    steps: FloatArray
-    skew: FloatArray
-    rests: bool
-
-
-def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | None:
-    """Return k_L, A, beta, gamma [N/V], delta [N/(V.s)] and n of the slowest loops, or None.
-
-    Forces follow from the model's stiffnesses by eq. (14), beta and gamma belong to its h_ref.
-    None where no record's voltage turns, or nothing moves. Only where a search begins depends on
-    these values, so they may come from all samples, held-out ones too.
-    """
-    loops = [_loop(r) for r in _slowest(records)]
-    slope = abs(static_slope(records))
-    level = max((float(np.ptp(loop.x)) for loop in loops), default=0.0)
-    if level == 0.0 or slope == 0.0:
-        return None
-    compliance = static_compliance(model.values)
-    size = compliance * model.values["h_ref"]
-    noise = max(_LOOP_FLOOR * level, *(high_frequency_noise(loop.x) for loop in loops))
-    doubt = np.array([noise if loop.rests else size for loop in loops])
-
-    def parts(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return _eliminated(loops, theta[0] * slope, theta[1], theta[2:] * doubt, size)
-
-    def weighted(theta: FloatArray) -> FloatArray:
-        return np.concatenate([parts(theta)[1] / noise, theta[2:]])
-
-    low = np.array([_K[0], _N[0], *[-_DOUBT] * len(loops)])
-    high = np.array([_K[1], _N[1], *[_DOUBT] * len(loops)])
-    none = [0.0] * len(loops)
-    found = [
-        scipy.optimize.least_squares(weighted, [*start, *none], bounds=(low, high), max_nfev=30)
-        for start in _STARTS
-    ]
-    best = min(found, key=lambda f: float(f.cost)).x
-    s, beta, gamma, delta = parts(best)[0]
-    k = best[0] * slope
-    values = {"k_L": k, "A": s - k, "beta": beta, "gamma": gamma, "delta": delta}
-    forces = {n: float(v) / compliance for n, v in values.items()} | {"n": float(best[1])}
-    return {n: float(np.clip(v, *model.parameter(n).bounds)) for n, v in forces.items()}
-
-
-def _eliminated(
-    loops: Sequence[_Loop], k: float, n: float, starts: FloatArray, size: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return s, beta, gamma, delta [m/V, m/(V.s)] and the residual [m] of all loops, stacked."""
-    blocks, targets = [], []
-    for loop, start in zip(loops, starts, strict=True):
-        ratio = (start + loop.x - k * loop.u) / size
-        middle = 0.5 * (ratio[1:] + ratio[:-1])
-        bend = np.abs(middle) ** n
-        turning = np.sign(middle) * bend * np.abs(loop.steps)
-        columns = [loop.u, -_integral(turning), -_integral(bend * loop.steps), _integral(loop.skew)]
-        blocks.append(np.column_stack([c - np.mean(c) for c in columns]))
-        targets.append(loop.x - np.mean(loop.x))
-    matrix, target = np.vstack(blocks), np.concatenate(targets)
-    scale = np.linalg.norm(matrix, axis=0)
-    scale[scale == 0.0] = 1.0
-    weights = np.linalg.lstsq(matrix / scale, target, rcond=1e-6)[0] / scale
-    return weights, target - matrix @ weights
-
-
-def _integral(steps: FloatArray) -> FloatArray:
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _slowest(records: Sequence[Record]) -> list[Record]:
-    """Return the records whose voltage turns, the slowest and those that are not much faster."""
-    turning = [r for r in records if r.mask.sum() > 20 and turns(r.voltage)]
-    turning.sort(key=_rate)
-    return [r for r in turning if _rate(r) <= _FASTER * _rate(turning[0])][:_LOOPS]
-
-
-def _rate(record: Record) -> float:
-    """Mean speed of the voltage [1/s], over its range."""
-    travelled = float(np.sum(np.abs(np.diff(record.voltage))))
-    return travelled / float(np.ptp(record.voltage)) / record.duration
-
-
-def _loop(record: Record) -> _Loop:
-    """Return a record, averaged in blocks where it has many samples; at rest if it begins so."""
-    valid = record.mask
-    y = np.interp(record.time, record.time[valid], measured(record)[valid])
-    every = -(-record.n // _SAMPLES)
-    blocks = record.n // every
-    t, u, x = (
-        np.mean(values[: blocks * every].reshape(blocks, every), axis=1)
-        for values in (record.time, record.voltage, y)
-    )
-    steps = np.diff(u)
-    moving = np.abs(steps) > _HELD * float(np.mean(np.abs(steps)))
-    skew = 0.5 * (u[1:] + u[:-1]) * np.sign(steps) * moving * np.diff(t)
-    rests = abs(float(u[0])) < 1e-2 * float(np.ptp(u))
-    return _Loop(x - x[0], u - u[0], steps, skew, rests)
-
-
 #: Candidate dynamics that miss the fast records this much more than the best are not tried.
 _WORSE, _DYNAMICS = 1.2, 3
 #: An oscillator shows where sqrt(m/k) is at least this share of the sampling interval.
@@ -368,34 +626,24 @@ _MASSES = ("m_P", "m_B")
 def starting_points(
     model: Model, linear: Sequence[LinearCandidate], records: Sequence[Record]
 ) -> list[tuple[str, dict[str, float]]]:
-    """Return the starts by name; static gain and loop keep their size where k_P moves.
+    """Return the starts by name: shapes that loops usually have, then dynamics that records show.
 
-    The loop that the records show comes first, then shapes that loops usually have: fewer of them
-    where the records show a loop, and where they show dynamics to try.
+    The model's own loop where its hysteresis is none of Bouc-Wen's. Static gain and loop keep their
+    size where k_P moves.
     """
-    shapes = _shapes(model, records, fewer=bool(linear))
+    shapes = [("the model's own loop", {})] if not has_loop(model) else loop_starts(model)
     if not linear:
         return shapes
-    found = _dynamics(model, linear, min(r.sample_time for r in records))
-    dynamics = [_within_bounds(model, values) for values in found]
+    bounds = {p.name: p.bounds for p in model.structure.parameters}
+    dynamics = [
+        {n: float(np.clip(v, *bounds[n])) for n, v in values.items()}
+        for values in _dynamics(model, linear, min(r.sample_time for r in records))
+    ]
     named = [(name, _moved(model, shape, dynamics[0])) for name, shape in shapes]
     return named + [
         (f"dynamics {k}", _moved(model, shapes[0][1], other))
         for k, other in enumerate(dynamics[1:], 2)
     ]
-
-
-def _shapes(
-    model: Model, records: Sequence[Record], *, fewer: bool
-) -> list[tuple[str, dict[str, float]]]:
-    """Return shapes of loop; the model's own where its hysteresis is none of Bouc-Wen's."""
-    if not has_loop(model):
-        return [("the model's own loop", {})]
-    shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
-    shown = loop_start(model, records)
-    return (
-        shapes if shown is None else [("the records' loops", shown), *shapes[: 1 if fewer else 2]]
-    )
 
 
 def resolved(
@@ -433,12 +681,6 @@ def _dynamics(
         slow_first.append(pair[0])
         turned.append(pair[1])
     return [*slow_first[:_DYNAMICS], turned[0]]
-
-
-def _within_bounds(model: Model, values: Mapping[str, float]) -> dict[str, float]:
-    """Return values within the bounds of the model's parameters: slow records have slow lags."""
-    bounds = {p.name: p.bounds for p in model.structure.parameters}
-    return {n: float(np.clip(v, *bounds[n])) for n, v in values.items()}
 
 
 def _creep_slowest(model: Model, values: Mapping[str, float]) -> dict[str, float]:

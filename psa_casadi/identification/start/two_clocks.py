@@ -24,9 +24,8 @@ from math import ceil, floor
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.identification.start.linear_response import orthonormal, plays
+from psa_casadi.identification.start.linear_response import first_order, orthonormal, plays
 from psa_casadi.notes import Note, note
-from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 
@@ -34,7 +33,7 @@ from psa_casadi.units import FloatArray
 FEWEST, MOST = 2.0, 24.0
 _PHASES, _FINER = 32, 8
 #: Steps on either side in which a best one is refined, and the share of its grid's step each time.
-_REFINED, _ROUNDS_beats = 8, (1.0, 0.125)
+_REFINED, _NEARER = 8, (1.0, 0.125)
 #: What a saw tooth must remove of the squares over the scatter that is left, and how much more
 #: than the first harmonics of its period do, this many of them, which are free in six weights.
 _CLEAR, _SHARPER, _HARMONICS = 150.0, 15.0, 3
@@ -79,7 +78,7 @@ class Delays:
     def refined(self, beat: Beat) -> Beat:
         """Return the best saw tooth next to one."""
         steps = np.arange(-_REFINED, _REFINED + 1) / _REFINED
-        for part in _ROUNDS_beats:
+        for part in _NEARER:
             beat = self._scanned(
                 beat.beats + part * steps / _FINER, beat.phase + part * steps / _PHASES
             )
@@ -92,21 +91,36 @@ class Delays:
 
         * what it removes: `_CLEAR` times the scatter that is left, which no noise reaches;
         * its jumps: three free harmonics of its period leave more than it does;
-        * both halves of the record, and every jump that has room on both sides, two at least.
+        * both halves of the record, and every jump that has room on both sides, two at least: there
+          a straight line goes on behind the jump, which is counted positive downwards.
         """
-        saw, dof = beat.saw(self.along), self.along.size - 5
-        left = self._left(saw[:, None])
-        scatter = left / max(dof, 1)
-        removed = (self._left() - left) / scatter
-        turns = 2.0 * np.pi * beat.beats * np.outer(self.along, np.arange(1, _HARMONICS + 1))
-        smooth = self._left(np.hstack([np.cos(turns), np.sin(turns)]))
-        if removed < _CLEAR or (smooth - left) / scatter < _SHARPER:
+        along, one = self.along, np.ones(self.along.size)
+        line, saw = np.column_stack([one, along]), beat.saw(along)
+        _, _, left = self._fitted(np.column_stack([saw, line]))
+        scatter = left / max(along.size - 5, 1)
+        turns = 2.0 * np.pi * beat.beats * np.outer(along, np.arange(1, _HARMONICS + 1))
+        _, _, smooth = self._fitted(np.hstack([np.cos(turns), np.sin(turns), line]))
+        removed = self._fitted(line)[2] - left
+        if removed < _CLEAR * scatter or smooth - left < _SHARPER * scatter:
             return False
-        halves = [self._height(saw, half) for half in (self.along < 0.5, self.along >= 0.5)]
-        jumps = [j for at in self._jumps(beat) if (j := self._jump(at, beat.beats, scatter))]
-        alike = [abs(h / beat.height - 1.0) < _ALIKE and abs(z) > _HALF for h, z in halves]
-        alike += [abs(h / beat.height - 1.0) < _ALIKE and abs(z) > _JUMP for h, z in jumps]
-        return len(jumps) >= _JUMPS and all(alike)
+        alike = []
+        for half in (along < 0.5, along >= 0.5):
+            height, variance, left = self._fitted(np.column_stack([saw, one]), half)
+            deviation = (left / max(half.sum() - 2, 1) * variance) ** 0.5
+            alike.append(self._alike(height, deviation, beat, _HALF))
+        ends = np.arange(ceil(beat.phase), floor(beat.phase + beat.beats) + 1)
+        jumps = 0
+        for at in (ends - beat.phase) / beat.beats:
+            near = np.abs(along - at) * beat.beats < 0.5
+            room = 0.25 / beat.beats < at < 1.0 - 0.25 / beat.beats
+            if not room or near.sum() < _BESIDE:
+                continue
+            columns = np.column_stack([along < at, one, along - at])
+            height, variance, left = self._fitted(columns, near)
+            deviation = (max(scatter, left / (near.sum() - 3)) * variance) ** 0.5
+            alike.append(self._alike(height, deviation, beat, _JUMP))
+            jumps += 1
+        return jumps >= _JUMPS and all(alike)
 
     def _scanned(self, beats: FloatArray, phases: FloatArray) -> Beat:
         root, along = np.sqrt(self.weight), self.along
@@ -125,11 +139,6 @@ class Delays:
                 best = removed, Beat(rate, float(phases[k]) % 1.0, float(told[k] / power[k]))
         return best[1]
 
-    def _left(self, columns: FloatArray | None = None) -> float:
-        """Return the weighted squares that a straight line and columns (k, j) leave."""
-        line = np.column_stack([np.ones(self.along.size), self.along])
-        return self._fitted(line if columns is None else np.hstack([columns, line]))[2]
-
     def _fitted(
         self, columns: FloatArray, part: slice | npt.NDArray[np.bool_] = slice(None)
     ) -> tuple[float, float, float]:
@@ -141,33 +150,10 @@ class Delays:
         left = wanted - q @ (q.T @ wanted)
         return float(inverse[0] @ q.T @ wanted), float(inverse[0] @ inverse[0]), float(left @ left)
 
-    def _height(self, saw: FloatArray, half: npt.NDArray[np.bool_]) -> tuple[float, float]:
-        """Return the height in a half of the record, and over its standard deviation."""
-        constant = np.ones(saw.size)
-        height, variance, left = self._fitted(np.column_stack([saw, constant]), half)
-        return height, height / max((left / max(half.sum() - 2, 1) * variance) ** 0.5, 1e-300)
-
     @staticmethod
-    def _jumps(beat: Beat) -> FloatArray:
-        """Return the jumps with a quarter of a beat on both sides within the record, (j,)."""
-        turns = np.arange(ceil(beat.phase), floor(beat.phase + beat.beats) + 1, dtype=np.float64)
-        at: FloatArray = (turns - beat.phase) / beat.beats
-        found: FloatArray = at[(at > 0.25 / beat.beats) & (at < 1.0 - 0.25 / beat.beats)]
-        return found
-
-    def _jump(self, at: float, beats: float, scatter: float) -> tuple[float, float] | None:
-        """Return what the delay jumps by there, down counted positive, and over its deviation.
-
-        A straight line before it and the same slope behind it; None where too little is seen.
-        """
-        near = np.abs(self.along - at) * beats < 0.5
-        if near.sum() < _BESIDE:
-            return None
-        before = self.along < at
-        columns = np.column_stack([before, np.ones(before.size), self.along - at])
-        height, variance, left = self._fitted(columns.astype(np.float64), near)
-        deviation = (max(scatter, left / (near.sum() - 3)) * variance) ** 0.5
-        return height, height / max(deviation, 1e-300)
+    def _alike(height: float, deviation: float, beat: Beat, least: float) -> bool:
+        near = abs(height / beat.height - 1.0) < _ALIKE
+        return near and abs(height) > least * max(deviation, 1e-300)
 
 
 #: Intervals whose delays are compared, readings that each has at least, the most of a record.
@@ -245,110 +231,71 @@ def two_clocks(record: Record) -> TwoClocks | None:
     one sampling interval. Records with uneven time steps, or with a beat that holds fewer than
     eight reversals of the voltage, are not judged.
     """
-    y, most = record.displacement, _most_beats(record)
-    if y is None or most < FEWEST:
+    y, valid = record.displacement, record.mask
+    most = np.count_nonzero(np.diff(np.sign(np.diff(record.voltage)[np.diff(record.voltage) != 0])))
+    judged = (
+        _INTERVALS * _EACH <= np.count_nonzero(valid) <= record.n <= _LONGEST
+        and np.ptp(np.diff(record.time)) <= _EVEN * record.sample_time
+    )
+    if y is None or not judged or most / _REVERSALS < FEWEST:
         return None
     along = (record.time - record.time[0]) / record.duration
-    smooth, valid = _Smooth.of(record), record.mask
-    rate, left = smooth.rate_and_left(y)
-    intervals = _Samples(along, rate, left, valid).intervals()
-    beat = intervals.best(most) if intervals else None
+    columns = np.column_stack(_functions(record))
+    basis, transform = orthonormal(columns[valid])
+    functions = columns @ transform
+
+    def rate_and_left(readings: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the rate [m/s] of a smooth fit to readings (n,) [m], and what it leaves [m]."""
+        smooth = functions @ (basis.T @ readings[valid])
+        rate = np.gradient(smooth, record.time).astype(np.float64)
+        return rate, np.where(valid, readings - smooth, 0.0)
+
+    rate, left = rate_and_left(y)
+    intervals, _ = _delays(along, rate, left, valid)
+    beat = intervals.best(most / _REVERSALS) if intervals else None
     if intervals is None or beat is None or not intervals.shows(beat):
         return None
     for _ in range(_ROUNDS):
         moved = -beat.height * (beat.saw(along) - 0.5) * rate
-        rate, left = smooth.rate_and_left(y - moved)
-        samples = _Samples(along, rate, np.where(valid, left + moved, 0.0), valid)
-        beat = samples.delays().refined(beat)
-    intervals = samples.intervals()
+        rate, left = rate_and_left(y - moved)
+        intervals, single = _delays(along, rate, np.where(valid, left + moved, 0.0), valid)
+        beat = single.refined(beat)
     if intervals is None or not intervals.shows(beat) or abs(beat.height) > record.sample_time:
         return None
     moved = np.where(valid, -beat.height * (beat.saw(along) - 0.5) * rate, np.nan)
     return TwoClocks(record.duration / beat.beats, abs(beat.height), beat.height < 0.0, moved)
 
 
-def _most_beats(record: Record) -> float:
-    """Return how many beats a record could show at most, 0 where it is not to be judged."""
-    readings, step = np.count_nonzero(record.mask), np.diff(record.time)
-    if not _INTERVALS * _EACH <= readings <= record.n <= _LONGEST:
-        return 0.0
-    if np.ptp(step) > _EVEN * record.sample_time:
-        return 0.0
-    turns = np.diff(record.voltage)
-    return float(np.count_nonzero(np.diff(np.sign(turns[turns != 0.0])))) / _REVERSALS
+def _delays(
+    along: FloatArray, rate: FloatArray, left: FloatArray, valid: npt.NDArray[np.bool_]
+) -> tuple[Delays | None, Delays]:
+    """Return the delays of intervals, and those of single readings, weighted as their intervals.
 
-
-@dataclass(frozen=True, eq=False)
-class _Smooth:
-    """Orthonormal functions of a record's voltage and time, at its readings and at all instants."""
-
-    time: FloatArray
-    valid: npt.NDArray[np.bool_]
-    functions: FloatArray
-    at_readings: FloatArray
-
-    @classmethod
-    def of(cls, record: Record) -> "_Smooth":
-        """Return the functions of a record."""
-        columns, valid = np.column_stack(_functions(record)), record.mask
-        basis, transform = orthonormal(columns[valid])
-        return cls(record.time, valid, columns @ transform, basis)
-
-    def rate_and_left(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the rate [m/s] of the best fit to readings (n,) [m], and what it leaves [m].
-
-        Where there is no reading that is 0.
-        """
-        fitted = self.functions @ (self.at_readings.T @ y[self.valid])
-        rate: FloatArray = np.gradient(fitted, self.time).astype(np.float64)
-        return rate, np.where(self.valid, y - fitted, 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """Times along a record, 0 to 1, rates [m/s], what a smooth fit leaves [m], and where it is."""
-
-    along: FloatArray
-    rate: FloatArray
-    left: FloatArray
-    valid: npt.NDArray[np.bool_]
-
-    @property
-    def place(self) -> npt.NDArray[np.int64]:
-        """Interval of each sample."""
-        return np.minimum((_INTERVALS * self.along).astype(np.int64), _INTERVALS - 1)
-
-    def intervals(self) -> Delays | None:
-        """Return the delays of intervals, None where the stack hardly ever moves."""
-        found, weight = self._of_intervals()
-        on = weight > 1e-3 * np.mean(weight)
-        if np.count_nonzero(on) < _INTERVALS // 2:
-            return None
-        middle = (np.arange(_INTERVALS) + 0.5) / _INTERVALS
-        return Delays(middle[on], found[on], weight[on])
-
-    def delays(self) -> Delays:
-        """Return the delays of single readings, weighted as their intervals are."""
-        power, weight = self._sums(self.rate**2 * self.valid), self._of_intervals()[1]
-        scale = (weight / np.maximum(power, 1e-300))[self.place]
-        on = self.valid & (self.rate != 0.0) & (scale > 0.0)
-        rate = self.rate[on]
-        return Delays(self.along[on], -self.left[on] / rate, rate**2 * scale[on])
-
-    def _of_intervals(self) -> tuple[FloatArray, FloatArray]:
-        """Return the delay of each interval, and its weight by what scatters in it."""
-        power, count = self._sums(self.rate**2 * self.valid), self._sums(self.valid.astype(float))
-        delay = self._sums(-self.left * self.rate) / np.maximum(power, 1e-300)
-        scattered = (self.left + delay[self.place] * self.rate) ** 2 * self.valid
-        variance = self._sums(scattered) / np.maximum(count - 1.0, 1.0)
-        known = (count > 1.0) & (power > 0.0)
-        usual = float(np.median(variance[known])) if known.any() else 0.0
-        weight = np.where(known, power / np.maximum(variance, max(usual, 1e-300)), 0.0)
-        most = _HEAVIEST * float(np.median(weight[known])) if known.any() else 0.0
-        return delay, np.minimum(weight, most)
-
-    def _sums(self, values: FloatArray) -> FloatArray:
-        return np.bincount(self.place, values, _INTERVALS).astype(np.float64)
+    From rates (n,) [m/s] and what a smooth fit leaves (n,) [m]. An interval counts by what scatters
+    in it; None where the stack hardly ever moves.
+    """
+    place = np.minimum((_INTERVALS * along).astype(np.int64), _INTERVALS - 1)
+    power, count, pull = (
+        np.bincount(place, values, _INTERVALS).astype(np.float64)
+        for values in (rate**2 * valid, valid.astype(float), -left * rate)
+    )
+    delay = pull / np.maximum(power, 1e-300)
+    scattered = (left + delay[place] * rate) ** 2 * valid
+    variance = np.bincount(place, scattered, _INTERVALS) / np.maximum(count - 1.0, 1.0)
+    known = (count > 1.0) & (power > 0.0)
+    usual = float(np.median(variance[known])) if known.any() else 0.0
+    weight = np.where(known, power / np.maximum(variance, max(usual, 1e-300)), 0.0)
+    most = _HEAVIEST * float(np.median(weight[known])) if known.any() else 0.0
+    weight = np.minimum(weight, most)
+    on = weight > 1e-3 * np.mean(weight)
+    middle = (np.arange(_INTERVALS) + 0.5) / _INTERVALS
+    scale = (weight / np.maximum(power, 1e-300))[place]
+    moving = valid & (rate != 0.0) & (scale > 0.0)
+    single = -left[moving] / rate[moving], (rate**2 * scale)[moving]
+    return (
+        Delays(middle[on], delay[on], weight[on]) if 2 * on.sum() >= _INTERVALS else None,
+        Delays(along[moving], *single),
+    )
 
 
 def _functions(record: Record) -> list[FloatArray]:
@@ -366,13 +313,6 @@ def _functions(record: Record) -> list[FloatArray]:
         *(v**k for k in range(1, 6)),
         *(rate, rate * v, rate * along),
         *(play**k for k in range(1, _POWERS + 1)),
-        *(_behind(tau / h, v) for tau in taus),
+        *(first_order(tau, v - v[0], h) for tau in taus),
         *(np.exp(-(along + 1.0) * record.duration / (2.0 * tau)) for tau in taus[4:]),
     ]
-
-
-def _behind(steps: float, x: FloatArray) -> FloatArray:
-    """Return x (n,) behind a lag of so many samples, from 0; x is linear between them."""
-    a = float(np.exp(-1.0 / steps))
-    b = (1.0 - a) * steps
-    return filtered([1.0 - b, b - a], [1.0, -a], x - x[0])

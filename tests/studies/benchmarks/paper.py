@@ -17,11 +17,11 @@ from psa_casadi import reference
 from psa_casadi.components import BASE
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.paper.hysteresis import hysteresis_part
-from psa_casadi.identification.paper.linear import (
+from psa_casadi.identification.paper import (
     COEFFICIENTS,
     find_loops,
     find_steps,
+    hysteresis_part,
     moment_coefficients,
 )
 from psa_casadi.identification.refitting import noise_levels

@@ -1,1 +1,0 @@
-"""The paper's own identification, section 3: moments of a step, zero crossings of loops."""
