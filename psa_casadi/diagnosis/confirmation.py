@@ -140,11 +140,9 @@ def _within(
     kurtosis = max(3.0, float(np.mean(learnt**2)) / power**2)
     spread = np.sqrt((kurtosis - 1.0) * (1.0 / m + 1.0 / n))
     chance = float(scipy.special.ndtr(-(ratio * (n - k) / (n + k) - 1.0) / spread))
-    return Excess(float(np.sqrt(ratio)), chance) if _tells(ratio, chance) else Excess()
-
-
-def _tells(ratio: float, chance: float) -> bool:
-    return chance < thresholds().unseen_alarm and ratio > thresholds().unseen_ratio ** 2
+    limits = thresholds()
+    tells = chance < limits.unseen_alarm and ratio > limits.unseen_ratio**2
+    return Excess(float(np.sqrt(ratio)), chance) if tells else Excess()
 
 
 #: Shares of the samples, and of the voltage's span, that are worth a word.

@@ -57,32 +57,6 @@ class Weighed:
         return None
 
 
-def verdict_of(
-    steps: Sequence[Step],
-    *,
-    missing: bool,
-    withdrawn: bool,
-    share: float,
-    unseen: bool = False,
-    unnamed: Collection[str] = (),
-) -> Verdict:
-    """Return the verdict on what a search found; the last step is the model with all causes.
-
-    `missing` says that the base leaves something, `withdrawn` that an unnamed correction takes the
-    names away or held-out samples do not confirm them, `share` of the held-out excess the causes
-    remove; `unseen` that held-out samples leave more than the fitted ones let expect; `unnamed` are
-    causes that stay in the model without a name.
-    """
-    named = [s for s in steps if s.chosen is not None and s.cause.name not in unnamed]
-    alarm = bool(steps) and steps[-1].test.alarm
-    return verdict_by(
-        missing=missing,
-        withdrawn=withdrawn or not named or (alarm and share < thresholds().enough),
-        ambiguous=bool(named and told_from(named[0])),
-        more=alarm or unseen or bool(unnamed),
-    )
-
-
 def verdict_by(*, missing: bool, withdrawn: bool, ambiguous: bool, more: bool) -> Verdict:
     """Return the verdict: is something `missing`, do no names stand, are there rivals, more left?
 

@@ -64,7 +64,7 @@ def noise_floor(
     (n,), nan where nothing counts, shows the noise, white or of first order (`first_order_noise`).
     No level is below quantum/sqrt(12), the rms of rounding to a quantum.
     """
-    return tuple(_floor(r, e) for r, e in zip(records, residuals, strict=True))
+    return tuple(_floor(r, e[np.isfinite(e)]) for r, e in zip(records, residuals, strict=True))
 
 
 def pooled_level(
@@ -123,8 +123,7 @@ def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 
-def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
-    valid = residual[np.isfinite(residual)]
+def _floor(record: Record, valid: FloatArray) -> NoiseFloor:
     quantum, _, _ = _resolution(record)
     source, found, how = _source(record)
     if found is not None and found.level > rms(valid):
@@ -201,12 +200,8 @@ def without_stuck_readings(
         residual = np.abs(y - predicted)
         again = np.r_[False, np.diff(y) == 0.0]
         noise = 1.4826 * float(np.nanmedian(residual))
-        far = residual > _FAR * noise
-        bad = again & far if np.mean(again) < _RARE else np.zeros_like(again)
+        bad = again & (residual > _FAR * noise) & (np.mean(again) < _RARE)
         count += int(np.count_nonzero(bad))
-        given = e.record.displacement
-        record = e.record
-        if given is not None and bad.any():
-            record = replace(record, displacement=np.where(bad, np.nan, given))
+        record = replace(e.record, displacement=np.where(bad, np.nan, y)) if bad.any() else e.record
         kept.append(replace(e, record=record, used=e.used & ~bad, held_out=e.held_out & ~bad))
     return tuple(kept), count

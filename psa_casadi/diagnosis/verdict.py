@@ -27,7 +27,7 @@ from psa_casadi.diagnosis.judgement import (
     told_from,
     too_small,
     vague_note,
-    verdict_of,
+    verdict_by,
     withdrawn_names,
 )
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
@@ -75,14 +75,11 @@ def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...
     """Return effects whose smallest gain that shows on these records is more than ordinary."""
     spots = []
     present = {c.name for c in final.fit.model.components}
-    for effect in table:
-        if effect.name in present:
-            continue
+    factor = np.sqrt(final.screening.threshold)
+    for effect in [e for e in table if e.name not in present]:
         scores = [s for s in final.screening.scores if s.direction.effect is effect]
         gain = next(p for p in effect.parameters if p.name == effect.gain)
-        extended = final.fit.model.with_effect(effect, {gain.name: 0.0})
-        practical = gain.typical(extended.values)
-        factor = np.sqrt(final.screening.threshold)
+        practical = gain.typical(final.fit.model.with_effect(effect, {gain.name: 0.0}).values)
         smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
         if smallest > practical:
             why = note(
@@ -158,12 +155,9 @@ def alternatives(
     effects = {e.name: e for e in table}
     found = []
     for step in named:
-        other = [
-            n
-            for n in told_from(step)
-            if n in effects and effects[n].in_plant != step.cause.in_plant
-        ]
-        for name in sorted(other, key=lambda n: -step.probability.get(n, 0.0)):
+        for name in sorted(told_from(step), key=lambda n: -step.probability.get(n, 0.0)):
+            if name not in effects or effects[name].in_plant == step.cause.in_plant:
+                continue
             fitted = _fitted(step, name, experiments)
             if fitted is None:
                 continue
@@ -235,9 +229,11 @@ def conclude(
     noise = noise_floor([e.record for e in experiments], errors)
     floor = pooled_level(noise, errors, colour)
     beyond = held_out_excess(first.fit, experiments, first.predicted, first.screening.colour, noise)
-    unseen = Excess()
-    if last is not first:
-        unseen = held_out_excess(last.fit, experiments, last.predicted, colour, noise)
+    unseen = (
+        Excess()
+        if last is first
+        else held_out_excess(last.fit, experiments, last.predicted, colour, noise)
+    )
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
     balance = Balance(experiments, Scale(first.view.of, colour, thresholds().price), floor)
     weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
@@ -249,18 +245,16 @@ def conclude(
     doubt = unconfirmed(experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden)
     stands = beaten is None and doubt is None
     vague = balance.vague(steps) if stands else {}
-    verdict: Verdict = (
-        "not_driven"
-        if not driven
-        else verdict_of(
-            steps,
+    found = [s for s in steps if s.chosen is not None and s.cause.name not in vague]
+    little = last.test.alarm and weighed.share < thresholds().enough
+    verdict: Verdict = "not_driven"
+    if driven:
+        verdict = verdict_by(
             missing=missing,
-            withdrawn=not stands,
-            share=weighed.share,
-            unseen=bool(unseen),
-            unnamed=vague,
+            withdrawn=not stands or not found or little,
+            ambiguous=bool(found and told_from(found[0])),
+            more=last.test.alarm or bool(unseen) or bool(vague),
         )
-    )
     weak = verdict == "unexplained" and stands and not vague and weighed.adds
     kept = [s for s in steps if s.chosen] if verdict in NAMING or weak else []
     final = last if kept else first
@@ -346,9 +340,7 @@ def patched_model(d: Diagnosis) -> Model:
 
 
 def _misfits(
-    experiments: Sequence[Experiment],
-    errors: Sequence[FloatArray],
-    noise: Sequence[NoiseFloor],
+    experiments: Sequence[Experiment], errors: Sequence[FloatArray], noise: Sequence[NoiseFloor]
 ) -> tuple[Misfit, ...]:
     return tuple(
         misfit(e.record, error, floor)
@@ -380,24 +372,19 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
     """
     base = float(np.mean(first.fit.residuals**2))
     excess = max(base - floor**2, 1e-300)
-    rows = []
-    scores = first.screening.best_by_effect()
-    for name in dict.fromkeys((*scores, *first.fitted)):  # a series of modes was not screened
-        known = first.fitted.get(name)
-        if known is not None:
-            gone = known.removes(first.view.of)
-        else:
-            level = first.screening.colour.level
-            gone = scores[name].decrease * level**2 / len(first.fit.residuals)
-        rows.append(
-            Candidate(
-                effect=name,
-                explained_share=float(np.clip(gone / excess, 0.0, 1.0)),
-                evidence=first.alone[name],
-                fitted=known is not None,
-                probability=first.probability.get(name, 0.0) if named else 0.0,
-            )
+    power = first.screening.colour.level**2 / len(first.fit.residuals)
+    gone = {n: s.decrease * power for n, s in first.screening.best_by_effect().items()}
+    gone |= {n: h.removes(first.view.of) for n, h in first.fitted.items()}
+    rows = [
+        Candidate(
+            effect=name,
+            explained_share=float(np.clip(removed / excess, 0.0, 1.0)),
+            evidence=first.alone[name],
+            fitted=name in first.fitted,
+            probability=first.probability.get(name, 0.0) if named else 0.0,
         )
+        for name, removed in gone.items()
+    ]
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 
 

@@ -39,7 +39,7 @@ from psa_casadi.diagnosis.screening import (
     screen,
     without,
 )
-from psa_casadi.diagnosis.task import State, Task, Tried, thresholds
+from psa_casadi.diagnosis.task import Task, thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import with_column
@@ -79,11 +79,6 @@ class Hypothesis:
         """Names of the first so many causes."""
         return frozenset(c.name for c in self.causes[:count])
 
-    @property
-    def power(self) -> float:
-        """Mean square of the residuals [m^2]."""
-        return self.fit.rms**2
-
     def removes(self, before: "Hypothesis") -> float:
         """Power [m^2] that it takes from the residual of another one.
 
@@ -94,7 +89,7 @@ class Hypothesis:
             len(old.residuals) / count * (old.rms**2 - new.rms**2) * (level / old.level) ** 2
             for old, new in zip(before.fit.further, self.fit.further, strict=True)
         )
-        return before.power - self.power + beside
+        return before.fit.rms**2 - self.fit.rms**2 + beside
 
     def share(self, before: "Hypothesis", root: "Hypothesis") -> float:
         """What it takes from another one's error over whole records, over what that one takes."""
@@ -189,25 +184,6 @@ def scale_of(
     return Scale(base, colour, price, held, any(e.held_out_whole for e in experiments))
 
 
-def tried(of: Hypothesis, state: State, root: Hypothesis, scale: Scale) -> Tried:
-    """Return what is told of a hypothesis while a search goes on."""
-    return Tried(
-        state,
-        tuple(c.name for c in of.causes),
-        evidence=float(scale.evidence(of)),
-        score=float(scale.score(of)),
-        rms_m=float(of.fit.rms),
-        holdout_rms_m=float(of.holdout_rms),
-        base_rms_m=float(root.holdout_rms),
-        noise_rms_m=float(scale.colour.rms),
-    )
-
-
-def ended(of: Hypothesis) -> Hypothesis:
-    """Return a hypothesis whose fit cannot go on."""
-    return replace(of, final=True)
-
-
 #: So many starts each effect gets.
 _STARTS = 2
 
@@ -244,6 +220,11 @@ class View:
         seen = self.decrease >= self.screening.threshold and self.promise > self.test.knowable**2
         return seen and (self.test.alarm or not self.of.causes)
 
+    @property
+    def leaves(self) -> bool:
+        """Whether anything is left to explain."""
+        return self.test.alarm or self.shows
+
     def estimated(self) -> dict[str, float]:
         """Evidence of every further effect over this hypothesis, without a fit."""
         return estimated(self.of.fit, self.screening)
@@ -261,10 +242,19 @@ class View:
         own = [s for s in self.screening.scores if s.direction.effect.name == name]
         near = [s for s in own if s.decrease >= 0.3 * own[0].decrease]
         starts: list[Score] = []
+
+        def form(score: Score) -> dict[str, float]:
+            fitted = score.direction.effect.fitted
+            return {n: v for n, v in score.direction.values.items() if n not in fitted}
+
+        def differing(score: Score) -> int:
+            best = near[0].direction.values
+            return sum(v != best[n] for n, v in score.direction.values.items())
+
         for score in near:
-            if all(_form(score) != _form(s) for s in starts):
+            if all(form(score) != form(s) for s in starts):
                 starts.append(score)
-        for score in sorted(near, key=lambda s: -_differing(s, near[0])):
+        for score in sorted(near, key=lambda s: -differing(s)):
             known = [s.direction.values for s in starts]
             new = score.direction.values not in known or score.direction.finite
             if new and score not in starts and len(starts) < _STARTS:
@@ -281,62 +271,45 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     """
     task.progress("screening effects")
     fit, experiments = of.fit, task.experiments
-    table = [e for e in task.table if e not in fit.model.components]
-    kept = [d for d in known if d.effect in table]
+    effects = [e for e in task.table if e not in fit.model.components]
+    kept: list[Direction] = []
     if known:
-        lines = [e for e in table if e.from_residual]  # this residual's peaks are other ones
-        kept = [d for d in kept if d.effect not in lines] + _directions(fit, task, lines)
-    else:
-        kept = _directions(fit, task, table)
+        lines = [e for e in effects if e.from_residual]  # this residual's peaks are other ones
+        kept = [d for d in known if d.effect in effects and d.effect not in lines]
+        effects = lines
+    finite = "finite steps" not in task.method.without
+    kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
-    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
-    time = np.concatenate([e.record.time[e.used] for e in experiments])
-    test = omnibus(
-        fit.residuals,
-        voltage,
-        time,
-        screening.colour,
-        noise_rms(fit.residuals, screening.colour),
-        knowable=knowable_of(fit, experiments),
-        even=bool(of.causes),
-    )
-    test = _with_further(test, fit, experiments, screening.colour, even=bool(of.causes))
-    return View(of, tuple(kept), screening, test)
+    return View(
+        of, tuple(kept), screening,
+        tested(fit, experiments, screening.colour, even=bool(of.causes)),
+    )  # fmt: skip
 
 
-def _with_further(
-    test: Omnibus, fit: Fit, experiments: Sequence[Experiment], colour: Colour, *, even: bool
-) -> Omnibus:
+def tested(fit: Fit, experiments: Sequence[Experiment], colour: Colour, *, even: bool) -> Omnibus:
     """Return the test of the residual, or that of a further column where only this one alarms."""
-    for f, own in zip(fit.further, colour.further, strict=True):
-        if test.alarm:
-            break
-        parts = [experiments[k] for k in with_column(experiments, f.column)]
+
+    def test_of(
+        residual: FloatArray, parts: Sequence[Experiment], own: Colour, least: float
+    ) -> Omnibus:
         voltage, time = (
             np.concatenate([getattr(e.record, name)[e.used] for e in parts])
             for name in ("voltage", "time")
         )
-        noise = noise_rms(f.residuals, own)
-        found = omnibus(f.residuals, voltage, time, own, noise, knowable=f.straight, even=even)
+        noise = noise_rms(residual, own)
+        return omnibus(residual, voltage, time, own, noise, knowable=least, even=even)
+
+    test = test_of(fit.residuals, experiments, colour, knowable_of(fit, experiments))
+    for f, own in zip(fit.further, colour.further, strict=True):
+        if test.alarm:
+            break
+        parts = [experiments[k] for k in with_column(experiments, f.column)]
+        found = test_of(f.residuals, parts, own, f.straight)
         p = min(1.0, found.p_value * (1 + len(fit.further)))
         if found.alarm and p < thresholds().alarm:
             size = max(test.size, 2.0 * test.knowable)
             test = replace(found, p_value=p, size=size, knowable=test.knowable, output=f.column)
     return test
-
-
-def _form(score: Score) -> dict[str, float]:
-    direction = score.direction
-    return {n: v for n, v in direction.values.items() if n not in direction.effect.fitted}
-
-
-def _differing(score: Score, other: Score) -> int:
-    return sum(v != other.direction.values[n] for n, v in score.direction.values.items())
-
-
-def _directions(fit: Fit, task: Task, effects: Sequence[Component]) -> list[Direction]:
-    finite = "finite steps" not in task.method.without
-    return directions(fit, task.experiments, effects, finite_steps=finite)
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
