@@ -57,16 +57,6 @@ class Weighed:
         return {"": self.together, **self.each}
 
 
-@dataclass(frozen=True)
-class Beaten:
-    """A free function that takes the names away, and the output (or "") where it removes more."""
-
-    by: Free
-    output: str
-    names: float
-    function: float
-
-
 def weighed(
     root: OdeHypothesis, errors: Sequence[float], noise: Sequence[float], together: float
 ) -> Weighed:
@@ -94,8 +84,8 @@ def beaten_by(
     own: Weighed,
     free: Sequence[Free],
     noise: Sequence[float],
-) -> Beaten | None:
-    """Return the free function that takes the names away, if there is one.
+) -> Note | None:
+    """Return which free function takes the names away, None if none does.
 
     It is clearly likelier, removes more of some output by more than a form may cost, and of none so
     much less.
@@ -109,19 +99,10 @@ def beaten_by(
         more = {n: theirs[n] - share for n, share in own.named.items()}
         where = max(more, key=lambda n: more[n])
         if more[where] > form and min(more.values()) >= -form:
-            return Beaten(f, where, own.named[where], theirs[where])
+            names, share = tuple(c.name for c in best.causes), own.named[where]
+            why = note("free_beats", of=f.of, port=f.port.words, share=theirs[where])
+            return note("own_withdrawn", names=names, share=share, output=where, why=why)
     return None
-
-
-def why_not_named(names: tuple[str, ...], own: Weighed, beaten: Beaten | None) -> Note:
-    """Return why causes that were found are not told."""
-    if beaten:
-        f = beaten.by
-        why = note("free_beats", of=f.of, port=f.port.words, share=beaten.function)
-        return note("own_withdrawn", names=names, share=beaten.names, output=beaten.output, why=why)
-    output, share = own.least
-    why = note("own_little", least=thresholds().enough)
-    return note("own_withdrawn", names=names, share=share, output=output, why=why)
 
 
 def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
@@ -175,7 +156,7 @@ def judged(known: Known) -> OdeDiagnosis:
     few = held < FEWEST_SAMPLES
     free = free_functions(known, first) if first.test.alarm or best.causes else ()
     beaten = beaten_by(known, best, own, free, floors) if best.causes else None
-    told = _steps(known, best)
+    told = {c.name: _chances(known, best, c) for c in best.causes}
     left = {h.names: _remaining(known, h) for h in (root, best)}
     more = not left[best.names].white
     verdict = verdict_by(
@@ -187,18 +168,20 @@ def judged(known: Known) -> OdeDiagnosis:
     named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
     notes = [note("own_few_held_out", count=held, least=FEWEST_SAMPLES)] if few else []
     if verdict == "unexplained" and best.causes and not few:
-        notes.append(why_not_named(tuple(c.name for c in best.causes), own, beaten))
+        output, share = own.least
+        why, names = (
+            note("own_little", least=thresholds().enough),
+            tuple(c.name for c in best.causes),
+        )
+        little = note("own_withdrawn", names=names, share=share, output=output, why=why)
+        notes.append(beaten or little)
     if not few:
         notes += left_out(known, best)
     return _diagnosis(known, verdict, named, removed, told, left, notes, free)
 
 
-def _steps(known: Known, best: OdeHypothesis) -> dict[str, dict[str, float]]:
-    """Return for every cause the probabilities of the effects that may be in its place."""
-    return {c.name: _chances(known, best, c) for c in best.causes}
-
-
 def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, float]:
+    """Return the probabilities of the effects that may be in a cause's place."""
     less = known.found.get(best.names - {cause.name}) or without(known, best, cause)
     if less is None:
         return {cause.name: 1.0}
@@ -234,7 +217,12 @@ def _diagnosis(
     model = with_told(named.fit.model, known.runs, certainty(named.fit))
     runs, noise = _noise(known, named)
     partly = known.view(named).test.alarm
-    shares = {c.name: _own_share(known, named, c, removed) for c in named.causes}
+    shares = {}
+    for c in named.causes:
+        less = known.found.get(named.names - {c.name})
+        shares[c.name] = Share(c.name, 0.0, (0.0, 0.0))
+        if less is not None:
+            shares[c.name] = removed.share(c.name, less.predicted, named.predicted)
     least = least_share([s.share for s in shares.values()])
     small = [n for n, s in shares.items() if partly and s.share < least]
     causes = tuple(
@@ -302,13 +290,6 @@ def _correction(known: Known, free: Free) -> FreeFunction | None:
     )  # fmt: skip
 
 
-def _own_share(known: Known, h: OdeHypothesis, cause: Component, removed: Removed) -> Share:
-    less = known.found.get(h.names - {cause.name})
-    if less is None:
-        return Share(cause.name, 0.0, (0.0, 0.0))
-    return removed.share(cause.name, less.predicted, h.predicted)
-
-
 def _candidates(
     known: Known,
     removed: Removed,
@@ -319,19 +300,12 @@ def _candidates(
     root = known.found[frozenset()]
     rows = []
     first = next(iter(told.values()), {}) if named.causes else {}
-    for name, evidence in known.view(root).estimated().items():
-        own = known.found.get(frozenset({name}))
-        rows.append(
-            Candidate(
-                effect=name,
-                explained_share=0.0
-                if own is None
-                else float(np.clip(removed.from_base(own.predicted), 0.0, 1.0)),
-                evidence=evidence if own is None else known.evidence(own),
-                fitted=own is not None,
-                probability=first.get(name, 0.0),
-            )
-        )
+    for name, estimate in known.view(root).estimated().items():
+        own, share, evidence = known.found.get(frozenset({name})), 0.0, estimate
+        if own is not None:
+            share = float(np.clip(removed.from_base(own.predicted), 0.0, 1.0))
+            evidence = known.evidence(own)
+        rows.append(Candidate(name, share, evidence, own is not None, first.get(name, 0.0)))
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 
 
