@@ -91,8 +91,8 @@ def diagnose_ode(
         if not any(n.startswith(name) for n in known_names):
             near = get_close_matches(name, known_names, 3, 0.3) or known_names
             raise InputError(
-                f"`leave_out` has '{name}', which begins the name of no effect; of the {len(known_names)}"
-                f" there are, the nearest are {', '.join(near)}."
+                f"`leave_out` has '{name}', which begins the name of no effect; of the"
+                f" {len(known_names)} there are, the nearest are {', '.join(near)}."
             )
     table = Table(base.model, tuple(e for e in every if not e.name.startswith(gone)))
     known = search(base, runs, table, progress)
