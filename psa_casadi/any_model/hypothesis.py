@@ -22,6 +22,7 @@ from psa_casadi.diagnosis.held_out import output_gain
 from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
 from psa_casadi.diagnosis.search.hypothesis import confirmed
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -250,7 +251,7 @@ def tested(of: OdeHypothesis, runs: Sequence[Run], colour: Colour) -> Omnibus:
             time = np.concatenate([runs[k].time[runs[k].fitted(output.index)] for k in output.runs])
             found = omnibus(
                 output.residuals, along, time, own, noise_rms(output.residuals, own),
-                knowable=output.straight, even=bool(of.causes),
+                knowable=output.straight, even=bool(of.causes), alarms_below=LIMITS.alarm,
             )  # fmt: skip
             rows.append(replace(found, output=output.column if len(of.fit.outputs) > 1 else ""))
     p = min(1.0, len(rows) * min(r.p_value for r in rows))

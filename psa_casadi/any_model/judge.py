@@ -25,7 +25,7 @@ from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Candidate, Remaining, Verdict, estimates
 from psa_casadi.diagnosis.screening import probabilities, temperature
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import PsaError
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import FEWEST_SAMPLES
@@ -49,7 +49,7 @@ class Weighed:
     @property
     def enough(self) -> bool:
         """Whether so much of every output is removed that names may stand where more is left."""
-        return self.least[1] >= thresholds().enough
+        return self.least[1] >= LIMITS.enough
 
     @property
     def named(self) -> dict[str, float]:
@@ -90,10 +90,10 @@ def beaten_by(
     It is clearly likelier, removes more of some output by more than a form may cost, and of none so
     much less.
     """
-    evidence, form = known.evidence(best), thresholds().form
+    evidence, form = known.evidence(best), LIMITS.form
     for f in free:
-        clearly = thresholds().clearly * temperature(max(evidence, f.evidence))
-        if f.evidence - thresholds().price <= known.of_fitted(best) + clearly:
+        clearly = LIMITS.clearly * temperature(max(evidence, f.evidence))
+        if f.evidence - LIMITS.price <= known.of_fitted(best) + clearly:
             continue
         theirs = weighed(known.found[frozenset()], f.errors, noise, f.share).named
         more = {n: theirs[n] - share for n, share in own.named.items()}
@@ -112,7 +112,7 @@ def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
     """
     if not best.causes or not known.view(best).test.alarm:
         return ()
-    clearly = thresholds().clearly * temperature(known.evidence(best))
+    clearly = LIMITS.clearly * temperature(known.evidence(best))
     better = [h for h in known.found.values() if known.score(h) > known.score(best) + clearly]
     better = [h for h in better if known.slight(h) and known.stands(h)]
     top = max(better, key=known.score, default=None)
@@ -120,7 +120,7 @@ def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
         return ()
     names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
     more = known.evidence(top) - known.evidence(best)
-    return (note("slight", names=names, more=more, small=small, least=thresholds().further),)
+    return (note("slight", names=names, more=more, small=small, least=LIMITS.further),)
 
 
 def changes(effect: Component, fit: OdeFit, runs: Sequence[Run]) -> tuple[Size, ...]:
@@ -170,7 +170,7 @@ def judged(known: Known) -> OdeDiagnosis:
     if verdict == "unexplained" and best.causes and not few:
         output, share = own.least
         why, names = (
-            note("own_little", least=thresholds().enough),
+            note("own_little", least=LIMITS.enough),
             tuple(c.name for c in best.causes),
         )
         little = note("own_withdrawn", names=names, share=share, output=output, why=why)
@@ -189,7 +189,7 @@ def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, f
     evidences = dict(view.estimated())
     fitted = {c for h in known.children(less) for c in h.names - less.names}
     top = known.evidence(best) - own
-    near = top - thresholds().clearly * temperature(top)
+    near = top - LIMITS.clearly * temperature(top)
     for name in [n for n, e in evidences.items() if e > near and n not in fitted]:
         known.note(with_cause(known, less, view.starts_of(name)))
     known.finish(
@@ -242,7 +242,7 @@ def _diagnosis(
         if c.name not in small
     )  # fmt: skip
     best_free = max(free, key=lambda f: f.share, default=None)
-    if verdict != "unexplained" or (best_free and best_free.share <= thresholds().form):
+    if verdict != "unexplained" or (best_free and best_free.share <= LIMITS.form):
         best_free = None
     return OdeDiagnosis(
         verdict=verdict,
@@ -321,7 +321,7 @@ def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
     for o, noise in zip(h.fit.outputs, _noise(known, h)[1], strict=True):
         held = any(r.judged(o.index).any() for r in known.runs)
         rms = missed_rms(known.runs, h.predicted, o.index)
-        least = thresholds().unseen_ratio_of_records * float(np.hypot(noise, o.straight))
+        least = LIMITS.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
         if held and rms > least:
             unlike = note("held_out_unlike", output=o.column, ratio=rms / noise)
             return Remaining(False, test.p_value, unlike)

@@ -27,7 +27,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.screening import Score, best_sets, evidence
 from psa_casadi.diagnosis.search.hypothesis import another_minimum, inside_ranges
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import PsaError
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError
@@ -78,7 +78,7 @@ class Known:
 
     def of_fitted(self, h: OdeHypothesis) -> float:
         """Evidence less the price of the causes: the score of the fitted samples alone."""
-        return self.evidence(h) - thresholds().price * len(h.causes)
+        return self.evidence(h) - LIMITS.price * len(h.causes)
 
     def score(self, h: OdeHypothesis) -> float:
         """The score of all samples, with what the fitted ones predict of held-out blocks.
@@ -123,7 +123,7 @@ class Known:
                 sum((t / s) ** 2 for t, s in zip(x.train, levels, strict=True))
                 for x in (self.found[NONE], before, h)
             )
-            if root > old and (old - new) / (root - old) <= thresholds().further:
+            if root > old and (old - new) / (root - old) <= LIMITS.further:
                 names.append(cause.name)
         return tuple(names)
 
@@ -187,7 +187,7 @@ def search(
         known.colour = view.screening.colour
         if len(best.causes) > 1:
             exchange(known, best)
-        if view.shows and len(best.causes) < thresholds().most_causes:
+        if view.shows and len(best.causes) < LIMITS.most_causes:
             add_causes(known, best, view)
     return known
 

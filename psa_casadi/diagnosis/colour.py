@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import filtered, first_order_noise
 from psa_casadi.records.repeats import autoregression_of
@@ -256,7 +255,8 @@ class Omnibus:
 
     `seen` is what that test sees, `output` the one of several whose residual it is. `excess` is the
     share of the residual's power above the noise; `size` [m] the rms of what the test sees,
-    `knowable` [m] that below which nothing can be told of a stack.
+    `knowable` [m] that below which nothing can be told of a stack, `alarms_below` the probability
+    from which on it does not alarm.
     """
 
     p_value: float
@@ -264,12 +264,13 @@ class Omnibus:
     seen: Seen
     size: float
     knowable: float
+    alarms_below: float
     output: str = ""
 
     @property
     def alarm(self) -> bool:
         """Whether something besides noise is in the residual, large enough to be told."""
-        return self.p_value < thresholds().alarm and self.size > self.knowable
+        return self.p_value < self.alarms_below and self.size > self.knowable
 
     @property
     def finding(self) -> Note:
@@ -286,6 +287,7 @@ def omnibus(
     *,
     knowable: float,
     even: bool,
+    alarms_below: float,
 ) -> Omnibus:
     """Test a residual (samples,) [m] for structure that noise of the given colour does not have.
 
@@ -308,7 +310,7 @@ def omnibus(
     size = float(np.sqrt(share * power))
     excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
     p = min(1.0, len(tests) * p)
-    return Omnibus(p, excess, seen, size, knowable)
+    return Omnibus(p, excess, seen, size, knowable, alarms_below)
 
 
 def whiteness(white: FloatArray) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupte
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
-from psa_casadi.diagnosis.task import Method, Task, Tried, shows_ringing, thresholds, using
+from psa_casadi.diagnosis.task import Method, Task, Thresholds, Tried, shows_ringing
 from psa_casadi.diagnosis.verdict import NAMING, conclude
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -78,19 +78,23 @@ class Driven:
 
 
 def driven(
-    base: Fit, model: Model, experiments: Sequence[Experiment], progress: Progress
+    base: Fit,
+    model: Model,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+    limits: Thresholds,
 ) -> Driven:
     """Return whether the `base` fit explains the displacement; else what the other sign explains.
 
     `model` is where the base fit started.
     """
-    if shows_ringing(experiments) and explained(base, experiments) < thresholds().follows:
+    if shows_ringing(experiments) and explained(base, experiments) < limits.follows:
         base = from_resonances(base, experiments, progress) or base
     share = explained(base, experiments)
     records = [e.record for e in experiments]
     doubts = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_quantity)
     notes = tuple(s for doubt in doubts if (s := doubt(records)))
-    if share >= thresholds().follows and correlation(records) > thresholds().falling:
+    if share >= limits.follows and correlation(records) > limits.falling:
         return Driven(follows=True, notes=notes)
     progress("the displacement with flipped sign")
     turned = [
@@ -99,11 +103,11 @@ def driven(
     other, shown = 0.0, max(share, 0.0)
     with suppress(PsaError):
         other = explained(fit_base(model, turned), turned)
-    if other > max(share, thresholds().follows):
+    if other > max(share, limits.follows):
         return Driven(False, (note("flipped", flipped=other, share=shown), *notes))
-    if share < thresholds().follows:
+    if share < limits.follows:
         linear = filtered(experiments)
-        if linear > thresholds().follows:
+        if linear > limits.follows:
             return Driven(False, (note("filtered", linear=linear, share=shown), *notes), True)
         quantity = doubtful_quantity(records)
         said = note("not_driven", share=shown)
@@ -188,7 +192,10 @@ def decisions(
             effects = tuple(e for e in table if e in effects or e.measured_by == LOAD)
         apart = without_column(experiments, column)
         alone = Task(apart, effects, task.method, task.progress, hidden=task.hidden)
-        now, then = _named(steps) if verdict in NAMING else {}, _named(search(alone))
+        now, then = (
+            _named(steps, task.limits) if verdict in NAMING else {},
+            _named(search(alone), task.limits),
+        )
         k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
         gained = further_gains(first.fit, last.fit, colour).get(column, 0.0)
         own = {e.name: e for e in effects}
@@ -210,13 +217,13 @@ def decisions(
     return tuple(found)
 
 
-def _named(steps: Sequence[Step]) -> dict[str, float]:
+def _named(steps: Sequence[Step], limits: Thresholds) -> dict[str, float]:
     """Return the named set of every cause, with the probability of each effect."""
     found: dict[str, float] = {}
     for step in steps:
         if step.chosen is None:
             continue
-        for name in (step.cause.name, *told_from(step)):
+        for name in (step.cause.name, *told_from(step, limits)):
             if step.probability.get(name, 0.0) >= _RIVAL:
                 found.setdefault(name, step.probability[name])
     return found
@@ -292,47 +299,44 @@ def diagnose(
     """
     method = method or Method()
     given, kept = records_given(records), records_given(holdout)
-    with using(method.thresholds):
-        with stage("preparing"):
-            table = list(effects if effects is not None else known_effects().values())
-            (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
-            ordered, apart = in_one_order(whole), in_one_order(held)
-            clean, said, hidden = _cleaned(ordered)
-            said += [*cut, *cut_too]
-            judged = [cleaned(r) for r in apart]
-            if "one clock" not in method.without:
-                clean, judged = _on_one_clock(clean, said), _on_one_clock(judged, said)
-            (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
-            start, scale_given = chosen_start(clean, model, stiffness)
-            (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
-            said += [*means, *means_too, *long, *long_too]
-            experiments = divided(clean, judged)
-            columns = columns_of(start, [e.record for e in experiments])
-            experiments = with_levels(experiments, columns.fitted)
-            forms, best, why = forms_of(columns.model, hysteresis), None, None
-            if forms[1:]:
-                best, why = search_forms(forms, experiments, progress=progress)
-            start = next(m for m in forms if not best or m.components == best.best.model.components)
-            refuse_stuck([e.record for e in experiments])
-            known = {e.name for e in table}
-            searched = (*table, *(c for c in start.effects if c.more_of in known))
-            start = start.without(c.name for c in searched if c.gain is not None)
-            there = {c.name for c in start.components}
-            table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-            said += [*columns.left_out, *([why] if why else [])]
-        so_far: list[Fit] = []
-        task = Task(
-            experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden
-        )
-        try:
-            # from the end: the screening begins at the front
-            with compiled_ahead(start.with_effect(e) for e in reversed(table)):
-                found = _diagnose(start, task, scale_given)
-            return replace(found, remarks=(*found.remarks, *said))
-        except KeyboardInterrupt:
-            if not so_far:
-                raise
-            raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
+    with stage("preparing"):
+        table = list(effects if effects is not None else known_effects().values())
+        (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
+        ordered, apart = in_one_order(whole), in_one_order(held)
+        clean, said, hidden = _cleaned(ordered)
+        said += [*cut, *cut_too]
+        judged = [cleaned(r) for r in apart]
+        if "one clock" not in method.without:
+            clean, judged = _on_one_clock(clean, said), _on_one_clock(judged, said)
+        (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
+        start, scale_given = chosen_start(clean, model, stiffness)
+        (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
+        said += [*means, *means_too, *long, *long_too]
+        experiments = divided(clean, judged)
+        columns = columns_of(start, [e.record for e in experiments])
+        experiments = with_levels(experiments, columns.fitted)
+        forms, best, why = forms_of(columns.model, hysteresis), None, None
+        if forms[1:]:
+            best, why = search_forms(forms, experiments, progress=progress)
+        start = next(m for m in forms if not best or m.components == best.best.model.components)
+        refuse_stuck([e.record for e in experiments])
+        known = {e.name for e in table}
+        searched = (*table, *(c for c in start.effects if c.more_of in known))
+        start = start.without(c.name for c in searched if c.gain is not None)
+        there = {c.name for c in start.components}
+        table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
+        said += [*columns.left_out, *([why] if why else [])]
+    so_far: list[Fit] = []
+    task = Task(experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden)
+    try:
+        # from the end: the screening begins at the front
+        with compiled_ahead(start.with_effect(e) for e in reversed(table)):
+            found = _diagnose(start, task, scale_given)
+        return replace(found, remarks=(*found.remarks, *said))
+    except KeyboardInterrupt:
+        if not so_far:
+            raise
+        raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
@@ -378,11 +382,17 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         refuse_stuck([e.record for e in experiments])
         base, task = _base(start, replace(task, experiments=experiments))
     experiments = task.experiments
-    seen = driven(base, start, experiments, progress)
+    seen = driven(base, start, experiments, progress, task.limits)
     if not seen.follows:
         steps = unsearched(base, task)
         found = conclude(
-            steps, experiments, table, scale_given, driven=seen.filtered, hidden=task.hidden
+            steps,
+            experiments,
+            table,
+            scale_given,
+            task.limits,
+            driven=seen.filtered,
+            hidden=task.hidden,
         )
         return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = steps_of(best_first(base, task), task)
@@ -402,7 +412,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         else:
             between = None
     progress("judging")
-    found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
+    found = conclude(steps, experiments, table, scale_given, task.limits, hidden=task.hidden)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
     more_said = [

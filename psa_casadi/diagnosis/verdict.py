@@ -48,7 +48,7 @@ from psa_casadi.diagnosis.result import (
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
-from psa_casadi.diagnosis.task import same_curves, thresholds
+from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
@@ -61,14 +61,13 @@ from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
 
 
-def shown(steps: Sequence[Step]) -> set[str]:
+def shown(steps: Sequence[Step], limits: Thresholds) -> set[str]:
     """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
 
     Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
     """
-    price = thresholds().price
-    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > price}
-    return fitted.union(*(told_from(s) for s in steps))
+    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
+    return fitted.union(*(told_from(s, limits) for s in steps))
 
 
 def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
@@ -145,6 +144,7 @@ def alternatives(
     final: Fit,
     experiments: Sequence[Experiment],
     table: Sequence[Component],
+    limits: Thresholds,
     *,
     stiffness_given: bool,
 ) -> tuple[Alternative, ...]:
@@ -155,7 +155,7 @@ def alternatives(
     effects = {e.name: e for e in table}
     found = []
     for step in named:
-        for name in sorted(told_from(step), key=lambda n: -step.probability.get(n, 0.0)):
+        for name in sorted(told_from(step, limits), key=lambda n: -step.probability.get(n, 0.0)):
             if name not in effects or effects[name].in_plant == step.cause.in_plant:
                 continue
             fitted = _fitted(step, name, experiments)
@@ -213,6 +213,7 @@ def conclude(
     experiments: Sequence[Experiment],
     table: Sequence[Component],
     stiffness_given: bool,
+    limits: Thresholds,
     *,
     driven: bool = True,
     hidden: float = 0.0,
@@ -228,31 +229,35 @@ def conclude(
     base_errors = whole_residuals(experiments, first.predicted)
     noise = noise_floor([e.record for e in experiments], errors)
     floor = pooled_level(noise, errors, colour)
-    beyond = held_out_excess(first.fit, experiments, first.predicted, first.screening.colour, noise)
+    beyond = held_out_excess(
+        first.fit, experiments, first.predicted, first.screening.colour, noise, limits
+    )
     unseen = (
         Excess()
         if last is first
-        else held_out_excess(last.fit, experiments, last.predicted, colour, noise)
+        else held_out_excess(last.fit, experiments, last.predicted, colour, noise, limits)
     )
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
-    balance = Balance(experiments, Scale(first.view.of, colour, thresholds().price), floor)
+    balance = Balance(experiments, Scale(first.view.of, colour, limits), floor)
     weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
     beaten = weighed.beaten_by()
     gain = gain_of(experiments, first.predicted, last.predicted)
     partly = last.test.alarm and len(steps) > 1
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
     lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
-    doubt = unconfirmed(experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden)
+    doubt = unconfirmed(
+        experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden, limits=limits
+    )
     stands = beaten is None and doubt is None
     vague = balance.vague(steps) if stands else {}
     found = [s for s in steps if s.chosen is not None and s.cause.name not in vague]
-    little = last.test.alarm and weighed.share < thresholds().enough
+    little = last.test.alarm and weighed.share < limits.enough
     verdict: Verdict = "not_driven"
     if driven:
         verdict = verdict_by(
             missing=missing,
             withdrawn=not stands or not found or little,
-            ambiguous=bool(found and told_from(found[0])),
+            ambiguous=bool(found and told_from(found[0], limits)),
             more=last.test.alarm or bool(unseen) or bool(vague),
         )
     weak = verdict == "unexplained" and stands and not vague and weighed.adds
@@ -263,6 +268,7 @@ def conclude(
         experiments,
         final.view.of.holdout_rms,
         colour,
+        limits,
     )
     missed = _misfits(experiments, base_errors, noise)
     spent = budget(
@@ -275,10 +281,14 @@ def conclude(
     )
     model = diagnosed_model(final.fit, experiments, final.predicted, stiffness_given, spent)
     named = kept if verdict in NAMING else []
-    small = too_small([c for c in spent.causes if c.what not in vague]) if partly and named else ()
+    small = (
+        too_small([c for c in spent.causes if c.what not in vague], limits)
+        if partly and named
+        else ()
+    )
     unnamed = {*vague, *(c.what for c in small)}
     causes = tuple(
-        _cause(s, model, spent, experiments) for s in named if s.cause.name not in unnamed
+        _cause(s, model, spent, experiments, limits) for s in named if s.cause.name not in unnamed
     )
     return Diagnosis(
         verdict=verdict,
@@ -288,7 +298,7 @@ def conclude(
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
-        blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
+        blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps, limits)]),
         remaining=_remaining(final, unseen if kept else beyond),
         next_experiment=next_experiment(
             causes,
@@ -303,7 +313,7 @@ def conclude(
             *(
                 withdrawn_names(steps, weighed, beaten, vague, doubt)
                 if verdict == "unexplained"
-                else vague_note(vague)
+                else vague_note(vague, limits)
             ),
             *(note("small", effect=c.what, share=max(c.share, 0.0)) for c in small),
             *coverage_notes(experiments),
@@ -317,11 +327,11 @@ def conclude(
         noise=noise,
         misfit=missed,
         remainder=_misfits(experiments, errors, noise) if kept else missed,
-        contenders=contenders(first, experiments) if verdict == "ambiguous" else (),
+        contenders=contenders(first, experiments, limits) if verdict == "ambiguous" else (),
         budget=spent,
         patch=patch,
         alternatives=alternatives(
-            kept, final.fit, experiments, table, stiffness_given=stiffness_given
+            kept, final.fit, experiments, table, limits, stiffness_given=stiffness_given
         ),
     )
 
@@ -349,7 +359,9 @@ def _misfits(
     )
 
 
-def _cause(s: Step, model: Model, spent: Budget, experiments: Sequence[Experiment]) -> Cause:
+def _cause(
+    s: Step, model: Model, spent: Budget, experiments: Sequence[Experiment], limits: Thresholds
+) -> Cause:
     """State a cause: its probability, the share of the error that it removes, what it changes."""
     records = [e.record for e in experiments]
     own = next((c for c in spent.causes if c.what == s.cause.name), None)
@@ -358,7 +370,7 @@ def _cause(s: Step, model: Model, spent: Budget, experiments: Sequence[Experimen
         belongs_to=s.cause.belongs_to,
         confidence=float(min(0.99, s.probability[s.cause.name])),
         parameters=estimates(s.cause, model),
-        cannot_be_told_from=told_from(s),
+        cannot_be_told_from=told_from(s, limits),
         explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
         remedy=s.cause.what_now.code,
         sizes=sizes(s.cause, model, records, unit=records[0].displacement_unit),

@@ -1,12 +1,12 @@
-"""The parts of the method that its negative controls leave out, and how controls are counted."""
+"""What a step of the method and its constants are good for is counted, and constants decide."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
 
-import pytest
+import numpy as np
 
-from psa_casadi.diagnosis.task import STEPS, Method, Thresholds, thresholds, using
-from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
+import psa_casadi as psa
+from psa_casadi.diagnosis.task import LIMITS, STEPS, Method, Thresholds
 from tests.studies.benchmarks.ablation import (
     ablation_table,
     moved_constants,
@@ -57,16 +57,29 @@ def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
     assert rows["without finite steps"] == wrong
 
 
-def test_every_constant_is_moved_and_a_diagnosis_uses_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_every_constant_is_moved() -> None:
     moved = moved_constants()
     assert {name.split(" = ")[0] for name in moved} == {f.name for f in fields(Thresholds)}
     assert len(fields(Thresholds)) <= 25
     assert moved["price = 16"].thresholds.price == 16.0
-    assert thresholds() == Thresholds()
-    for threads in ("1", "2"):
-        monkeypatch.setenv(VARIABLE, threads)
-        with using(Thresholds(price=3.0)):
-            assert side_by_side(lambda _: thresholds().price, range(4)) == [3.0] * 4
-    assert thresholds().price == 8.0
+
+
+def test_a_diagnosis_decides_by_the_constants_that_it_is_given() -> None:
+    """With those of every other diagnosis gone: whatever would use them fails."""
+    time = np.linspace(0.0, 2.0, 600)
+    voltage = 40.0 * (1.0 - np.cos(4 * np.pi * time))
+    clean = psa.simulate(psa.stack_model("P-885.51"), time, voltage).displacement
+    noise = 2e-3 * np.ptp(clean) * np.random.default_rng(4).standard_normal(time.size)
+    drift = 0.05 * np.ptp(clean) * time / time[-1]
+    record = psa.Record(name="r", time=time, voltage=voltage, displacement=clean + drift + noise)
+    effects = [psa.EFFECTS[n] for n in ("offset_drift", "sensor_nonlinearity", "load_stiffness")]
+    own, kept = Method(thresholds=Thresholds()), vars(LIMITS).copy()
+    try:
+        vars(LIMITS).clear()
+        vars(LIMITS).update(dict.fromkeys(kept))
+        found = psa.diagnose([record], effects=effects, method=own)
+    finally:
+        vars(LIMITS).update(kept)
+    assert [c.effect for c in found.causes] == ["offset_drift"]
+    strict = Method(thresholds=replace(own.thresholds, price=1e6))
+    assert not psa.diagnose([record], effects=effects, method=strict).causes

@@ -35,7 +35,7 @@ from psa_casadi.diagnosis.search.moves import (
     one_mode,
     with_modes,
 )
-from psa_casadi.diagnosis.task import Task, thresholds
+from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -115,7 +115,7 @@ class _Search:
         if "rejected" in self.task.method.without:
             return None
         for h in self.known.rejected():
-            if len(h.causes) < thresholds().most_causes and self.unseen(h):
+            if len(h.causes) < self.task.limits.most_causes and self.unseen(h):
                 self.known.finish([] if h.final else [h])
                 return self.known.found.get(h.names)
         return None
@@ -139,7 +139,7 @@ class _Search:
     def unseen(self, h: Hypothesis) -> bool:
         """Whether a hypothesis was not visited yet, or has become much better since."""
         last = self.expanded.get(h.names)
-        if last is None or h.fit.rms < thresholds().better * last.fit.rms:
+        if last is None or h.fit.rms < self.task.limits.better * last.fit.rms:
             return True
         return h is self.known.best() and self.known.gained(last, h)
 
@@ -171,7 +171,7 @@ class _Search:
         seen, self.expanded[h.names] = self.expanded.get(h.names), h
         if (seen is not None and self.closed(seen, h)) or self.several_modes(h, view):
             return
-        if view.shows and len(h.causes) < thresholds().most_causes:
+        if view.shows and len(h.causes) < self.task.limits.most_causes:
             if h.causes and not series:
                 self.several_at_once(h)
             self.add_causes(h, view)
@@ -306,7 +306,7 @@ class _Search:
         rung = ringing(h.fit, experiments)
         if rung is None or rung.decrease < SEEN:
             return False
-        if view.shows and rung.decrease < thresholds().ringing * view.decrease:
+        if view.shows and rung.decrease < self.task.limits.ringing * view.decrease:
             return False
         found = from_band(h.fit, experiments, task.progress)
         own = hypothesis(h.causes, found, experiments, final=True)

@@ -39,7 +39,7 @@ from psa_casadi.diagnosis.screening import (
     screen,
     without,
 )
-from psa_casadi.diagnosis.task import Task, thresholds
+from psa_casadi.diagnosis.task import LIMITS, Task, Thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import with_column
@@ -130,14 +130,14 @@ def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """What hypotheses are compared by: the plain base, the colour of the noise, the price.
+    """What hypotheses are compared by: the plain base, the colour of the noise, the limits.
 
     `held` is the number of held-out samples; they choose between hypotheses, or `judge_only`.
     """
 
     base: Hypothesis
     colour: Colour
-    price: float
+    limits: Thresholds
     held: int = 0
     judge_only: bool = False
     _known: dict[Fit, float] = field(init=False, default_factory=dict)
@@ -146,7 +146,7 @@ class Scale:
         """Ln B, of the fitted samples alone; more modes than one have their price here."""
         if of.fit not in self._known:
             self._known[of.fit] = evidence(self.base.fit, of.fit, self.colour)
-        return self._known[of.fit] - self.price * sum(c.count - 1 for c in of.causes)
+        return self._known[of.fit] - self.limits.price * sum(c.count - 1 for c in of.causes)
 
     def held_out(self, of: Hypothesis, before: Hypothesis) -> float:
         """Ln of what one hypothesis gives the held-out samples over what another one does."""
@@ -169,19 +169,19 @@ class Scale:
 
     def score(self, of: Hypothesis) -> float:
         """Ln of the Bayes factor over the plain base, less the price of the causes."""
-        return self.gain(of, self.base) - self.price * len(of.causes)
+        return self.gain(of, self.base) - self.limits.price * len(of.causes)
 
     def of_fitted(self, of: Hypothesis) -> float:
         """The score of the fitted samples alone."""
-        return self.evidence(of) - self.price * len(of.causes)
+        return self.evidence(of) - self.limits.price * len(of.causes)
 
 
 def scale_of(
-    base: Hypothesis, colour: Colour, price: float, experiments: Sequence[Experiment]
+    base: Hypothesis, colour: Colour, limits: Thresholds, experiments: Sequence[Experiment]
 ) -> Scale:
     """Return the scale of a search; blocks of fitted records choose, whole records judge alone."""
     held = sum(int(e.held_out.sum()) for e in experiments)
-    return Scale(base, colour, price, held, any(e.held_out_whole for e in experiments))
+    return Scale(base, colour, limits, held, any(e.held_out_whole for e in experiments))
 
 
 #: So many starts each effect gets.
@@ -282,11 +282,18 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     screening = _screened(fit, kept, task)
     return View(
         of, tuple(kept), screening,
-        tested(fit, experiments, screening.colour, even=bool(of.causes)),
+        tested(fit, experiments, screening.colour, task.limits, even=bool(of.causes)),
     )  # fmt: skip
 
 
-def tested(fit: Fit, experiments: Sequence[Experiment], colour: Colour, *, even: bool) -> Omnibus:
+def tested(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    colour: Colour,
+    limits: Thresholds,
+    *,
+    even: bool,
+) -> Omnibus:
     """Return the test of the residual, or that of a further column where only this one alarms."""
 
     def test_of(
@@ -297,16 +304,19 @@ def tested(fit: Fit, experiments: Sequence[Experiment], colour: Colour, *, even:
             for name in ("voltage", "time")
         )
         noise = noise_rms(residual, own)
-        return omnibus(residual, voltage, time, own, noise, knowable=least, even=even)
+        return omnibus(
+            residual, voltage, time, own, noise,
+            knowable=least, even=even, alarms_below=limits.alarm,
+        )  # fmt: skip
 
-    test = test_of(fit.residuals, experiments, colour, knowable_of(fit, experiments))
+    test = test_of(fit.residuals, experiments, colour, knowable_of(fit, experiments, limits))
     for f, own in zip(fit.further, colour.further, strict=True):
         if test.alarm:
             break
         parts = [experiments[k] for k in with_column(experiments, f.column)]
         found = test_of(f.residuals, parts, own, f.straight)
         p = min(1.0, found.p_value * (1 + len(fit.further)))
-        if found.alarm and p < thresholds().alarm:
+        if found.alarm and p < limits.alarm:
             size = max(test.size, 2.0 * test.knowable)
             test = replace(found, p_value=p, size=size, knowable=test.knowable, output=f.column)
     return test
@@ -317,8 +327,10 @@ def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
     residuals = fit.residuals_of(task.experiments)
     known = [known_colour(e.record, r) for e, r in zip(task.experiments, residuals, strict=True)]
     if "remainder" in task.method.without:
-        return screen(fit, trials, lengths, colour=residual_colour(fit.residuals, lengths))
-    return screen(fit, trials, lengths, known)
+        return screen(
+            fit, trials, lengths, colour=residual_colour(fit.residuals, lengths), limits=task.limits
+        )
+    return screen(fit, trials, lengths, known, limits=task.limits)
 
 
 #: Fits of one set whose evidence differs by so many nats at most are the same minimum.
@@ -349,18 +361,19 @@ def held_out_confirms(
     after = max(of.holdout_rms, 1e-300)
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2
     gained = scale.held_out(of, before)
-    return confirmed(gained, promise, scale.of_fitted(of) - scale.of_fitted(before))
+    score = scale.of_fitted(of) - scale.of_fitted(before)
+    return confirmed(gained, promise, score, scale.limits)
 
 
-def confirmed(gained: float, promise: float, score: float) -> bool:
+def confirmed(gained: float, promise: float, score: float, limits: Thresholds = LIMITS) -> bool:
     """Whether a gain of the held-out log-likelihood is enough, beside that of the score [nats].
 
     A promised gain p is found give or take sqrt(2 p). Found must be `held_out`, or, where these
     samples can hardly show the cause, two such errors less than what is promised; and so much must
     the fitted samples' score and what is found be together.
     """
-    least = min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
-    return bool(gained > least and score + gained > thresholds().held_out)
+    least = min(limits.held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
+    return bool(gained > least and score + gained > limits.held_out)
 
 
 def another_minimum(gained: float, held_out: float) -> bool:
@@ -371,7 +384,9 @@ def another_minimum(gained: float, held_out: float) -> bool:
     return gained > _SAME and gained + held_out > 0.0
 
 
-def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
+def shows_memory(
+    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], limits: Thresholds
+) -> bool:
     """Whether what a cause adds to another hypothesis is more than a curve of the voltage.
 
     At most `static` of the power that the other's parameters cannot follow may be one. Elements
@@ -385,7 +400,7 @@ def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Exper
     place = (voltage - voltage.min()) / max(float(np.ptp(voltage)), 1e-300)
     curves = np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
     static = independent(without(curves, basis)).T @ target
-    return float(static @ static) < thresholds().static * float(target @ target)
+    return float(static @ static) < limits.static * float(target @ target)
 
 
 def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:

@@ -20,7 +20,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     scale_of,
     shows_memory,
 )
-from psa_casadi.diagnosis.task import State, Task, Tried, thresholds
+from psa_casadi.diagnosis.task import State, Task, Tried
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 
@@ -54,7 +54,7 @@ class Known:
         root = root_of(base, task.experiments)
         first = examine(root, task)
         self.trials = first.trials
-        own = scale_of(root, first.screening.colour, thresholds().price, task.experiments)
+        own = scale_of(root, first.screening.colour, task.limits, task.experiments)
         self.scale = replace(own, held=0) if "held out" in task.method.without else own
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
@@ -86,7 +86,9 @@ class Known:
         if self.scale.judge_only or not self.removes_little(best):
             return best
         own = self.scale.evidence(best)
-        least = self.scale.score(best) - thresholds().clearly * temperature(own)
+        least = self.scale.score(best) - self.task.limits.clearly * temperature(
+            own, self.task.limits
+        )
 
         def near() -> list[Hypothesis]:
             return [h for h in self.ranked() if h.causes and self.scale.score(h) > least]
@@ -101,7 +103,7 @@ class Known:
         if not h.causes or root <= noise:
             return False
         share = (root**2 - h.holdout_rms**2) / (root**2 - noise**2)
-        return share < thresholds().enough and self.view(h).test.alarm
+        return share < self.task.limits.enough and self.view(h).test.alarm
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with its causes in the order in which they explain most.
@@ -249,7 +251,7 @@ class Known:
                 continue
             little = before.causes and "form" not in out
             if h.removes(before) <= knowable**2 or (
-                little and h.share(before, root) <= thresholds().further
+                little and h.share(before, root) <= self.task.limits.further
             ):
                 return False
             if not self.remembers(h, before, cause):
@@ -265,12 +267,14 @@ class Known:
         if not any(s.memory and not s.settles for s in cause.states):
             return True
         if (h, before) not in self.memories:
-            self.memories[h, before] = shows_memory(h, before, self.task.experiments)
+            self.memories[h, before] = shows_memory(
+                h, before, self.task.experiments, self.task.limits
+            )
         return self.memories[h, before]
 
     def gained(self, before: Hypothesis, after: Hypothesis) -> bool:
         """Whether a fit has more evidence than an earlier one by the price of a cause."""
-        return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.price
+        return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.limits.price
 
     def different(self, effect: Component, h: Hypothesis) -> bool:
         """Whether an effect is none of the causes, nor bends the same curve as one of them."""

@@ -22,7 +22,7 @@ from psa_casadi.diagnosis.search.fits import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, Known, nearly
-from psa_casadi.diagnosis.task import Task, thresholds
+from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -218,7 +218,7 @@ def _copies(h: Hypothesis, less: Hypothesis, known: Known, task: Task) -> list[C
     added = np.concatenate([(p - q)[e.used] for p, q, e in pairs])
     table = [e for e in task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
-    power, found = copies(less.fit, added, trials, known.scale.colour)
+    power, found = copies(less.fit, added, trials, known.scale.colour, task.limits)
     own = known.scale.evidence(h)
     lost: dict[str, float] = {}
     for name, copy in found.items():
@@ -249,14 +249,16 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     tried, as a fit that adds one cause to the other may end in another minimum than one that begins
     with both. These go to their end, since they need more steps for it.
     """
-    root, price = known.root, known.scale.price
+    root, price = known.root, known.scale.limits.price
     view, alike = known.view(root), task.alike(root.fit)
     if not view.trials:
         return
     every = [
         found
-        for size in range(2, thresholds().most_causes + 1)
-        for found in best_sets(root.fit, view.trials, view.screening.colour, size, alike)
+        for size in range(2, task.limits.most_causes + 1)
+        for found in best_sets(
+            root.fit, view.trials, view.screening.colour, size, alike, task.limits
+        )
     ]
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
     beside = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
@@ -296,7 +298,7 @@ def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
         shared = known.found.get(h.names - {cause.name})
         if shared is None or not shared.causes:
             continue
-        gained = evidence(h) - evidence(shared) - known.scale.price
+        gained = evidence(h) - evidence(shared) - known.scale.limits.price
         for child in known.children(h):
             other = known.found.get(child.names - {cause.name})
             if other is not None and evidence(other) + gained > evidence(child):

@@ -27,7 +27,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     scale_of,
 )
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.task import Task, same_curves, thresholds
+from psa_casadi.diagnosis.task import Task, Thresholds, same_curves
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import as_read
@@ -147,7 +147,7 @@ def _step(found: Known, task: Task, view: View, chosen: Hypothesis | None) -> St
     evidence = {**there.estimated(), **{n: gain(c, less) for n, c in beside.items()}}
     whole = found.scale.evidence(found.answer)
     # only an estimate says that these are as likely as the cause
-    least = evidence[cause.name] - thresholds().clearly * temperature(whole)
+    least = evidence[cause.name] - task.limits.clearly * temperature(whole, task.limits)
     for name in [n for n, e in evidence.items() if n not in beside and e > least]:
         more = with_cause(less, task.experiments, there.starts_of(name))
         evidence[name] = -np.inf if more is None else gain(more, less)
@@ -189,21 +189,23 @@ def _judged(
         elif refused & set(group):
             refused = refused | set(group)
     shared = levelled(evidence, alike, good)
-    chances = probabilities({n: v for n, v in shared.items() if n not in refused}, whole)
+    chances = probabilities(
+        {n: v for n, v in shared.items() if n not in refused}, whole, task.limits
+    )
     return replace(step, evidence=shared, probability=chances)
 
 
 def contenders(
-    step: Step, experiments: Sequence[Experiment], names: Sequence[str] = ()
+    step: Step, experiments: Sequence[Experiment], limits: Thresholds, names: Sequence[str] = ()
 ) -> tuple[Contender, ...]:
     """Return effects of one step of the search with their fits; those not fitted are fitted now.
 
     Without `names` they are the fewest that hold the cause with the probability `credible`. An
     effect whose fit fails is left out.
     """
-    names = names or credible_set(step.probability, thresholds().credible)
+    names = names or credible_set(step.probability, limits.credible)
     found = dict(step.fitted)
-    scale = scale_of(step.view.of, step.screening.colour, 0.0, experiments)
+    scale = scale_of(step.view.of, step.screening.colour, replace(limits, price=0.0), experiments)
     known = dict(step.evidence)
     for name in names:
         scores = [] if name in found else step.view.starts_of(name)
@@ -250,7 +252,7 @@ def fit_contenders(
     seen = examine(plain, task)
     progress("fitting the rivals")
     step = Step(seen, evidence=seen.estimated())
-    chosen = contenders(step, experiments, [e.name for e in effects])
+    chosen = contenders(step, experiments, task.limits, [e.name for e in effects])
     lost = {e.name for e in effects} - {c.effect for c in chosen}
     if lost:
         raise InputError(
