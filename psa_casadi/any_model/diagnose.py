@@ -72,7 +72,8 @@ def diagnose_ode(
             f"The model '{model.name}' has effects already ({names}); diagnose it without them."
         )
     given = signals_given(records, hold)
-    held = signals_given(holdout, hold, len(given) + 1) if _any(holdout) else []
+    none = isinstance(holdout, tuple | list) and not holdout
+    held = [] if none else signals_given(holdout, hold, len(given) + 1)
     runs = runs_of(model, given, held)
     shifted = known_zeros(model, zeros)
     progress("fitting from several starts")
@@ -85,7 +86,14 @@ def diagnose_ode(
     sizes = sizes_of(base.model, runs, base.starts())
     gone = (*leave_out, *(f"zero_of_{n}" for n in shifted))
     every = effects_of(base.model, sizes)
-    _refuse_unknown(leave_out, [e.name for e in every])
+    known_names = [e.name for e in every]
+    for name in leave_out:
+        if not any(n.startswith(name) for n in known_names):
+            near = get_close_matches(name, known_names, 3, 0.3) or known_names
+            raise InputError(
+                f"`leave_out` has '{name}', which begins the name of no effect; of the"
+                f" {len(known_names)} there are, the nearest are {', '.join(near)}."
+            )
     table = Table(base.model, tuple(e for e in every if not e.name.startswith(gone)))
     known = search(base, runs, table, progress)
     runs = with_noise(known.best().fit, runs)
@@ -95,20 +103,6 @@ def diagnose_ode(
     progress("judging")
     found = judged(known)
     return replace(found, remarks=(*found.remarks, *told_of_columns(model, runs)))
-
-
-def _any(given: Any) -> bool:
-    return not (isinstance(given, tuple | list) and not given)
-
-
-def _refuse_unknown(leave_out: Sequence[str], names: Sequence[str]) -> None:
-    for name in leave_out:
-        if not any(n.startswith(name) for n in names):
-            near = get_close_matches(name, names, 3, 0.3) or names
-            raise InputError(
-                f"`leave_out` has '{name}', which begins the name of no effect; of the {len(names)}"
-                f" there are, the nearest are {', '.join(near)}."
-            )
 
 
 Progress = Callable[[str], None]

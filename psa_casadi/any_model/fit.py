@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from psa_casadi.any_model.predict import STEP_RTOL, coordinates_of, output_of, shown_by
 from psa_casadi.any_model.runs import Run, measured_spans
-from psa_casadi.errors import Problems, PsaError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, Minimum, minimise
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
@@ -22,57 +22,6 @@ FloatArray = npt.NDArray[np.float64]
 
 #: How far the start is sought in the first tenth.
 _EVALUATIONS, _TOLERANCE = 30, 1e-5
-
-
-def begun(
-    model: Model,
-    runs: Sequence[Run],
-    unknowns: Unknowns,
-    theta: FloatArray,
-    places: Sequence[int],
-    levels: Sequence[float],
-    rtol: float,
-) -> FloatArray:
-    """Return theta with initial states and zeros of held-out experiments, from their first tenth.
-
-    `places` are the outputs that count, each by its level. Where a start cannot be simulated it
-    stays as it is.
-    """
-    found = theta.copy()
-    judging = [k for k, r in enumerate(runs) if r.held_out_whole]
-
-    def one(k: int) -> FloatArray:
-        first, run = unknowns.first(k), runs[k].of_beginning()
-        own = slice(first, unknowns.first(k + 1))
-        prior = 1.0 / unknowns.prior[own]
-        weights = [(j, run.fitted(j), level * run.noise[j])
-                   for j, level in zip(places, levels, strict=True)]  # fmt: skip
-
-        def evaluate(start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-            there = theta.copy()
-            there[own] = start
-            rows, slopes = [start * prior], [np.diag(prior)]
-            for j, used, size in weights:
-                if not used.any():
-                    continue
-                try:
-                    shown, by_theta = output_of(model, run, unknowns, there, k, j, rtol)
-                except PsaError:
-                    return None
-                cut = used[: run.stop]
-                rows.append((shown[cut] - run.outputs[used, j]) / size)
-                slopes.append(by_theta[cut, own] / size)
-            return np.concatenate(rows), np.vstack(slopes)
-
-        free = np.full(own.stop - own.start, np.inf)
-        best = minimise(
-            evaluate, theta[own], (-free, free), tolerance=_TOLERANCE, evaluations=_EVALUATIONS
-        )
-        return theta[own] if best is None else best.theta
-
-    for k, start in zip(judging, side_by_side(one, judging), strict=True):
-        found[unknowns.first(k) : unknowns.first(k + 1)] = start
-    return found
 
 
 #: Share of an output's range below which no difference between a device and a model is told.
@@ -188,7 +137,6 @@ def fit_ode(
     evaluations: int = 60,
     tolerance: float = 1e-6,
     rtol: float = STEP_RTOL,
-    goal: float = np.inf,
     zeros: tuple[str, ...] = (),
     known_start: bool = False,
 ) -> OdeFit:
@@ -212,7 +160,6 @@ def fit_ode(
         unknowns.bounds(),
         tolerance=tolerance,
         evaluations=evaluations,
-        goal=goal,
         radius=FIRST_RADIUS,
     )
     if found is None:
@@ -244,36 +191,67 @@ class _Problem:
         """Which output of which run, in the order of the stacked residuals."""
         return [(j, k) for j in self.places for k, r in enumerate(self.runs) if r.fitted(j).any()]
 
-    def parts(self, theta: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-        """Return residuals (predicted - measured) and Jacobian of every task, over its noise.
+    def part(self, theta: FloatArray, j: int, k: int, run: Run) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (predicted - measured) and Jacobian of an output of a run, over noise.
 
         Raises PsaError.
         """
-
-        def one(task: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-            j, k = task
-            run = self.runs[k]
-            used = run.fitted(j)
-            shown, slopes = output_of(self.model, run, self.unknowns, theta, k, j, self.rtol)
-            own, share = used[: run.stop], run.noise[j]
-            return (shown[own] - run.outputs[used, j]) / share, slopes[own] / share
-
-        return side_by_side(one, self.tasks)
+        used = run.fitted(j)
+        shown, slopes = output_of(self.model, run, self.unknowns, theta, k, j, self.rtol)
+        own, share = used[: run.stop], run.noise[j]
+        weight = 1.0 / self.levels[self.places.index(j)]
+        residual = (shown[own] - run.outputs[used, j]) / share * weight
+        return residual, slopes[own] / share * weight
 
     def evaluate(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         try:
-            parts = self.parts(theta)
+            parts = side_by_side(lambda t: self.part(theta, *t, self.runs[t[1]]), self.tasks)
         except PsaError:
             return None
-        weight = {j: 1.0 / level for j, level in zip(self.places, self.levels, strict=True)}
-        rows = [r * weight[j] for (j, _), (r, _) in zip(self.tasks, parts, strict=True)]
-        slopes = [d * weight[j] for (j, _), (_, d) in zip(self.tasks, parts, strict=True)]
+        rows, slopes = zip(*parts, strict=True)
         prior = 1.0 / self.unknowns.prior
         residual = np.concatenate([*rows, theta * prior])
         jacobian = np.vstack([*slopes, np.diag(prior)])
         with np.errstate(over="ignore", invalid="ignore"):
             finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
         return (residual, jacobian) if finite else None
+
+    def begun(self, theta: FloatArray) -> FloatArray:
+        """Return theta with starts and zeros of held-out experiments, from their first tenth.
+
+        Where a start cannot be simulated it stays as it is.
+        """
+        found = theta.copy()
+        judging = [k for k, r in enumerate(self.runs) if r.held_out_whole]
+
+        def one(k: int) -> FloatArray:
+            run, own = self.runs[k].of_beginning(), self.own(k)
+            prior = 1.0 / self.unknowns.prior[own]
+            outputs = [j for j in self.places if run.fitted(j).any()]
+
+            def evaluate(start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+                there = theta.copy()
+                there[own] = start
+                try:
+                    parts = [self.part(there, j, k, run) for j in outputs]
+                except PsaError:
+                    return None
+                rows = np.concatenate([start * prior, *(r for r, _ in parts)])
+                return rows, np.vstack([np.diag(prior), *(d[:, own] for _, d in parts)])
+
+            free = np.full(len(prior), np.inf)
+            best = minimise(
+                evaluate, theta[own], (-free, free), tolerance=_TOLERANCE, evaluations=_EVALUATIONS
+            )
+            return theta[own] if best is None else best.theta
+
+        for k, start in zip(judging, side_by_side(one, judging), strict=True):
+            found[self.own(k)] = start
+        return found
+
+    def own(self, k: int) -> slice:
+        """Return the coordinates of a run's start."""
+        return slice(self.unknowns.first(k), self.unknowns.first(k + 1))
 
     def fit(self, found: Minimum, zeros: tuple[str, ...], known_start: bool) -> OdeFit:
         model = self.model.with_values(self.unknowns.values(found.theta))
@@ -298,9 +276,7 @@ class _Problem:
         return OdeFit(
             model=model,
             unknowns=self.unknowns,
-            theta=begun(
-                model, self.runs, self.unknowns, found.theta, self.places, self.levels, self.rtol
-            ),
+            theta=self.begun(found.theta),
             outputs=tuple(outputs),
             cost=found.cost,
             converged=found.converged,
@@ -320,7 +296,6 @@ def refitted(
     levels: Sequence[float] | None = None,
     evaluations: int = 60,
     tolerance: float = 1e-6,
-    goal: float = np.inf,
 ) -> OdeFit:
     """Go on with a fit from where it stopped, or with another model from its values.
 
@@ -333,21 +308,19 @@ def refitted(
         other, runs, own,
         levels=before.levels if levels is None else levels,
         starts=before.starts(), evaluations=evaluations, tolerance=tolerance, rtol=before.rtol,
-        goal=goal, zeros=before.zeros, known_start=before.known_start,
+        zeros=before.zeros, known_start=before.known_start,
     )  # fmt: skip
 
 
 def refuse_unfit(model: Model) -> None:
     """Refuse a model without an output, and one with sampled states. Raises InputError."""
-    problems = Problems()
     if not model.output_names:
-        problems.add(f"The model '{model.name}' has no output; a fit compares with one.")
+        raise InputError(f"The model '{model.name}' has no output; a fit compares with one.")
     if model.structure.sampled:
-        problems.add(
+        raise InputError(
             f"The model '{model.name}' has sampled states, whose sensitivities are not computed;"
             " leave the sampled component out."
         )
-    problems.raise_if_any()
 
 
 #: A parameter with a larger standard error than this, over its ordinary change, is not determined.
@@ -381,7 +354,12 @@ def certainty(fit: OdeFit) -> Certainty:
     """
     information = np.diag(1.0 / fit.unknowns.prior**2)
     for output in fit.outputs:
-        white = _whitened(output, np.column_stack([output.residuals, output.jacobian]))
+        white = np.column_stack([output.residuals, output.jacobian])
+        top = sum(float(p[1:] @ p[:-1]) for p in output.parts)
+        r = min(top / max(float(output.residuals @ output.residuals), 1e-300), 0.98)
+        if r >= _WHITE:  # the correlation of neighbours within the experiments
+            parts = np.split(white, np.cumsum(output.lengths)[:-1])
+            white = np.vstack([filtered([1.0, -r], [1.0], part)[1:] for part in parts])
         level = max(float(np.sqrt(np.mean(white[:, 0] ** 2))), 1e-300)
         information = information + white[:, 1:].T @ white[:, 1:] / level**2
     names = fit.unknowns.names
@@ -403,17 +381,3 @@ def certainty(fit: OdeFit) -> Certainty:
             on_bound.append(name)
     undetermined = [n for n, s in zip(names, spread, strict=True) if s > _UNDETERMINED]
     return Certainty(errors, intervals, tuple(undetermined), tuple(on_bound))
-
-
-def _whitened(output: FittedOutput, columns: FloatArray) -> FloatArray:
-    r = _correlation(output)
-    if r < _WHITE:
-        return columns
-    parts = np.split(columns, np.cumsum(output.lengths)[:-1])
-    return np.vstack([filtered([1.0, -r], [1.0], part)[1:] for part in parts])
-
-
-def _correlation(output: FittedOutput) -> float:
-    """Return the correlation of neighbours within the experiments, 0.98 at most."""
-    top = sum(float(p[1:] @ p[:-1]) for p in output.parts)
-    return min(top / max(float(output.residuals @ output.residuals), 1e-300), 0.98)

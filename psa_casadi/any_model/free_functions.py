@@ -7,6 +7,7 @@ or up to the fifth of a signal, each over its size. They have no memory and no t
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from math import prod
@@ -16,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
-from psa_casadi.any_model.fit import OdeFit, fit_ode
-from psa_casadi.any_model.hypothesis import OdeHypothesis, OdeView, hypothesis_of
+from psa_casadi.any_model.fit import OdeFit, refitted
+from psa_casadi.any_model.hypothesis import OdeView, hypothesis_of
 from psa_casadi.any_model.identify import noise_left
 from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, start_of, states_of, traced
 from psa_casadi.any_model.result import removed_from
@@ -87,16 +88,16 @@ def curve_of(free: Free, runs: Sequence[Run]) -> tuple[str, FloatArray, FloatArr
         for c, term in zip(free.law.coefficients(component.name), free.law.terms, strict=True)
     )
     added = np.asarray(added, dtype=np.float64)
-    name = min(values, key=lambda n: _scatter(values[n], added))
+
+    def scatter(name: str) -> float:
+        """What a polynomial of one variable leaves of what is added (sum of squares)."""
+        place = values[name] / max(float(np.max(np.abs(values[name]))), 1e-300)
+        powers = np.vander(place, _OF_SIGNAL + 1)
+        rest = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
+        return float(rest @ rest)
+
+    name = min(values, key=scatter)
     return name, values[name], added
-
-
-def _scatter(along: FloatArray, added: FloatArray) -> float:
-    """Return what a polynomial of one variable leaves of what is added (sum of squares)."""
-    place = along / max(float(np.max(np.abs(along))), 1e-300)
-    powers = np.vander(place, _OF_SIGNAL + 1)
-    rest = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
-    return float(rest @ rest)
 
 
 def _along(free: Free, runs: Sequence[Run], name: str) -> FloatArray:
@@ -132,31 +133,22 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
     found = []
     for _, attached, law in scored[:_FITTED]:
         known.progress(f"a free function in {attached.port.words}")
-        h = hypothesis_of((attached.component,), _fitted(known, root, attached), known.runs)
+        fitted: OdeFit | None = None
+        with suppress(PsaError):
+            model = extended(known.table.base, [attached])
+            fitted = refitted(
+                root.fit, known.runs, model=model, evaluations=_EVALUATIONS, tolerance=1e-4
+            )
+        h = hypothesis_of((attached.component,), fitted, known.runs)
         if h is not None:
             of = " and ".join(law.names)
-            removes = _removes(f"{of} in {attached.port.words}", known, h, view)
+            # of the base's held-out error above the noise that it leaves
+            noise = noise_left(h.fit, view.screening.colour)
+            of_base = removed_from(known.runs, h.fit.places, root.predicted, noise)
+            what = f"{of} in {attached.port.words}"
+            removes = of_base.share(what, root.predicted, h.predicted)
             found.append(Free(attached.port, of, known.evidence(h), removes, law, h.fit, h.errors))
     return tuple(sorted(found, key=lambda f: -f.evidence))
-
-
-def _removes(what: str, known: Known, h: OdeHypothesis, view: OdeView) -> Share:
-    """Return what it removes of the base's held-out error above the noise that it leaves."""
-    noise, base = noise_left(h.fit, view.screening.colour), view.of.predicted
-    return removed_from(known.runs, h.fit.places, base, noise).share(what, base, h.predicted)
-
-
-def _fitted(known: Known, root: OdeHypothesis, attached: Attached) -> OdeFit | None:
-    before = root.fit
-    model = extended(known.table.base, [attached])
-    try:
-        return fit_ode(
-            model, known.runs, [*before.unknowns.names, *attached.component.fitted],
-            levels=before.levels, starts=before.starts(), evaluations=_EVALUATIONS,
-            tolerance=1e-4, rtol=before.rtol, zeros=before.zeros, known_start=before.known_start,
-        )  # fmt: skip
-    except PsaError:
-        return None
 
 
 def _decrease(known: Known, view: OdeView, attached: Attached) -> float:

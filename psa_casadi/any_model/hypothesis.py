@@ -4,7 +4,8 @@ The score is that of a stack's diagnosis: ln of the Bayes factor over the base, 
 every cause (`psa_casadi.diagnosis.search.hypothesis`).
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import Attached, extended
-from psa_casadi.any_model.fit import FittedOutput, OdeFit
+from psa_casadi.any_model.fit import OdeFit
 from psa_casadi.any_model.predict import start_of, traced, zero_name
 from psa_casadi.any_model.runs import Run
 from psa_casadi.component import Component
@@ -21,6 +22,7 @@ from psa_casadi.diagnosis.held_out import output_gain
 from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
 from psa_casadi.diagnosis.search.hypothesis import confirmed
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -54,7 +56,10 @@ def trial_directions(
     there = fit.model.effects
     models = {e.name: table.with_effects(fit, [*there, e]) for e in effects}
     side_by_side(_compiled, list(models.values()))
-    tasks = [(e, values) for e in effects for values in _values(e)]
+    tasks = []
+    for e in effects:
+        grids = [g for g in e.probe.values() if not isinstance(g, str)]
+        tasks += [(e, dict(zip(e.probe, point, strict=True))) for point in product(*grids)]
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
         effect, values = task
@@ -64,16 +69,8 @@ def trial_directions(
 
 
 def _compiled(model: Model) -> None:
-    try:
+    with suppress(PsaError, MachineError):
         make_ready(model)
-    except (PsaError, MachineError):
-        return
-
-
-def _values(effect: Component) -> Iterator[dict[str, float]]:
-    grids = [g for g in effect.probe.values() if not isinstance(g, str)]
-    for point in product(*grids):
-        yield dict(zip(effect.probe, point, strict=True))
 
 
 def _at(
@@ -116,19 +113,12 @@ def _moved(
             shown, slopes = traced(current, run, begun.x, wanted, s0, o.column, fit.rtol)
             used = run.fitted(o.index)
             moved = (shown if step else slopes[:, 0] * scale)[used[: run.stop]]
-            if step:
-                moved = moved - _shown(o, residual, run, starts[k])
+            if step:  # less the fit's own predictions, without an unknown zero
+                zero = starts[k].get(zero_name(o.column), 0.0)
+                moved = moved - (run.outputs[used, o.index] - zero - residual * run.noise[o.index])
             parts.append(moved / run.noise[o.index])
         found.append(np.concatenate(parts))
     return found
-
-
-def _shown(
-    output: FittedOutput, residual: FloatArray, run: Run, start: Mapping[str, float]
-) -> FloatArray:
-    """Return a fit's own predictions of an output's used samples, without an unknown zero."""
-    j, zero = output.index, start.get(zero_name(output.column), 0.0)
-    return np.asarray(run.outputs[run.fitted(j), j] - zero - residual * run.noise[j])
 
 
 #: So many starts each effect gets.
@@ -255,25 +245,19 @@ def tested(of: OdeHypothesis, runs: Sequence[Run], colour: Colour) -> Omnibus:
     """
     rows = []
     for output, own in zip(of.fit.outputs, colour.each, strict=True):
-        for along in _along(runs, output):
+        parts = [runs[k].inputs[runs[k].fitted(output.index)] for k in output.runs]
+        moving = [column for column in np.vstack(parts).T if np.ptp(column) > 0]
+        for along in moving or [np.zeros(len(output.residuals))]:
             time = np.concatenate([runs[k].time[runs[k].fitted(output.index)] for k in output.runs])
             found = omnibus(
                 output.residuals, along, time, own, noise_rms(output.residuals, own),
-                knowable=output.straight, even=bool(of.causes),
+                knowable=output.straight, even=bool(of.causes), alarms_below=LIMITS.alarm,
             )  # fmt: skip
             rows.append(replace(found, output=output.column if len(of.fit.outputs) > 1 else ""))
     p = min(1.0, len(rows) * min(r.p_value for r in rows))
     worst = min(rows, key=lambda r: (not r.alarm, r.p_value))
     told = worst.p_value * len(rows)
     return replace(worst, p_value=min(1.0, told if worst.alarm else p))
-
-
-def _along(runs: Sequence[Run], output: FittedOutput) -> list[FloatArray]:
-    """Return the inputs that move, at an output's fitted samples; time where none does."""
-    parts = [runs[k].inputs[runs[k].fitted(output.index)] for k in output.runs]
-    whole = np.vstack(parts)
-    moving = [whole[:, j] for j in range(whole.shape[1]) if np.ptp(whole[:, j]) > 0]
-    return moving or [np.zeros(len(whole))]
 
 
 def can_be_told(of: OdeHypothesis, before: OdeHypothesis) -> bool:

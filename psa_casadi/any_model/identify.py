@@ -35,13 +35,6 @@ FloatArray = npt.NDArray[np.float64]
 _TELLING, _SURE = 32, 3.0
 
 
-def first_levels(runs: Sequence[Run]) -> tuple[float, ...]:
-    """Return levels to begin with: a tenth of every measured output's standard deviation."""
-    places = measured_outputs(runs)
-    every = np.vstack([np.where(r.used[:, None], r.outputs, np.nan) for r in runs])
-    return tuple(0.1 * float(np.nanstd(every[:, j])) for j in places)
-
-
 def relevelled(fit: OdeFit, runs: Sequence[Run], rounds: int = 4) -> OdeFit:
     """Fit again with every output's residual as its noise level, until that stays the same."""
     for _ in range(rounds if len(fit.outputs) > 1 else 1):
@@ -60,10 +53,15 @@ def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
     that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
     """
     shares = [r.noise.copy() for r in runs]
-    beginnings = _beginnings(fit, runs)
+    beginnings = []
+    for k, run in enumerate(runs):
+        if run.held_out_whole:
+            first = run.of_beginning()
+            shown = shown_by(fit.model, first, fit.starts()[k], first.stop, fit.rtol, fit.zeros)
+            beginnings.append((k, first, (run.outputs[: first.stop] - shown) / run.noise))
     for o in fit.outputs:
         fitted = zip(o.runs, o.parts, strict=True)
-        begun = ((k, _at(r, e, o.index)) for k, r, e in beginnings)
+        begun = ((k, e[r.fitted(o.index)[: r.stop], o.index]) for k, r, e in beginnings)
         found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
         if len(found) < 2:
             continue
@@ -73,23 +71,6 @@ def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
             if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
                 shares[k][o.index] *= float(np.exp(own))
     return tuple(replace(r, noise=share) for r, share in zip(runs, shares, strict=True))
-
-
-def _beginnings(fit: OdeFit, runs: Sequence[Run]) -> list[tuple[int, Run, FloatArray]]:
-    """Return the held-out experiments' beginnings, with measured minus predicted over the noise."""
-    found = []
-    for k, run in enumerate(runs):
-        if run.held_out_whole:
-            begun = run.of_beginning()
-            shown = shown_by(fit.model, begun, fit.starts()[k], begun.stop, fit.rtol, fit.zeros)
-            found.append((k, begun, (run.outputs[: begun.stop] - shown) / run.noise))
-    return found
-
-
-def _at(run: Run, errors: FloatArray, output: int) -> FloatArray:
-    """Return the errors of an output where it was measured."""
-    found: FloatArray = errors[run.fitted(output)[: run.stop], output]
-    return found
 
 
 def unlike(runs: Sequence[Run], others: Sequence[Run]) -> bool:
@@ -251,9 +232,14 @@ def search_starts(
     The costs are those of the starts with the same noise in all experiments. Raises SimulationError
     where none can be simulated.
     """
-    levels, found = first_levels(runs), []
+    # to begin with: a tenth of every measured output's standard deviation
+    levels = [0.1 * _movement(runs, j) for j in measured_outputs(runs)]
+    found: list[OdeFit] = []
     costs: list[float] = []
-    for values in _starts(model, free, max(1, starts)):
+    rng = np.random.default_rng(_SEED)
+    for number in range(max(1, starts)):
+        declared = model.values  # the first start; random ones about them, within the bounds
+        values = {n: _drawn(model.parameter(n), declared, rng) for n in free} if number else {}
         try:
             own = fit_ode(
                 model.with_values(values), runs, free, levels=levels,
@@ -307,16 +293,6 @@ def seen_starts(model: Model, runs: Sequence[Run]) -> list[dict[str, float]]:
     return found
 
 
-def _starts(model: Model, free: Sequence[str], count: int) -> list[dict[str, float]]:
-    """Return the declared values and random ones about them, within the bounds."""
-    rng = np.random.default_rng(_SEED)
-    declared = {n: model.values[n] for n in free}
-    drawn = (
-        {n: _drawn(model.parameter(n), model.values, rng) for n in free} for _ in range(count - 1)
-    )
-    return [declared, *drawn]
-
-
 def _drawn(p: Parameter, values: Mapping[str, float], rng: np.random.Generator) -> float:
     low, high = p.bounds
     value = values[p.name]
@@ -360,16 +336,10 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
         said.append(note("one_start", starts=len(costs)))
     said += [note("own_undetermined", name=n) for n in sure.undetermined]
     said += [note("on_bound", name=n) for n in sure.on_bound]
-    said += [
-        note("output_missed", output=n, ratio=rms[n] / noise[n])
-        for n in rms
-        if noise[n] > 0 and rms[n] > MISSED * noise[n]
-    ]
-    said += [
-        note("output_not_followed", output=o.column, share=share)
-        for o in fit.outputs
-        if (share := rms[o.column] / _movement(runs, o.index)) > _ALL
-    ]
+    missed = {n: rms[n] / noise[n] for n in rms if noise[n] > 0}
+    said += [note("output_missed", output=n, ratio=r) for n, r in missed.items() if r > MISSED]
+    left_of = {o.column: rms[o.column] / _movement(runs, o.index) for o in fit.outputs}
+    said += [note("output_not_followed", output=n, share=s) for n, s in left_of.items() if s > _ALL]
     said += told_of_columns(fit.model, runs)
     return OdeIdentification(
         model=with_told(fit.model, runs, sure, fit.interrupted),

@@ -25,7 +25,7 @@ from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Candidate, Remaining, Verdict, estimates
 from psa_casadi.diagnosis.screening import probabilities, temperature
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import PsaError
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import FEWEST_SAMPLES
@@ -49,22 +49,12 @@ class Weighed:
     @property
     def enough(self) -> bool:
         """Whether so much of every output is removed that names may stand where more is left."""
-        return self.least[1] >= thresholds().enough
+        return self.least[1] >= LIMITS.enough
 
     @property
     def named(self) -> dict[str, float]:
         """Every share by the name of its output, "" for all together."""
         return {"": self.together, **self.each}
-
-
-@dataclass(frozen=True)
-class Beaten:
-    """A free function that takes the names away, and the output (or "") where it removes more."""
-
-    by: Free
-    output: str
-    names: float
-    function: float
 
 
 def weighed(
@@ -94,34 +84,25 @@ def beaten_by(
     own: Weighed,
     free: Sequence[Free],
     noise: Sequence[float],
-) -> Beaten | None:
-    """Return the free function that takes the names away, if there is one.
+) -> Note | None:
+    """Return which free function takes the names away, None if none does.
 
     It is clearly likelier, removes more of some output by more than a form may cost, and of none so
     much less.
     """
-    evidence, form = known.evidence(best), thresholds().form
+    evidence, form = known.evidence(best), LIMITS.form
     for f in free:
-        clearly = thresholds().clearly * temperature(max(evidence, f.evidence))
-        if f.evidence - thresholds().price <= known.of_fitted(best) + clearly:
+        clearly = LIMITS.clearly * temperature(max(evidence, f.evidence))
+        if f.evidence - LIMITS.price <= known.of_fitted(best) + clearly:
             continue
         theirs = weighed(known.found[frozenset()], f.errors, noise, f.share).named
         more = {n: theirs[n] - share for n, share in own.named.items()}
         where = max(more, key=lambda n: more[n])
         if more[where] > form and min(more.values()) >= -form:
-            return Beaten(f, where, own.named[where], theirs[where])
+            names, share = tuple(c.name for c in best.causes), own.named[where]
+            why = note("free_beats", of=f.of, port=f.port.words, share=theirs[where])
+            return note("own_withdrawn", names=names, share=share, output=where, why=why)
     return None
-
-
-def why_not_named(names: tuple[str, ...], own: Weighed, beaten: Beaten | None) -> Note:
-    """Return why causes that were found are not told."""
-    if beaten:
-        f = beaten.by
-        why = note("free_beats", of=f.of, port=f.port.words, share=beaten.function)
-        return note("own_withdrawn", names=names, share=beaten.names, output=beaten.output, why=why)
-    output, share = own.least
-    why = note("own_little", least=thresholds().enough)
-    return note("own_withdrawn", names=names, share=share, output=output, why=why)
 
 
 def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
@@ -131,7 +112,7 @@ def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
     """
     if not best.causes or not known.view(best).test.alarm:
         return ()
-    clearly = thresholds().clearly * temperature(known.evidence(best))
+    clearly = LIMITS.clearly * temperature(known.evidence(best))
     better = [h for h in known.found.values() if known.score(h) > known.score(best) + clearly]
     better = [h for h in better if known.slight(h) and known.stands(h)]
     top = max(better, key=known.score, default=None)
@@ -139,7 +120,7 @@ def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
         return ()
     names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
     more = known.evidence(top) - known.evidence(best)
-    return (note("slight", names=names, more=more, small=small, least=thresholds().further),)
+    return (note("slight", names=names, more=more, small=small, least=LIMITS.further),)
 
 
 def changes(effect: Component, fit: OdeFit, runs: Sequence[Run]) -> tuple[Size, ...]:
@@ -175,7 +156,7 @@ def judged(known: Known) -> OdeDiagnosis:
     few = held < FEWEST_SAMPLES
     free = free_functions(known, first) if first.test.alarm or best.causes else ()
     beaten = beaten_by(known, best, own, free, floors) if best.causes else None
-    told = _steps(known, best)
+    told = {c.name: _chances(known, best, c) for c in best.causes}
     left = {h.names: _remaining(known, h) for h in (root, best)}
     more = not left[best.names].white
     verdict = verdict_by(
@@ -187,18 +168,20 @@ def judged(known: Known) -> OdeDiagnosis:
     named = best if verdict in ("cause_named", "partly_explained", "ambiguous") else root
     notes = [note("own_few_held_out", count=held, least=FEWEST_SAMPLES)] if few else []
     if verdict == "unexplained" and best.causes and not few:
-        notes.append(why_not_named(tuple(c.name for c in best.causes), own, beaten))
+        output, share = own.least
+        why, names = (
+            note("own_little", least=LIMITS.enough),
+            tuple(c.name for c in best.causes),
+        )
+        little = note("own_withdrawn", names=names, share=share, output=output, why=why)
+        notes.append(beaten or little)
     if not few:
         notes += left_out(known, best)
     return _diagnosis(known, verdict, named, removed, told, left, notes, free)
 
 
-def _steps(known: Known, best: OdeHypothesis) -> dict[str, dict[str, float]]:
-    """Return for every cause the probabilities of the effects that may be in its place."""
-    return {c.name: _chances(known, best, c) for c in best.causes}
-
-
 def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, float]:
+    """Return the probabilities of the effects that may be in a cause's place."""
     less = known.found.get(best.names - {cause.name}) or without(known, best, cause)
     if less is None:
         return {cause.name: 1.0}
@@ -206,7 +189,7 @@ def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, f
     evidences = dict(view.estimated())
     fitted = {c for h in known.children(less) for c in h.names - less.names}
     top = known.evidence(best) - own
-    near = top - thresholds().clearly * temperature(top)
+    near = top - LIMITS.clearly * temperature(top)
     for name in [n for n, e in evidences.items() if e > near and n not in fitted]:
         known.note(with_cause(known, less, view.starts_of(name)))
     known.finish(
@@ -234,7 +217,12 @@ def _diagnosis(
     model = with_told(named.fit.model, known.runs, certainty(named.fit))
     runs, noise = _noise(known, named)
     partly = known.view(named).test.alarm
-    shares = {c.name: _own_share(known, named, c, removed) for c in named.causes}
+    shares = {}
+    for c in named.causes:
+        less = known.found.get(named.names - {c.name})
+        shares[c.name] = Share(c.name, 0.0, (0.0, 0.0))
+        if less is not None:
+            shares[c.name] = removed.share(c.name, less.predicted, named.predicted)
     least = least_share([s.share for s in shares.values()])
     small = [n for n, s in shares.items() if partly and s.share < least]
     causes = tuple(
@@ -254,7 +242,7 @@ def _diagnosis(
         if c.name not in small
     )  # fmt: skip
     best_free = max(free, key=lambda f: f.share, default=None)
-    if verdict != "unexplained" or (best_free and best_free.share <= thresholds().form):
+    if verdict != "unexplained" or (best_free and best_free.share <= LIMITS.form):
         best_free = None
     return OdeDiagnosis(
         verdict=verdict,
@@ -302,13 +290,6 @@ def _correction(known: Known, free: Free) -> FreeFunction | None:
     )  # fmt: skip
 
 
-def _own_share(known: Known, h: OdeHypothesis, cause: Component, removed: Removed) -> Share:
-    less = known.found.get(h.names - {cause.name})
-    if less is None:
-        return Share(cause.name, 0.0, (0.0, 0.0))
-    return removed.share(cause.name, less.predicted, h.predicted)
-
-
 def _candidates(
     known: Known,
     removed: Removed,
@@ -319,19 +300,12 @@ def _candidates(
     root = known.found[frozenset()]
     rows = []
     first = next(iter(told.values()), {}) if named.causes else {}
-    for name, evidence in known.view(root).estimated().items():
-        own = known.found.get(frozenset({name}))
-        rows.append(
-            Candidate(
-                effect=name,
-                explained_share=0.0
-                if own is None
-                else float(np.clip(removed.from_base(own.predicted), 0.0, 1.0)),
-                evidence=evidence if own is None else known.evidence(own),
-                fitted=own is not None,
-                probability=first.get(name, 0.0),
-            )
-        )
+    for name, estimate in known.view(root).estimated().items():
+        own, share, evidence = known.found.get(frozenset({name})), 0.0, estimate
+        if own is not None:
+            share = float(np.clip(removed.from_base(own.predicted), 0.0, 1.0))
+            evidence = known.evidence(own)
+        rows.append(Candidate(name, share, evidence, own is not None, first.get(name, 0.0)))
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 
 
@@ -347,7 +321,7 @@ def _remaining(known: Known, h: OdeHypothesis) -> Remaining:
     for o, noise in zip(h.fit.outputs, _noise(known, h)[1], strict=True):
         held = any(r.judged(o.index).any() for r in known.runs)
         rms = missed_rms(known.runs, h.predicted, o.index)
-        least = thresholds().unseen_ratio_of_records * float(np.hypot(noise, o.straight))
+        least = LIMITS.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
         if held and rms > least:
             unlike = note("held_out_unlike", output=o.column, ratio=rms / noise)
             return Remaining(False, test.p_value, unlike)

@@ -7,6 +7,7 @@ filters of effects, starts where it would rest: g(x_s, x_0, u_0, p) = 0 with g i
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -22,7 +23,7 @@ from psa_casadi.identification.fitting.unknowns import (
     memory_prior,
 )
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.simulation.stepper import SimulationError, Steps
 from psa_casadi.simulation.stepper import run as simulate
 from psa_casadi.variables import nominal_value
 
@@ -38,12 +39,6 @@ class Begun:
     x: FloatArray
     by_parameter: FloatArray
     by_state: FloatArray
-
-
-def searched_states(structure: Structure) -> tuple[str, ...]:
-    """Return the states whose start is searched: those of the own equations, and memories."""
-    resting = resting_states(structure)
-    return tuple(s.name for s in structure.states if s.name not in resting)
 
 
 def resting_states(structure: Structure) -> tuple[str, ...]:
@@ -118,7 +113,7 @@ def coordinates_of(
     parameters = [model.parameter(n) for n in free]
     log = np.array([p.log and values[p.name] > 0 for p in parameters], dtype=bool)
     memories = {q.name for c in model.effects for q in c.states if q.memory}
-    names = memories if known_start else searched_states(s)
+    names = memories if known_start else {q.name for q in s.states} - {*resting_states(s)}
     states = [q for q in s.states if q.name in names]
     spans = measured_spans(runs)
     sizes = [nominal_value(q.nominal, values) for q in states]
@@ -190,11 +185,7 @@ def traced(
     rtol: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return one output (stop,) and its derivatives (stop, k) by parameters or initial states."""
-    steps = simulate(
-        model, run.time[: run.stop], run.inputs[: run.stop], x0,
-        rtol=rtol, hold=run.signals.hold, unknowns=unknowns, s0=s0, output=output,
-        steps_limit=_STEPS, steps_most=_MEAN_STEPS * run.stop,
-    )  # fmt: skip
+    steps = _steps(model, run, x0, run.stop, rtol, unknowns=unknowns, s0=s0, output=output)
     none = np.zeros((run.stop, 0))
     slopes = none if steps.sensitivity is None else steps.sensitivity
     return steps.y[:, model.output_names.index(output)], slopes
@@ -209,12 +200,7 @@ def shown_by(
     zeros: tuple[str, ...] = (),
 ) -> FloatArray:
     """Return all outputs (stop, ny) of one experiment, with sensors' zeros. Raises PsaError."""
-    begun = start_of(model, run.inputs[0], dict(start))
-    steps = simulate(
-        model, run.time[:stop], run.inputs[:stop], begun.x, rtol=rtol, hold=run.signals.hold,
-        steps_limit=_STEPS, steps_most=_MEAN_STEPS * stop,
-    )  # fmt: skip
-    shown = steps.y.copy()
+    shown = _steps(model, run, start_of(model, run.inputs[0], dict(start)).x, stop, rtol).y.copy()
     for name in zeros:
         shown[:, model.output_names.index(name)] += start.get(zero_name(name), 0.0)
     return shown
@@ -222,11 +208,15 @@ def shown_by(
 
 def states_of(model: Model, run: Run, start: Mapping[str, float], rtol: float) -> FloatArray:
     """Return all states (n, nx) of one experiment. Raises PsaError."""
-    begun = start_of(model, run.inputs[0], dict(start))
+    return _steps(model, run, start_of(model, run.inputs[0], dict(start)).x, run.signals.n, rtol).x
+
+
+def _steps(model: Model, run: Run, x0: FloatArray, stop: int, rtol: float, **wanted: Any) -> Steps:
+    """Simulate the first samples of an experiment from a state."""
     return simulate(
-        model, run.time, run.inputs, begun.x, rtol=rtol, hold=run.signals.hold,
-        steps_limit=_STEPS, steps_most=_MEAN_STEPS * run.signals.n,
-    ).x  # fmt: skip
+        model, run.time[:stop], run.inputs[:stop], x0, rtol=rtol, hold=run.signals.hold,
+        steps_limit=_STEPS, steps_most=_MEAN_STEPS * stop, **wanted,
+    )  # fmt: skip
 
 
 #: Tolerance of the first look at a model whose states' sizes are not known.

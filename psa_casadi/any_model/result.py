@@ -66,6 +66,8 @@ def _judged_errors(
 
 
 FORMAT = "psa_casadi.own_model_diagnosis/1"
+#: What the document has of a correction.
+_OF_CORRECTION = ("port", "of", "evidence", "share", "unit", "variable")
 
 
 @dataclass(frozen=True)
@@ -120,11 +122,6 @@ class FreeFunction:
     variable_unit: str
     along: FloatArray
     added: FloatArray
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return its entry in the document, without the arrays."""
-        names = ("port", "of", "evidence", "share", "unit", "variable")
-        return {n: getattr(self, n) for n in names}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -197,7 +194,9 @@ class OdeDiagnosis(Reported):
             "missed": told(self.missed, "seen", "where"),
             "remaining": told(self.remaining, "seen", "where"),
             "unnamed": self.unnamed,
-            "correction": None if self.correction is None else self.correction.to_dict(),
+            "correction": None
+            if self.correction is None
+            else {n: getattr(self.correction, n) for n in _OF_CORRECTION},
             "budget": asdict(self.budget),
             "notes": list(self.notes),
             "values": dict(self.model.values),

@@ -105,20 +105,24 @@ def runs_of(
     Raises InputError for inputs that are missing or have gaps, and where no output was measured.
     """
     problems = Problems()
+    fitted = {s.sha256: s.name for s in given}
     for s in (*given, *holdout):
         _check(model, s, problems)
-    _refuse_twins(given, holdout, problems)
+    for s in [s for s in holdout if s.sha256 in fitted]:
+        problems.add(
+            f"signals '{s.name}' of `holdout` are those of '{fitted[s.sha256]}', which is"
+            " fitted; held-out samples must be others."
+        )
     problems.raise_if_any()
     shadows = [[_shadow(model, s) for s in part] for part in (given, holdout)]
     experiments = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
     both = zip((*given, *holdout), experiments, strict=True)
-    return tuple(
-        Run(
-            s, s.time - s.time[0], _inputs(model, s), _outputs(model, s), e.used, e.held_out,
-            np.ones(len(model.output_names)),
-        )
-        for s, e in both
-    )  # fmt: skip
+    runs = []
+    for s, e in both:
+        inputs = np.column_stack([np.empty((s.n, 0)), *(s.columns[n] for n in model.input_names)])
+        outputs, noise = _outputs(model, s), np.ones(len(model.output_names))
+        runs.append(Run(s, s.time - s.time[0], inputs, outputs, e.used, e.held_out, noise))
+    return tuple(runs)
 
 
 def varied(run: Run) -> int | None:
@@ -136,16 +140,6 @@ def told_of_columns(model: Model, runs: Sequence[Run]) -> tuple[Note, ...]:
         *(note("stairs", input=n, records=records) for n, records in held.items() if records),
         *(note("no_column", output=n) for n in absent),
     )
-
-
-def _refuse_twins(given: Sequence[Signals], holdout: Sequence[Signals], problems: Problems) -> None:
-    fitted = {s.sha256: s.name for s in given}
-    for s in holdout:
-        if s.sha256 in fitted:
-            problems.add(
-                f"signals '{s.name}' of `holdout` are those of '{fitted[s.sha256]}', which is"
-                " fitted; held-out samples must be others."
-            )
 
 
 def _check(model: Model, s: Signals, problems: Problems) -> None:
@@ -166,11 +160,6 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
             f"signals '{s.name}' have no output of the model '{model.name}' with eight samples or"
             f" more; the model's are {model.output_names}.{unit_hint(s.columns)}"
         )
-
-
-def _inputs(model: Model, s: Signals) -> FloatArray:
-    columns = [s.columns[n] for n in model.input_names]
-    return np.column_stack([np.empty((s.n, 0)), *columns])
 
 
 def _outputs(model: Model, s: Signals) -> FloatArray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from psa_casadi.any_model.fit import OdeFit, fit_ode, refitted
+from psa_casadi.any_model.fit import OdeFit, refitted
 from psa_casadi.any_model.hypothesis import (
     OdeHypothesis,
     OdeView,
@@ -25,9 +25,9 @@ from psa_casadi.any_model.identify import relevelled
 from psa_casadi.any_model.runs import Run
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.screening import Score, Together, best_sets, evidence
+from psa_casadi.diagnosis.screening import Score, best_sets, evidence
 from psa_casadi.diagnosis.search.hypothesis import another_minimum, inside_ranges
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import PsaError
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.stepper import SimulationError
@@ -78,7 +78,7 @@ class Known:
 
     def of_fitted(self, h: OdeHypothesis) -> float:
         """Evidence less the price of the causes: the score of the fitted samples alone."""
-        return self.evidence(h) - thresholds().price * len(h.causes)
+        return self.evidence(h) - LIMITS.price * len(h.causes)
 
     def score(self, h: OdeHypothesis) -> float:
         """The score of all samples, with what the fitted ones predict of held-out blocks.
@@ -112,12 +112,20 @@ class Known:
 
     def slight(self, h: OdeHypothesis) -> tuple[str, ...]:
         """Name the causes that remove too little beside the others to be told from their form."""
-        less = [(c.name, self.found.get(h.names - {c.name})) for c in h.causes]
-        return tuple(
-            name
-            for name, before in less
-            if before and before.causes and self._share(h, before) <= thresholds().further
-        )
+        names = []
+        for cause in h.causes:
+            before = self.found.get(h.names - {cause.name})
+            if before is None or not before.causes:
+                continue
+            # what a cause removes of the error over what the other causes remove
+            levels = [max(o.level, 1e-300) for o in before.fit.outputs]
+            root, old, new = (
+                sum((t / s) ** 2 for t, s in zip(x.train, levels, strict=True))
+                for x in (self.found[NONE], before, h)
+            )
+            if root > old and (old - new) / (root - old) <= LIMITS.further:
+                names.append(cause.name)
+        return tuple(names)
 
     def stands(self, h: OdeHypothesis) -> bool:
         """Whether every cause is itself, can be told, and is confirmed by held-out data."""
@@ -133,15 +141,6 @@ class Known:
             if not held_out_confirms(h, before, self.runs, self.colour, gained):
                 return False
         return True
-
-    def _share(self, h: OdeHypothesis, before: OdeHypothesis) -> float:
-        """Return what a cause removes of the error over what the other causes remove."""
-        levels = [max(o.level, 1e-300) for o in before.fit.outputs]
-        root, old, new = (
-            sum((t / s) ** 2 for t, s in zip(x.train, levels, strict=True))
-            for x in (self.found[NONE], before, h)
-        )
-        return (old - new) / (root - old) if root > old else np.inf
 
     def best(self) -> OdeHypothesis:
         """Return the hypothesis of the highest score that is worth having, fitted to its end."""
@@ -188,7 +187,7 @@ def search(
         known.colour = view.screening.colour
         if len(best.causes) > 1:
             exchange(known, best)
-        if view.shows and len(best.causes) < thresholds().most_causes:
+        if view.shows and len(best.causes) < LIMITS.most_causes:
             add_causes(known, best, view)
     return known
 
@@ -203,7 +202,10 @@ def add_causes(known: Known, h: OdeHypothesis, view: OdeView) -> None:
         return
     for pair in best_sets(h.fit, view.trials, view.screening.colour, 2)[:_PAIRS]:
         known.progress(f"fitting {' and '.join(sorted(pair.names))}")
-        known.note(with_pair(known, h, pair))
+        pairs = zip(pair.directions, pair.gains, strict=True)
+        added = [(d.effect, d.values, d.unit_gain if d.finite else g) for d, g in pairs]
+        fit = _quick(known, h, added, 2 * _QUICK)
+        known.note(hypothesis_of((*h.causes, *(e for e, _, _ in added)), fit, known.runs))
 
 
 def exchange(known: Known, h: OdeHypothesis) -> None:
@@ -239,20 +241,9 @@ def with_cause(known: Known, h: OdeHypothesis, scores: Sequence[Score]) -> OdeHy
     if any(q.memory for q in effect.states):
         trials = [d for d in known.views[NONE].trials if d.effect is effect]
         starts += [(d.values, side * _FULL * d.unit_gain) for d in trials for side in (1, -1)]
-    fits = side_by_side(lambda s: _quick(known, h, [(effect, *s)], h.fit), starts)
-    good = [f for f in fits if f is not None]
-    best = min(good, key=lambda f: f.cost, default=None)
+    fits = side_by_side(lambda s: _quick(known, h, [(effect, *s)]), starts)
+    best = min((f for f in fits if f is not None), key=lambda f: f.cost, default=None)
     return hypothesis_of((*h.causes, effect), best, known.runs)
-
-
-def with_pair(known: Known, h: OdeHypothesis, pair: Together) -> OdeHypothesis | None:
-    """Fit quickly with two more causes at once; None if that fails."""
-    added = [
-        (d.effect, d.values, d.unit_gain if d.finite else g)
-        for d, g in zip(pair.directions, pair.gains, strict=True)
-    ]
-    fit = _quick(known, h, added, h.fit, 2 * _QUICK)
-    return hypothesis_of((*h.causes, *(e for e, _, _ in added)), fit, known.runs)
 
 
 def without(known: Known, h: OdeHypothesis, cause: Component) -> OdeHypothesis | None:
@@ -272,25 +263,23 @@ def _quick(
     known: Known,
     h: OdeHypothesis,
     added: Sequence[tuple[Component, dict[str, float], float]],
-    before: OdeFit,
     evaluations: int = _QUICK,
 ) -> OdeFit | None:
     """Fit with more effects from their trial values and gains; at a third of these if that fails.
 
     A fit that is worse than the one without them has failed. None where both fail.
     """
+    before = h.fit
     model = known.table.with_effects(before, [*h.causes, *(e for e, _, _ in added)])
-    free = [*before.unknowns.names, *(n for e, _, _ in added for n in e.fitted)]
     for share in (1.0, 0.3):
         values: dict[str, float] = {}
         for effect, trial, gain in added:
             low, high = model.parameter(effect.gain or "").bounds
             values |= {**trial, effect.gain or "": float(np.clip(share * gain, low, 0.9 * high))}
         try:
-            fit = fit_ode(
-                model.with_values(values), known.runs, free, levels=before.levels,
-                starts=before.starts(), evaluations=evaluations, tolerance=1e-3,
-                rtol=before.rtol, zeros=before.zeros, known_start=before.known_start,
+            fit = refitted(
+                before, known.runs, model=model.with_values(values),
+                evaluations=evaluations, tolerance=1e-3,
             )  # fmt: skip
         except PsaError:
             continue

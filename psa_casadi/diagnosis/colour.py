@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import filtered, first_order_noise
 from psa_casadi.records.repeats import autoregression_of
@@ -50,7 +49,8 @@ class Colour:
         The noise's density at frequency 0 over its mean density: (1 + r)/(1 - r) of a first-order
         autoregression.
         """
-        each = [_at_rest(a) / p for a, p in zip(self.autoregression, self._powers, strict=True)]
+        rest = [1.0 / max((1.0 - float(np.sum(a))) ** 2, 1e-6) for a in self.autoregression]
+        each = [d / p for d, p in zip(rest, self._powers, strict=True)]
         return max(1.0, float(np.average(each, weights=self.lengths)))
 
     @property
@@ -60,8 +60,10 @@ class Colour:
 
     @cached_property
     def _powers(self) -> tuple[float, ...]:
-        """Variance of every record's noise over that of w."""
-        return tuple(_power(a) for a in self.autoregression)
+        """Variance of every record's noise over that of w: its impulse response's square sum."""
+        impulse = np.eye(1, 4096)[0]
+        each = (filtered([1.0], np.append(1.0, -a), impulse) for a in self.autoregression)
+        return tuple(float(np.sum(e**2)) for e in each)
 
     def whiten(self, signal: FloatArray) -> FloatArray:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
@@ -112,19 +114,15 @@ def colour_of(
     """
     given = list(known or [None] * len(lengths))
     top = bottom = 0.0
-    first = 0
-    for length, own in zip(lengths, given, strict=True):
-        part = remainder[first : first + length]
+    ends = np.cumsum(lengths)[:-1]
+    for part, own in zip(np.split(remainder, ends), given, strict=True):
         if own is None:
             top += float(part[1:] @ part[:-1])
             bottom += float(part @ part)
-        first += length
     seen = top / bottom if bottom > 0 else 0.0
     if removed is not None and bottom > 0:
-        ends = np.cumsum(lengths)[:-1]
         pairs = zip(np.split(removed, ends), given, strict=True)
-        parts = [q for q, own in pairs if own is None and len(q)]
-        seen = _before(seen, parts)
+        seen = _before(seen, [q for q, own in pairs if own is None and len(q)])
     correlation = float(np.clip(seen, 0.0, _LARGEST))
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
     each = tuple(shared if own is None else own for own in given)
@@ -243,20 +241,6 @@ def _with_level(
     return replace(colour, level=max(level, 1e-15))
 
 
-def _at_rest(a: FloatArray) -> float:
-    """Density of the noise at frequency 0 over that of w."""
-    return float(1.0 / max((1.0 - np.sum(a)) ** 2, 1e-6))
-
-
-def _power(a: FloatArray) -> float:
-    """Variance of the noise over that of w: the sum of squares of its impulse response."""
-    if not a.size:
-        return 1.0
-    impulse = np.zeros(4096)
-    impulse[0] = 1.0
-    return float(np.sum(filtered([1.0], np.concatenate([[1.0], -a]), impulse) ** 2))
-
-
 #: Neighbours correlate, the spectrum has a line, the residual or its size follows the drive.
 Seen = Literal["correlation", "line", "drive", "size"]
 
@@ -271,7 +255,8 @@ class Omnibus:
 
     `seen` is what that test sees, `output` the one of several whose residual it is. `excess` is the
     share of the residual's power above the noise; `size` [m] the rms of what the test sees,
-    `knowable` [m] that below which nothing can be told of a stack.
+    `knowable` [m] that below which nothing can be told of a stack, `alarms_below` the probability
+    from which on it does not alarm.
     """
 
     p_value: float
@@ -279,12 +264,13 @@ class Omnibus:
     seen: Seen
     size: float
     knowable: float
+    alarms_below: float
     output: str = ""
 
     @property
     def alarm(self) -> bool:
         """Whether something besides noise is in the residual, large enough to be told."""
-        return self.p_value < thresholds().alarm and self.size > self.knowable
+        return self.p_value < self.alarms_below and self.size > self.knowable
 
     @property
     def finding(self) -> Note:
@@ -301,6 +287,7 @@ def omnibus(
     *,
     knowable: float,
     even: bool,
+    alarms_below: float,
 ) -> Omnibus:
     """Test a residual (samples,) [m] for structure that noise of the given colour does not have.
 
@@ -312,7 +299,7 @@ def omnibus(
     """
     white = colour.whiten(residual)
     tests: dict[Seen, tuple[float, float]] = {
-        "correlation": _neighbours(white),
+        "correlation": whiteness(white),
         "line": _fisher_line(white),
         "drive": _features(white, voltage, time, colour),
     }
@@ -323,16 +310,14 @@ def omnibus(
     size = float(np.sqrt(share * power))
     excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
     p = min(1.0, len(tests) * p)
-    return Omnibus(p, excess, seen, size, knowable)
+    return Omnibus(p, excess, seen, size, knowable, alarms_below)
 
 
-def whiteness(white: FloatArray) -> float:
-    """Return the p-value of Ljung and Box's test (1978) that neighbours are not correlated."""
-    return _neighbours(white)[0]
+def whiteness(white: FloatArray) -> tuple[float, float]:
+    """Return the p-value of Ljung and Box's test (1978) that neighbours are not correlated.
 
-
-def _neighbours(white: FloatArray) -> tuple[float, float]:
-    """Return the p-value, and the largest correlation: what is correlated has that share."""
+    And the largest correlation: what is correlated has that share.
+    """
     n = len(white)
     centred = white - np.mean(white)
     power = float(centred @ centred)

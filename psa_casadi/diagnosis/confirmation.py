@@ -10,7 +10,7 @@ import scipy
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
 from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage
 from psa_casadi.notes import Note, note
@@ -39,6 +39,7 @@ def unconfirmed(
     lost: float,
     partly: bool,
     hidden: float,
+    limits: Thresholds,
 ) -> Note | None:
     """Return why the records do not confirm the causes of an extended model; None where they do.
 
@@ -55,7 +56,7 @@ def unconfirmed(
     if hidden > _HIDDEN:
         return note("saturated", share=hidden)
     low, high = gain.interval
-    if low <= _DOUBLED and high >= whole and lost > thresholds().held_out:
+    if low <= _DOUBLED and high >= whole and lost > limits.held_out:
         return note("gain_unknown", low=low, high=high)
     records = [e.record for e in experiments]
     if doubtful_voltage(records):
@@ -89,6 +90,7 @@ def held_out_excess(
     predicted: Sequence[FloatArray],
     colour: Colour,
     noise: Sequence[NoiseFloor],
+    limits: Thresholds,
 ) -> Excess:
     """Return by which factor held-out errors exceed those of the fit; 1 where noise would do so.
 
@@ -107,12 +109,12 @@ def held_out_excess(
         for part, floor, mine in zip(parts, noise, own, strict=True)
         if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
     ]
-    found = _within(fit, experiments, parts, colour, own)
+    found = _within(fit, experiments, parts, colour, own, limits)
     worst = max(beyond, default=0.0)
-    if worst > max(thresholds().unseen_ratio_of_records, found.factor):
-        found = Excess(worst, thresholds().unseen_alarm)
+    if worst > max(limits.unseen_ratio_of_records, found.factor):
+        found = Excess(worst, limits.unseen_alarm)
     size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / found.factor**2))
-    return found if size > knowable_of(fit, experiments) else Excess()
+    return found if size > knowable_of(fit, experiments, limits) else Excess()
 
 
 def _within(
@@ -121,6 +123,7 @@ def _within(
     parts: Sequence[FloatArray],
     colour: Colour,
     own: Sequence[bool],
+    limits: Thresholds,
 ) -> Excess:
     scales = [1.0 / s if mine else 0.0 for s, mine in zip(fit.sigma, own, strict=True)]
     held = np.concatenate([p * s for p, s in zip(parts, scales, strict=True)])
@@ -140,11 +143,8 @@ def _within(
     kurtosis = max(3.0, float(np.mean(learnt**2)) / power**2)
     spread = np.sqrt((kurtosis - 1.0) * (1.0 / m + 1.0 / n))
     chance = float(scipy.special.ndtr(-(ratio * (n - k) / (n + k) - 1.0) / spread))
-    return Excess(float(np.sqrt(ratio)), chance) if _tells(ratio, chance) else Excess()
-
-
-def _tells(ratio: float, chance: float) -> bool:
-    return chance < thresholds().unseen_alarm and ratio > thresholds().unseen_ratio ** 2
+    tells = chance < limits.unseen_alarm and ratio > limits.unseen_ratio**2
+    return Excess(float(np.sqrt(ratio)), chance) if tells else Excess()
 
 
 #: Shares of the samples, and of the voltage's span, that are worth a word.

@@ -95,18 +95,6 @@ def _cosines(q: FloatArray, first: int, count: int) -> FloatArray:
     return np.cos(np.pi * np.outer(q, np.arange(first, first + count)))
 
 
-def _voltage_curve(s: Signals, k: int) -> FloatArray:
-    return s.respond(k, _cosines(s.voltage(k), 1, CURVE))
-
-
-def _force_curve(s: Signals, k: int) -> FloatArray:
-    return s.respond(k, _cosines(s.displacement(k), 1, CURVE))
-
-
-def _reading_curve(s: Signals, k: int) -> FloatArray:
-    return _cosines(s.displacement(k), 1, CURVE)
-
-
 def _direction(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
     side = (q[:, None] - plays(q, [NARROW])) / NARROW
@@ -153,10 +141,6 @@ def _time(s: Signals, k: int) -> FloatArray:
     return _cosines((t - t[0]) / (t[-1] - t[0]), 1, BRANCH)
 
 
-def _gain_in_time(s: Signals, k: int) -> FloatArray:
-    return s.displacement(k)[:, None] * _time(s, k)
-
-
 def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
     """Return z of tau z' + z = x with x linear between samples, z(0) = x(0)."""
     if np.ptp(step[1:]) < 1e-6 * step[-1]:
@@ -189,16 +173,19 @@ def _smooth(count: int) -> FloatArray:
 
 
 KINDS = (
-    Kind("curve", "drive voltage", _voltage_curve, _smooth),
-    Kind("curve", "reading", _reading_curve, _smooth),
-    Kind("curve", "force", _force_curve, _smooth, fast=True),
+    Kind("curve", "drive voltage",
+         lambda s, k: s.respond(k, _cosines(s.voltage(k), 1, CURVE)), _smooth),
+    Kind("curve", "reading", lambda s, k: _cosines(s.displacement(k), 1, CURVE), _smooth),
+    Kind("curve", "force",
+         lambda s, k: s.respond(k, _cosines(s.displacement(k), 1, CURVE)), _smooth, fast=True),
     Kind("direction", "force", _direction, _smooth),
     Kind("memory", "force", _memory, _flat),
     Kind("relaxation", "force", _relaxation, _flat),
     Kind("modes", "force", _modes, _flat),
     Kind("time", "reading", _time, _smooth),
-    Kind("gain in time", "force", _gain_in_time, _smooth),
-)
+    Kind("gain in time", "force",
+         lambda s, k: s.displacement(k)[:, None] * _time(s, k), _smooth),
+)  # fmt: skip
 
 
 #: Coordinates this near to a bound stay there.

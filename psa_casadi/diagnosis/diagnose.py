@@ -1,6 +1,7 @@
 """Diagnose: fit the base, ask whether it is driven, search for causes, judge, weigh columns."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupte
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
-from psa_casadi.diagnosis.task import Method, Task, Tried, shows_ringing, thresholds, using
+from psa_casadi.diagnosis.task import Method, Task, Thresholds, Tried, shows_ringing
 from psa_casadi.diagnosis.verdict import NAMING, conclude
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -77,28 +78,36 @@ class Driven:
 
 
 def driven(
-    base: Fit, model: Model, experiments: Sequence[Experiment], progress: Progress
+    base: Fit,
+    model: Model,
+    experiments: Sequence[Experiment],
+    progress: Progress,
+    limits: Thresholds,
 ) -> Driven:
     """Return whether the `base` fit explains the displacement; else what the other sign explains.
 
     `model` is where the base fit started.
     """
-    if shows_ringing(experiments) and explained(base, experiments) < thresholds().follows:
+    if shows_ringing(experiments) and explained(base, experiments) < limits.follows:
         base = from_resonances(base, experiments, progress) or base
     share = explained(base, experiments)
     records = [e.record for e in experiments]
     doubts = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_quantity)
     notes = tuple(s for doubt in doubts if (s := doubt(records)))
-    if share >= thresholds().follows and correlation(records) > thresholds().falling:
+    if share >= limits.follows and correlation(records) > limits.falling:
         return Driven(follows=True, notes=notes)
     progress("the displacement with flipped sign")
-    other = _flipped(model, experiments)
-    shown = max(share, 0.0)
-    if other > max(share, thresholds().follows):
+    turned = [
+        replace(e, record=replace(e.record, displacement=-measured(e.record))) for e in experiments
+    ]
+    other, shown = 0.0, max(share, 0.0)
+    with suppress(PsaError):
+        other = explained(fit_base(model, turned), turned)
+    if other > max(share, limits.follows):
         return Driven(False, (note("flipped", flipped=other, share=shown), *notes))
-    if share < thresholds().follows:
+    if share < limits.follows:
         linear = filtered(experiments)
-        if linear > thresholds().follows:
+        if linear > limits.follows:
             return Driven(False, (note("filtered", linear=linear, share=shown), *notes), True)
         quantity = doubtful_quantity(records)
         said = note("not_driven", share=shown)
@@ -118,15 +127,11 @@ def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
         valid = np.isfinite(given)
         time, v = e.record.time[valid], e.record.voltage[valid]
         moving = np.sum(_about_trend(time, v) ** 2) > _TREND * np.sum((v - np.mean(v)) ** 2)
-        about = _about_trend if moving else _about_mean
-        left += float(np.sum(about(time, (given - y)[valid]) ** 2))
-        total += float(np.sum(about(time, given[valid]) ** 2))
+        rows = ((given - y)[valid], given[valid])
+        about = [_about_trend(time, r) if moving else r - np.mean(r) for r in rows]
+        left += float(np.sum(about[0] ** 2))
+        total += float(np.sum(about[1] ** 2))
     return 1.0 - left / total if total > 0 else 0.0
-
-
-def _about_mean(_: FloatArray, signal: FloatArray) -> FloatArray:
-    found: FloatArray = signal - np.mean(signal)
-    return found
 
 
 def _about_trend(time: FloatArray, signal: FloatArray) -> FloatArray:
@@ -156,16 +161,6 @@ def filtered(experiments: Sequence[Experiment]) -> float:
     return 1.0 - left / total if total > 0 else 0.0
 
 
-def _flipped(model: Model, experiments: Sequence[Experiment]) -> float:
-    other = [
-        replace(e, record=replace(e.record, displacement=-measured(e.record))) for e in experiments
-    ]
-    try:
-        return explained(fit_base(model, other), other)
-    except PsaError:
-        return 0.0
-
-
 #: The places that effects belong to, in the order in which they are told.
 _PLACES = ("drive", "sensor", "plant", "environment")
 #: Probability below which an effect is no rival.
@@ -188,58 +183,47 @@ def decisions(
     columns = [q.column for q in experiments[0].further]
     if is_measured(experiments):
         columns.append(LOAD)
+    first, last, colour = steps[0].view.of, steps[-1].view.of, steps[-1].screening.colour
     found = []
     for column in columns:
         task.progress(f"the same without {column}")
         effects = task.table
         if column == LOAD:
             effects = tuple(e for e in table if e in effects or e.measured_by == LOAD)
-        alone = replace(
-            task,
-            experiments=without_column(experiments, column),
-            table=effects,
-            keep=lambda _: None,
-            watch=lambda _: None,
+        apart = without_column(experiments, column)
+        alone = Task(apart, effects, task.method, task.progress, hidden=task.hidden)
+        now, then = (
+            _named(steps, task.limits) if verdict in NAMING else {},
+            _named(search(alone), task.limits),
         )
-        found.append(_decision(column, steps, search(alone), effects, verdict))
+        k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
+        gained = further_gains(first.fit, last.fit, colour).get(column, 0.0)
+        own = {e.name: e for e in effects}
+        found.append(
+            Decision(
+                column=column,
+                role="input" if k is None else "output",
+                unit="N" if k is None else COLUMNS[column].unit,
+                noise=None if k is None else colour.further[k].rms,
+                base_rms=None if k is None else first.held_further[k],
+                extended_rms=None if k is None else last.held_further[k],
+                named=now,
+                named_without=then,
+                ruled_out=tuple(n for n in then if n not in now),
+                evidence=gained,
+                outcome=decided(column, now, then, gained, own, clear=verdict == "adequate"),
+            )
+        )
     return tuple(found)
 
 
-def _decision(
-    column: str,
-    steps: Sequence[Step],
-    before: Sequence[Step],
-    table: Sequence[Component],
-    verdict: Verdict,
-) -> Decision:
-    first, last = steps[0].view.of, steps[-1].view.of
-    now, then = _named(steps) if verdict in NAMING else {}, _named(before)
-    effects = {e.name: e for e in table}
-    k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
-    gained = further_gains(first.fit, last.fit, steps[-1].screening.colour).get(column, 0.0)
-    ruled_out = tuple(n for n in then if n not in now)
-    return Decision(
-        column=column,
-        role="input" if k is None else "output",
-        unit="N" if k is None else COLUMNS[column].unit,
-        noise=None if k is None else steps[-1].screening.colour.further[k].rms,
-        base_rms=None if k is None else first.held_further[k],
-        extended_rms=None if k is None else last.held_further[k],
-        named=now,
-        named_without=then,
-        ruled_out=ruled_out,
-        evidence=gained,
-        outcome=decided(column, now, then, gained, effects, clear=verdict == "adequate"),
-    )
-
-
-def _named(steps: Sequence[Step]) -> dict[str, float]:
+def _named(steps: Sequence[Step], limits: Thresholds) -> dict[str, float]:
     """Return the named set of every cause, with the probability of each effect."""
     found: dict[str, float] = {}
     for step in steps:
         if step.chosen is None:
             continue
-        for name in (step.cause.name, *told_from(step)):
+        for name in (step.cause.name, *told_from(step, limits)):
             if step.probability.get(name, 0.0) >= _RIVAL:
                 found.setdefault(name, step.probability[name])
     return found
@@ -315,59 +299,44 @@ def diagnose(
     """
     method = method or Method()
     given, kept = records_given(records), records_given(holdout)
-    with using(method.thresholds):
-        with stage("preparing"):
-            table = list(effects if effects is not None else known_effects().values())
-            (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
-            ordered, apart = in_one_order(whole), in_one_order(held)
-            clean, said, hidden = _cleaned(ordered)
-            said += [*cut, *cut_too]
-            judged = [cleaned(r) for r in apart]
-            if "one clock" not in method.without:
-                clean, judged = _on_one_clock(clean, said), _on_one_clock(judged, said)
-            (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
-            start, scale_given = chosen_start(clean, model, stiffness)
-            (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
-            said += [*means, *means_too, *long, *long_too]
-            experiments = divided(clean, judged)
-            columns = columns_of(start, [e.record for e in experiments])
-            experiments = with_levels(experiments, columns.fitted)
-            start, preferred = _in_form(columns.model, hysteresis, experiments, progress)
-            refuse_stuck([e.record for e in experiments])
-            known = {e.name for e in table}
-            searched = (*table, *(c for c in start.effects if c.more_of in known))
-            start = start.without(c.name for c in searched if c.gain is not None)
-            there = {c.name for c in start.components}
-            table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-            said += [*columns.left_out, *preferred]
-        so_far: list[Fit] = []
-        task = Task(
-            experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden
-        )
-        try:
-            # from the end: the screening begins at the front
-            with compiled_ahead(start.with_effect(e) for e in reversed(table)):
-                found = _diagnose(start, task, scale_given)
-            return replace(found, remarks=(*found.remarks, *said))
-        except KeyboardInterrupt:
-            if not so_far:
-                raise
-            raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
-
-
-def _in_form(
-    start: Model,
-    hysteresis: Hysteresis | None,
-    experiments: Sequence[Experiment],
-    progress: Progress,
-) -> tuple[Model, tuple[Note, ...]]:
-    """Return where the base fit starts, in the form that is asked for; and why it is the best."""
-    forms = forms_of(start, hysteresis)
-    if len(forms) == 1:
-        return forms[0], ()
-    found, why = search_forms(forms, experiments, progress=progress)
-    best = next(m for m in forms if m.components == found.best.model.components)
-    return best, () if why is None else (why,)
+    with stage("preparing"):
+        table = list(effects if effects is not None else known_effects().values())
+        (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
+        ordered, apart = in_one_order(whole), in_one_order(held)
+        clean, said, hidden = _cleaned(ordered)
+        said += [*cut, *cut_too]
+        judged = [cleaned(r) for r in apart]
+        if "one clock" not in method.without:
+            clean, judged = _on_one_clock(clean, said), _on_one_clock(judged, said)
+        (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
+        start, scale_given = chosen_start(clean, model, stiffness)
+        (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
+        said += [*means, *means_too, *long, *long_too]
+        experiments = divided(clean, judged)
+        columns = columns_of(start, [e.record for e in experiments])
+        experiments = with_levels(experiments, columns.fitted)
+        forms, best, why = forms_of(columns.model, hysteresis), None, None
+        if forms[1:]:
+            best, why = search_forms(forms, experiments, progress=progress)
+        start = next(m for m in forms if not best or m.components == best.best.model.components)
+        refuse_stuck([e.record for e in experiments])
+        known = {e.name for e in table}
+        searched = (*table, *(c for c in start.effects if c.more_of in known))
+        start = start.without(c.name for c in searched if c.gain is not None)
+        there = {c.name for c in start.components}
+        table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
+        said += [*columns.left_out, *([why] if why else [])]
+    so_far: list[Fit] = []
+    task = Task(experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden)
+    try:
+        # from the end: the screening begins at the front
+        with compiled_ahead(start.with_effect(e) for e in reversed(table)):
+            found = _diagnose(start, task, scale_given)
+        return replace(found, remarks=(*found.remarks, *said))
+    except KeyboardInterrupt:
+        if not so_far:
+            raise
+        raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
@@ -413,44 +382,45 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         refuse_stuck([e.record for e in experiments])
         base, task = _base(start, replace(task, experiments=experiments))
     experiments = task.experiments
-    seen = driven(base, start, experiments, progress)
+    seen = driven(base, start, experiments, progress, task.limits)
     if not seen.follows:
         steps = unsearched(base, task)
         found = conclude(
-            steps, experiments, table, scale_given, driven=seen.filtered, hidden=task.hidden
+            steps,
+            experiments,
+            table,
+            scale_given,
+            task.limits,
+            driven=seen.filtered,
+            hidden=task.hidden,
         )
         return replace(found, remarks=(*found.remarks, *seen.notes))
-    steps = _search(base, task)
+    steps = steps_of(best_first(base, task), task)
+    task.keep(steps[-1].fit)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
         stuck += more
         steps, task = _searched(start, replace(task, experiments=fewer))
         experiments = task.experiments
-    steps, task, between = _with_smooth_voltage(start, steps, task)
-    experiments = task.experiments
+    between = None
+    if "between samples" not in task.method.without:
+        between = smooth_between(steps[0].fit, experiments)
+    if between is not None:
+        again, other = _searched(start, replace(task, experiments=between[0]))
+        if again[0].fit.rms < steps[0].fit.rms:
+            steps, task, experiments = again, other, other.experiments
+        else:
+            between = None
     progress("judging")
-    found = conclude(steps, experiments, table, scale_given, hidden=task.hidden)
+    found = conclude(steps, experiments, table, scale_given, task.limits, hidden=task.hidden)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
+    more_said = [
+        *([between[1]] if between else []),
+        *([note("stuck", count=stuck)] if stuck else []),
+    ]
     turned = [n for f in steps[0].fit.further for n in f.turned]
-    remarks = (*seen.notes, *between, *([note("stuck", count=stuck)] if stuck else []), *turned)
-    return replace(found, remarks=(*found.remarks, *remarks))
-
-
-def _with_smooth_voltage(
-    start: Model, steps: list[Step], task: Task
-) -> tuple[list[Step], Task, tuple[Note, ...]]:
-    """Search again where the voltage is smooth between its samples; return what holds, and notes.
-
-    As it is where the base's error shows none of it, or is no less with it.
-    """
-    if "between samples" not in task.method.without:
-        between = smooth_between(steps[0].fit, task.experiments)
-        if between is not None:
-            again, other = _searched(start, replace(task, experiments=between[0]))
-            if again[0].fit.rms < steps[0].fit.rms:
-                return again, other, (between[1],)
-    return steps, task, ()
+    return replace(found, remarks=(*found.remarks, *seen.notes, *more_said, *turned))
 
 
 def _base(start: Model, task: Task) -> tuple[Fit, Task]:
@@ -469,13 +439,9 @@ def _base(start: Model, task: Task) -> tuple[Fit, Task]:
 def _searched(start: Model, task: Task) -> tuple[list[Step], Task]:
     """Fit the base and search; return the steps, and the task with its columns' levels."""
     base, task = _base(start, task)
-    return _search(base, task), task
-
-
-def _search(base: Fit, task: Task) -> list[Step]:
     steps = steps_of(best_first(base, task), task)
     task.keep(steps[-1].fit)
-    return steps
+    return steps, task
 
 
 def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:

@@ -31,7 +31,16 @@ def diagnosed_model(
     told = replace(
         evidence_of(fit, found, experiments, predicted, by="psa diagnose"),
         held_out=_held_out(experiments, predicted),
-        budget=None if spent is None else _budget(spent),
+        budget=None
+        if spent is None
+        else ErrorBudget(
+            base_m=spent.excess_rms_m,
+            noise_m=spent.noise_rms_m,
+            remains_m=spent.remains_rms_m,
+            remains_percent=spent.remains_percent,
+            causes=tuple(_share(s) for s in spent.causes),
+            unnamed=None if spent.unnamed is None else _share(spent.unnamed),
+        ),
     )
     records = [e.record for e in experiments]
     return with_provenance(fit.model, found, records, stiffness_given, evidence=told)
@@ -48,7 +57,7 @@ def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
         power = float(np.sum(sums[kept])) / max(int(np.sum(counts[kept])), 1)
         return 0.5 * float(np.log(max(power, 1e-300)))
 
-    centre, half = jackknife(of, np.ones(len(counts), dtype=bool))
+    centre, half = jackknife(of, len(counts))
     records = sum(bool(e.held_out.any()) for e in experiments)
     return HeldOut(
         rms_m=errors.holdout_rms_m,
@@ -56,17 +65,6 @@ def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
         max_m=errors.holdout_max_m,
         nrmse_percent=errors.holdout_nrmse_percent,
         records=records if len(counts) == records else 0,
-    )
-
-
-def _budget(spent: Budget) -> ErrorBudget:
-    return ErrorBudget(
-        base_m=spent.excess_rms_m,
-        noise_m=spent.noise_rms_m,
-        remains_m=spent.remains_rms_m,
-        remains_percent=spent.remains_percent,
-        causes=tuple(_share(s) for s in spent.causes),
-        unnamed=None if spent.unnamed is None else _share(spent.unnamed),
     )
 
 

@@ -60,13 +60,13 @@ def parts_of(*errors: Sequence[FloatArray]) -> tuple[FloatArray, npt.NDArray[np.
     return np.reshape(sums, (-1, len(errors), outputs)), counts.reshape(-1, outputs)
 
 
-def jackknife(of: Callable[[BoolArray], float], every: BoolArray) -> tuple[float, float]:
+def jackknife(of: Callable[[BoolArray], float], k: int) -> tuple[float, float]:
     """Return a figure over all parts, and the half width of its 95 % interval.
 
     With L the figure over all of k parts and L_i that without part i it is
     L +- t_(k-1) sqrt((k-1)/k sum (L_i - mean)^2) (Efron and Tibshirani 1993, chapter 11).
     """
-    k = len(every)
+    every = np.ones(k, dtype=bool)
     if k < 2:
         return of(every), 0.0
     without = [of(every & (np.arange(k) != i)) for i in range(k)]
@@ -101,10 +101,8 @@ def held_out_residuals(
     experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
 ) -> list[FloatArray]:
     """Return measured minus predicted over the held-out samples of every experiment [m]."""
-    parts = []
-    for e, y in zip(experiments, predicted, strict=True):
-        parts.append((measured(e.record) - y)[e.held_out])
-    return parts
+    left = whole_residuals(experiments, predicted)
+    return [part[e.held_out] for e, part in zip(experiments, left, strict=True)]
 
 
 def held_out_rms(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> float:
@@ -121,11 +119,8 @@ def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     theta = fit.placed(experiments)
     for f in fit.further:
         shown = predicted_further(fit.model, experiments, fit.unknowns, theta, f, way=fit.way)
-        parts = [
-            (getattr(experiments[k].record, f.column) - x)[experiments[k].held_out]
-            for k, x in shown.items()
-        ]
-        held = np.concatenate(parts)
+        pairs = [(experiments[k], x) for k, x in shown.items()]
+        held = np.concatenate([(getattr(e.record, f.column) - x)[e.held_out] for e, x in pairs])
         found.append(rms(held) if held.size else f.rms)
     return tuple(found)
 
@@ -153,23 +148,18 @@ def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
     A record whose displacement rests counts over the largest range of all.
     """
     largest = max(e.record.range_m for e in experiments)
-    train = np.concatenate(
-        [(measured(e.record) - y)[e.used] for e, y in zip(experiments, predicted, strict=True)]
+    pairs = list(zip(experiments, whole_residuals(experiments, predicted), strict=True))
+    train = np.concatenate([left[e.used] for e, left in pairs])
+    held = np.concatenate([left[e.held_out] for e, left in pairs])
+    squares = sum(
+        float(np.sum((left[e.held_out] / (e.record.range_m or largest)) ** 2)) for e, left in pairs
     )
-    held = np.concatenate(held_out_residuals(experiments, predicted))
-    squares = shares = 0.0
-    for e, part in zip(experiments, held_out_residuals(experiments, predicted), strict=True):
-        squares += float(np.sum((part / (e.record.range_m or largest)) ** 2))
-        shares += len(part)
+    shares = float(len(held))
     if not len(held):
         held = train
         squares, shares = float(np.mean(train**2)) / largest**2, 1.0
-    return Errors(
-        train_rms_m=rms(train),
-        holdout_rms_m=rms(held),
-        holdout_max_m=float(np.max(np.abs(held))),
-        holdout_nrmse_percent=100.0 * float(np.sqrt(squares / shares)),
-    )
+    worst, percent = float(np.max(np.abs(held))), 100.0 * float(np.sqrt(squares / shares))
+    return Errors(rms(train), rms(held), worst, percent)
 
 
 def held_out_parts(
@@ -191,24 +181,17 @@ def held_out_columns(
 
 
 def gain_of(
-    experiments: Sequence[Experiment],
-    base: Sequence[FloatArray],
-    extended: Sequence[FloatArray],
+    experiments: Sequence[Experiment], base: Sequence[FloatArray], extended: Sequence[FloatArray]
 ) -> Gain:
     """Return the reduction of the held-out rms, with a jackknife interval of the errors' ratio.
 
     The interval is that of the ratio's logarithm over the parts of `held_out_parts`.
     """
     sums, counts = held_out_parts(experiments, base, extended)
-    records = sum(bool(len(r)) for r in held_out_residuals(experiments, base))
-
-    def of(kept: npt.NDArray[np.bool_]) -> float:
-        return _log_ratio(np.sum(sums[kept], axis=0))
-
-    centre, half = jackknife(of, np.ones(len(counts), dtype=bool))
-    low, high = (100.0 * (1.0 - float(np.exp(centre + side * half))) for side in (1.0, -1.0))
-    told = len(counts) if records >= FEWEST_RECORDS else 0
-    return Gain(100.0 * (1.0 - float(np.exp(centre))), (low, high), told)
+    records = sum(bool(e.held_out.any()) for e in experiments)
+    centre, half = jackknife(lambda kept: _log_ratio(np.sum(sums[kept], axis=0)), len(counts))
+    gain, low, high = (100.0 * (1.0 - float(np.exp(centre + move))) for move in (0.0, half, -half))
+    return Gain(gain, (low, high), len(counts) if records >= FEWEST_RECORDS else 0)
 
 
 def lost_elsewhere(
@@ -295,8 +278,7 @@ class Removed:
 
     def share(self, what: str, before: Sequence[FloatArray], after: Sequence[FloatArray]) -> Share:
         """Return the share of the base's excess that `after` removes of what `before` leaves."""
-        of, count = self._of(before, after)
-        centre, half = jackknife(of, np.ones(count, dtype=bool))
+        centre, half = jackknife(*self._of(before, after))
         return Share(what, centre, (centre - half, centre + half))
 
     def from_base(self, after: Sequence[FloatArray]) -> float:
@@ -376,8 +358,7 @@ def budget(
     those with the best unnamed correction; `noise` [m] is the rms of the noise.
     """
     removed = removed_from(experiments, base, noise)
-    sums, counts = held_out_parts(experiments, base, extended)
-    powers = np.sum(sums, axis=0) / max(int(np.sum(counts)), 1)
+    powers = _powers(*held_out_parts(experiments, base, extended))
     excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
     whole = errors_of(experiments, extended)
     return Budget(
@@ -385,9 +366,7 @@ def budget(
         noise_rms_m=noise,
         together=removed.share("together", base, extended),
         causes=tuple(removed.share(name, less, extended) for name, less in without),
-        unnamed=None
-        if correction is None
-        else removed.share(correction[0], extended, correction[1]),
+        unnamed=removed.share(correction[0], extended, correction[1]) if correction else None,
         remains_rms_m=remains,
         remains_percent=whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300),
     )

@@ -9,7 +9,7 @@ from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment
 
@@ -28,12 +28,13 @@ class Weighed:
     share: float
     corrections: Sequence[Correction]
     shares: Sequence[float]
-    whole: float = 0.0
+    whole: float
+    limits: Thresholds
 
     @property
     def adds(self) -> bool:
         """Do the causes remove more than their form may be wrong by, named or not?"""
-        return self.share > thresholds().form
+        return self.share > self.limits.form
 
     def beaten_by(self) -> Correction | None:
         """Return the unnamed correction that takes the names away, if there is one.
@@ -43,44 +44,21 @@ class Weighed:
         of all corrections best or but for their form, takes nothing while they do as much: it only
         has more freedom.
         """
-        own = self.evidence - thresholds().price * self.causes
+        limits = self.limits
+        own = self.evidence - limits.price * self.causes
         best = max((c.copies for c in self.corrections), default=0.0)
-        alike = min(best, 1.0 - thresholds().form)
+        alike = min(best, 1.0 - limits.form)
         for c, share in zip(self.corrections, self.shares, strict=True):
-            clearly = thresholds().clearly * temperature(max(self.evidence, self.whole, c.evidence))
-            enough = share - thresholds().form
+            clearly = limits.clearly * temperature(
+                max(self.evidence, self.whole, c.evidence), limits
+            )
+            enough = share - limits.form
             if c.copies >= alike:
-                enough = thresholds().enough * share
+                enough = limits.enough * share
             removes_more = share > 0.0 and self.share < enough
-            if removes_more and c.evidence - thresholds().price > own + clearly:
+            if removes_more and c.evidence - limits.price > own + clearly:
                 return c
         return None
-
-
-def verdict_of(
-    steps: Sequence[Step],
-    *,
-    missing: bool,
-    withdrawn: bool,
-    share: float,
-    unseen: bool = False,
-    unnamed: Collection[str] = (),
-) -> Verdict:
-    """Return the verdict on what a search found; the last step is the model with all causes.
-
-    `missing` says that the base leaves something, `withdrawn` that an unnamed correction takes the
-    names away or held-out samples do not confirm them, `share` of the held-out excess the causes
-    remove; `unseen` that held-out samples leave more than the fitted ones let expect; `unnamed` are
-    causes that stay in the model without a name.
-    """
-    named = [s for s in steps if s.chosen is not None and s.cause.name not in unnamed]
-    alarm = bool(steps) and steps[-1].test.alarm
-    return verdict_by(
-        missing=missing,
-        withdrawn=withdrawn or not named or (alarm and share < thresholds().enough),
-        ambiguous=bool(named and told_from(named[0])),
-        more=alarm or unseen or bool(unnamed),
-    )
 
 
 def verdict_by(*, missing: bool, withdrawn: bool, ambiguous: bool, more: bool) -> Verdict:
@@ -97,31 +75,33 @@ def verdict_by(*, missing: bool, withdrawn: bool, ambiguous: bool, more: bool) -
     return "partly_explained" if more else "cause_named"
 
 
-def told_from(step: Step) -> tuple[str, ...]:
+def told_from(step: Step, limits: Thresholds) -> tuple[str, ...]:
     """Effects that may as well be a step's cause: with the chosen one, the credible set."""
-    return () if step.chosen is None else rivals(step.probability, step.cause.name)
+    return () if step.chosen is None else rivals(step.probability, step.cause.name, limits)
 
 
-def rivals(probability: Mapping[str, float], cause: str) -> tuple[str, ...]:
+def rivals(
+    probability: Mapping[str, float], cause: str, limits: Thresholds = LIMITS
+) -> tuple[str, ...]:
     """Return the other effects of the credible set that holds a cause."""
-    within = credible_set(probability, thresholds().credible)
+    within = credible_set(probability, limits.credible)
     return tuple(name for name in within if name != cause)
 
 
-def too_small(causes: Sequence[Share]) -> tuple[Share, ...]:
+def too_small(causes: Sequence[Share], limits: Thresholds) -> tuple[Share, ...]:
     """Return causes that are not named where structure remains: the form of the others is wrong.
 
     Each removes less of the base's excess than a form may miss, and less than `enough` of what the
     largest does: that one is always named.
     """
-    least = least_share([c.share for c in causes])
+    least = least_share([c.share for c in causes], limits)
     return tuple(c for c in causes if c.share < least)
 
 
-def least_share(shares: Collection[float]) -> float:
+def least_share(shares: Collection[float], limits: Thresholds = LIMITS) -> float:
     """Return the share of the base's excess from which on a cause is named beside others."""
     most = max(shares, default=0.0)
-    return min(thresholds().form, thresholds().enough * most if most > 0.0 else most)
+    return min(limits.form, limits.enough * most if most > 0.0 else most)
 
 
 def withdrawn_names(
@@ -146,22 +126,22 @@ def withdrawn_names(
         why = note("beaten", by=beaten.kind.name, port=beaten.kind.port,
                    evidence=beaten.evidence, share=share)  # fmt: skip
     elif vague:
-        why = _each(vague)
+        why = _each(vague, weighed.limits)
     else:
-        why, kept = note("little", least=thresholds().enough), weighed.adds
+        why, kept = note("little", least=weighed.limits.enough), weighed.adds
     return (
         note("withdrawn", names=names, evidence=weighed.evidence, share=max(0.0, weighed.share),
              kept=kept, why=why),
     )  # fmt: skip
 
 
-def vague_note(vague: Mapping[str, Correction]) -> tuple[Note, ...]:
+def vague_note(vague: Mapping[str, Correction], limits: Thresholds) -> tuple[Note, ...]:
     """Return which causes stay in the model without a name, as corrections describe them better."""
-    return (note("vague", names=tuple(vague), why=_each(vague)),) if vague else ()
+    return (note("vague", names=tuple(vague), why=_each(vague, limits)),) if vague else ()
 
 
-def _each(vague: Mapping[str, Correction]) -> Note:
-    free = 1.0 - thresholds().form
+def _each(vague: Mapping[str, Correction], limits: Thresholds) -> Note:
+    free = 1.0 - limits.form
     return note(
         "better_unnamed",
         each=tuple((c.kind.name, c.kind.port, n, c.copies >= free) for n, c in vague.items()),
@@ -195,6 +175,7 @@ class Balance:
             corrections=found,
             shares=[removed.from_base(c.predicted) for c in found],
             whole=whole,
+            limits=self.scale.limits,
         )
 
     def vague(self, steps: Sequence[Step]) -> dict[str, Correction]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour, noise_rms, rms
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.notes import Note, note
@@ -64,7 +64,7 @@ def noise_floor(
     (n,), nan where nothing counts, shows the noise, white or of first order (`first_order_noise`).
     No level is below quantum/sqrt(12), the rms of rounding to a quantum.
     """
-    return tuple(_floor(r, e) for r, e in zip(records, residuals, strict=True))
+    return tuple(_floor(r, e[np.isfinite(e)]) for r, e in zip(records, residuals, strict=True))
 
 
 def pooled_level(
@@ -98,7 +98,9 @@ def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     return found.autoregression if found.level <= rms(residual) else None
 
 
-def knowable(record: Record, error: float, residual: FloatArray) -> float:
+def knowable(
+    record: Record, error: float, residual: FloatArray, limits: Thresholds = LIMITS
+) -> float:
     """Return the rms [m] below which a `residual` (n,) tells nothing of a stack.
 
     It is that of the simulation's own largest `error` [m], of the form that no model has exactly
@@ -107,24 +109,24 @@ def knowable(record: Record, error: float, residual: FloatArray) -> float:
     """
     quantum, last_place, size = _resolution(record)
     rounding = _rounding(max(quantum or 0.0, last_place))
-    if rms(residual) > thresholds().dithered * rounding:
+    if rms(residual) > limits.dithered * rounding:
         rounding = 0.0
-    return float(np.sqrt(rounding**2 + error**2 + (thresholds().form_of_range * size) ** 2))
+    return float(np.sqrt(rounding**2 + error**2 + (limits.form_of_range * size) ** 2))
 
 
-def knowable_of(fit: Fit, experiments: Sequence[Experiment]) -> float:
+def knowable_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
     """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
     error = max((s.error for s in fit.simulated), default=0.0)
     counts = [int(e.used.sum()) for e in experiments]
     parts = fit.residuals_of(experiments)
     squares = [
-        knowable(e.record, error, part) ** 2 for e, part in zip(experiments, parts, strict=True)
+        knowable(e.record, error, part, limits) ** 2
+        for e, part in zip(experiments, parts, strict=True)
     ]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 
-def _floor(record: Record, residual: FloatArray) -> NoiseFloor:
-    valid = residual[np.isfinite(residual)]
+def _floor(record: Record, valid: FloatArray) -> NoiseFloor:
     quantum, _, _ = _resolution(record)
     source, found, how = _source(record)
     if found is not None and found.level > rms(valid):
@@ -201,12 +203,8 @@ def without_stuck_readings(
         residual = np.abs(y - predicted)
         again = np.r_[False, np.diff(y) == 0.0]
         noise = 1.4826 * float(np.nanmedian(residual))
-        far = residual > _FAR * noise
-        bad = again & far if np.mean(again) < _RARE else np.zeros_like(again)
+        bad = again & (residual > _FAR * noise) & (np.mean(again) < _RARE)
         count += int(np.count_nonzero(bad))
-        given = e.record.displacement
-        record = e.record
-        if given is not None and bad.any():
-            record = replace(record, displacement=np.where(bad, np.nan, given))
+        record = replace(e.record, displacement=np.where(bad, np.nan, y)) if bad.any() else e.record
         kept.append(replace(e, record=record, used=e.used & ~bad, held_out=e.held_out & ~bad))
     return tuple(kept), count

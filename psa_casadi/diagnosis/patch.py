@@ -11,7 +11,7 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections import Correction, time_constants
 from psa_casadi.diagnosis.screening import temperature
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -67,6 +67,7 @@ def patch_of(
     experiments: Sequence[Experiment],
     holdout_rms: float,
     colour: Colour,
+    limits: Thresholds = LIMITS,
 ) -> Patch | None:
     """Return the best correction beside a model; None if none helps.
 
@@ -78,12 +79,12 @@ def patch_of(
     def gained(c: Correction) -> float:
         return samples * float(np.log(holdout_rms / max(c.holdout_rms, 1e-300)))
 
-    told = [c for c in found if c.evidence > thresholds().price]
-    good = [c for c in told if not samples or gained(c) > thresholds().held_out]
+    told = [c for c in found if c.evidence > limits.price]
+    good = [c for c in told if not samples or gained(c) > limits.held_out]
     if not good:
         return None
     best = max(good, key=lambda c: c.evidence)
-    near = thresholds().clearly * temperature(best.evidence)
+    near = limits.clearly * temperature(best.evidence, limits)
     others = [c for c in good if c is not best and c.evidence > best.evidence - near]
     return Patch(
         kind=best.kind.name,

@@ -27,7 +27,6 @@ from psa_casadi.component import (
     SPECTRAL_PEAKS,
     Component,
 )
-from psa_casadi.diagnosis.task import thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column
@@ -360,11 +359,14 @@ def declared(directions: Sequence[Direction]) -> FloatArray:
 class Span:
     """Directions of a span: the `gram` (m, m) of their unit vectors, their `norms` over the noise.
 
+    `false_alarm` is the chance that noise makes a direction seen.
+
     Residuals come as projections t (..., m) on the unit vectors, over the noise level.
     """
 
     gram: FloatArray
     norms: FloatArray
+    false_alarm: float
 
     @cached_property
     def information(self) -> FloatArray:
@@ -397,7 +399,7 @@ class Span:
     def surplus(self) -> float:
         """What a chi-square that is passed as rarely as a false alarm is above that of one."""
         freedom = max(float(np.sum(self.covariance * self.information)), 1.0)
-        share = thresholds().false_alarm
+        share = self.false_alarm
         largest, of_one = (
             2.0 * float(scipy.special.gammainccinv(0.5 * f, share)) for f in (freedom, 1.0)
         )

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR, Fitted
 
 FloatArray = npt.NDArray[np.float64]
@@ -98,6 +98,7 @@ def screen(
     known: Sequence[FloatArray | None] | None = None,
     *,
     colour: Colour | None = None,
+    limits: Thresholds = LIMITS,
 ) -> Screening:
     """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples.
 
@@ -127,7 +128,8 @@ def screen(
     for places in spans(trials):
         own = [trials[k] for k in places]
         if own[0].weight:
-            span = Span(gram[np.ix_(places, places)], norm[places] * usable[places] / colour.level)
+            size = norm[places] * usable[places] / colour.level
+            span = Span(gram[np.ix_(places, places)], size, limits.false_alarm)
             seen.append((places, span))
             scores.append(_of_span(own, span, t[places]))
             continue
@@ -142,7 +144,7 @@ def screen(
             )
         )
     scores.sort(key=lambda s: -s.decrease)
-    return Screening(tuple(scores), _threshold(gram, seen), colour)
+    return Screening(tuple(scores), _threshold(gram, seen, limits.false_alarm), colour)
 
 
 def _of_span(own: Sequence[Direction], span: Span, t: FloatArray) -> Score:
@@ -198,7 +200,11 @@ class Copy:
 
 
 def copies(
-    fit: Fitted, added: FloatArray, trials: Sequence[Direction], colour: Colour
+    fit: Fitted,
+    added: FloatArray,
+    trials: Sequence[Direction],
+    colour: Colour,
+    limits: Thresholds,
 ) -> tuple[float, dict[str, Copy]]:
     """Return the power of a contribution over the noise's, and how each effect can copy it.
 
@@ -220,7 +226,7 @@ def copies(
         share = float(np.sum((independent(free[:, usable]).T @ target) ** 2)) / power
         unit, sizes = np.where(usable, free / np.where(usable, norms, 1.0), 0.0), usable * norms
         along = unit.T @ target / colour.level
-        ways = [_copy(own, p, unit, sizes / colour.level, along) for p in spans(own)]
+        ways = [_copy(own, p, unit, sizes / colour.level, along, limits) for p in spans(own)]
         _, direction, gain = max(ways, key=lambda w: w[0])
         found[name] = Copy(share, direction, gain)
     return power / colour.level**2, found
@@ -232,13 +238,14 @@ def _copy(
     unit: FloatArray,
     norms: FloatArray,
     along: FloatArray,
+    limits: Thresholds,
 ) -> tuple[float, Direction, float]:
     """Return how much of a target a span or a direction explains, and how it does so best."""
     first = trials[places[0]]
     if not first.weight:
         t, norm = float(along[places[0]]), float(norms[places[0]])
         return t**2, first, t / max(norm, 1e-300) * first.unit_gain
-    span = Span(unit[:, places].T @ unit[:, places], norms[places])
+    span = Span(unit[:, places].T @ unit[:, places], norms[places], limits.false_alarm)
     own, t_own = [trials[k] for k in places], along[places]
     return float(span.decrease(t_own)), combined(own, span.gains(t_own)), 1.0
 
@@ -263,7 +270,9 @@ def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
     return projected
 
 
-def _threshold(gram: FloatArray, seen: Sequence[tuple[list[int], Span]]) -> float:
+def _threshold(
+    gram: FloatArray, seen: Sequence[tuple[list[int], Span]], false_alarm: float
+) -> float:
     """Quantile of the largest decrease that white noise makes along directions and spans.
 
     `gram` is that of the unit directions, `seen` has the places of those that are in spans.
@@ -278,7 +287,7 @@ def _threshold(gram: FloatArray, seen: Sequence[tuple[list[int], Span]]) -> floa
     single[[k for places, _ in seen for k in places]] = False
     every = [*(drawn[:, single] ** 2).T, *(span.decrease(drawn[:, p]) for p, span in seen)]
     largest = np.max(every, axis=0)
-    return float(np.quantile(largest, 1.0 - thresholds().false_alarm))
+    return float(np.quantile(largest, 1.0 - false_alarm))
 
 
 #: A direction of which less than this is new beside the fitted parameters is left out.
@@ -304,7 +313,7 @@ class Together:
 
 
 def _ways(
-    trials: Sequence[Direction], gram: FloatArray, sizes: FloatArray
+    trials: Sequence[Direction], gram: FloatArray, sizes: FloatArray, limits: Thresholds
 ) -> tuple[dict[str, npt.NDArray[np.int64]], FloatArray, FloatArray]:
     """Return the directions (ways, m) of each effect, what priors add to the gram, and costs.
 
@@ -317,7 +326,7 @@ def _ways(
     for places in spans(trials):
         first, own = trials[places[0]], sizes[places]
         if first.weight:
-            span = Span(gram[np.ix_(places, places)], own)
+            span = Span(gram[np.ix_(places, places)], own, limits.false_alarm)
             weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * own, _NEW) ** 2
             cost[places[0]] = float(np.sum(span.penalties[:-1]))
         if first.weight or own[0]:
@@ -351,6 +360,7 @@ def best_sets(
     colour: Colour,
     size: int,
     alike: Sequence[Sequence[str]] = (),
+    limits: Thresholds = LIMITS,
 ) -> list[Together]:
     """Return the best directions of every set of so many effects, the best set first.
 
@@ -367,7 +377,7 @@ def best_sets(
     unit = np.where(usable, free / np.where(usable, norm, 1.0), 0.0)
     gram, along = unit.T @ unit, unit.T @ residual
     positive = np.array([d.one_sided or d.finite for d in trials], dtype=bool)
-    ways, weak, cost = _ways(trials, gram, norm * usable / colour.level)
+    ways, weak, cost = _ways(trials, gram, norm * usable / colour.level, limits)
     gram += np.diag(weak)
     total, n = float(residual @ residual), len(residual)
     found = []
@@ -471,17 +481,19 @@ def levelled(
     return found
 
 
-def temperature(largest: float) -> float:
+def temperature(largest: float, limits: Thresholds = LIMITS) -> float:
     """Return what evidence is divided by before it becomes a probability.
 
     The effects are not the true equations, so that their evidence differs by more than noise, and
     the more the larger the `largest` one is: that of a whole model over the plain base, as the form
     of each of its parts is approximate.
     """
-    return max(thresholds().temperature, thresholds().temperature_share * largest)
+    return max(limits.temperature, limits.temperature_share * largest)
 
 
-def probabilities(evidences: Mapping[str, float], whole: float = 0.0) -> dict[str, float]:
+def probabilities(
+    evidences: Mapping[str, float], whole: float = 0.0, limits: Thresholds = LIMITS
+) -> dict[str, float]:
     """Return the probability of each effect, given that one of them is the cause.
 
     `whole` is the evidence of the model with the cause over the plain base, where the effects'
@@ -490,7 +502,7 @@ def probabilities(evidences: Mapping[str, float], whole: float = 0.0) -> dict[st
     if not evidences:
         return {}
     given = np.array(list(evidences.values()))
-    values = given / temperature(max(whole, float(np.max(given))))
+    values = given / temperature(max(whole, float(np.max(given))), limits)
     weights = np.exp(values - np.logaddexp.reduce(values))
     return dict(zip(evidences, weights.tolist(), strict=True))
 

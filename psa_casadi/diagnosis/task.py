@@ -4,9 +4,7 @@ What a search does with its time (how many fits, from how many starts) stands wh
 these here decide what is said. `python -m tests.studies ablation` doubles and halves each.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -90,23 +88,8 @@ class Thresholds:
     falling: float = -0.5
 
 
-_CURRENT: ContextVar[Thresholds] = ContextVar("thresholds", default=Thresholds())  # noqa: B039
-
-
-def thresholds() -> Thresholds:
-    """Return the constants of the diagnosis that is running."""
-    return _CURRENT.get()
-
-
-@contextmanager
-def using(constants: Thresholds) -> Iterator[None]:
-    """Diagnose with other constants."""
-    token = _CURRENT.set(constants)
-    try:
-        yield
-    finally:
-        _CURRENT.reset(token)
-
+#: The constants of every diagnosis that is given no others.
+LIMITS = Thresholds()
 
 #: Sampling interval [s] below which a stack may ring within the record's band.
 FAST = 7e-4
@@ -140,7 +123,7 @@ class Method:
     """The method, `without` some of its `STEPS`, with its deciding constants."""
 
     without: frozenset[str] = frozenset()
-    thresholds: Thresholds = field(default_factory=Thresholds)
+    thresholds: Thresholds = LIMITS
 
 
 #: Why a hypothesis is told of.
@@ -184,6 +167,11 @@ class Task:
     keep: Callable[[Fit], None] = lambda _: None
     watch: Callable[[Tried], None] = lambda _: None
     hidden: float = 0.0
+
+    @property
+    def limits(self) -> Thresholds:
+        """The constants that decide."""
+        return self.method.thresholds
 
     @property
     def fast(self) -> bool:

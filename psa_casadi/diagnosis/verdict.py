@@ -27,7 +27,7 @@ from psa_casadi.diagnosis.judgement import (
     told_from,
     too_small,
     vague_note,
-    verdict_of,
+    verdict_by,
     withdrawn_names,
 )
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
@@ -48,7 +48,7 @@ from psa_casadi.diagnosis.result import (
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
-from psa_casadi.diagnosis.task import same_curves, thresholds
+from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
@@ -61,28 +61,24 @@ from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
 
 
-def shown(steps: Sequence[Step]) -> set[str]:
+def shown(steps: Sequence[Step], limits: Thresholds) -> set[str]:
     """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
 
     Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
     """
-    price = thresholds().price
-    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > price}
-    return fitted.union(*(told_from(s) for s in steps))
+    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
+    return fitted.union(*(told_from(s, limits) for s in steps))
 
 
 def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
     """Return effects whose smallest gain that shows on these records is more than ordinary."""
     spots = []
     present = {c.name for c in final.fit.model.components}
-    for effect in table:
-        if effect.name in present:
-            continue
+    factor = np.sqrt(final.screening.threshold)
+    for effect in [e for e in table if e.name not in present]:
         scores = [s for s in final.screening.scores if s.direction.effect is effect]
         gain = next(p for p in effect.parameters if p.name == effect.gain)
-        extended = final.fit.model.with_effect(effect, {gain.name: 0.0})
-        practical = gain.typical(extended.values)
-        factor = np.sqrt(final.screening.threshold)
+        practical = gain.typical(final.fit.model.with_effect(effect, {gain.name: 0.0}).values)
         smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
         if smallest > practical:
             why = note(
@@ -148,6 +144,7 @@ def alternatives(
     final: Fit,
     experiments: Sequence[Experiment],
     table: Sequence[Component],
+    limits: Thresholds,
     *,
     stiffness_given: bool,
 ) -> tuple[Alternative, ...]:
@@ -158,12 +155,9 @@ def alternatives(
     effects = {e.name: e for e in table}
     found = []
     for step in named:
-        other = [
-            n
-            for n in told_from(step)
-            if n in effects and effects[n].in_plant != step.cause.in_plant
-        ]
-        for name in sorted(other, key=lambda n: -step.probability.get(n, 0.0)):
+        for name in sorted(told_from(step, limits), key=lambda n: -step.probability.get(n, 0.0)):
+            if name not in effects or effects[name].in_plant == step.cause.in_plant:
+                continue
             fitted = _fitted(step, name, experiments)
             if fitted is None:
                 continue
@@ -219,6 +213,7 @@ def conclude(
     experiments: Sequence[Experiment],
     table: Sequence[Component],
     stiffness_given: bool,
+    limits: Thresholds,
     *,
     driven: bool = True,
     hidden: float = 0.0,
@@ -234,33 +229,37 @@ def conclude(
     base_errors = whole_residuals(experiments, first.predicted)
     noise = noise_floor([e.record for e in experiments], errors)
     floor = pooled_level(noise, errors, colour)
-    beyond = held_out_excess(first.fit, experiments, first.predicted, first.screening.colour, noise)
-    unseen = Excess()
-    if last is not first:
-        unseen = held_out_excess(last.fit, experiments, last.predicted, colour, noise)
+    beyond = held_out_excess(
+        first.fit, experiments, first.predicted, first.screening.colour, noise, limits
+    )
+    unseen = (
+        Excess()
+        if last is first
+        else held_out_excess(last.fit, experiments, last.predicted, colour, noise, limits)
+    )
     missing = first.test.alarm or first.chosen is not None or bool(beyond)
-    balance = Balance(experiments, Scale(first.view.of, colour, thresholds().price), floor)
+    balance = Balance(experiments, Scale(first.view.of, colour, limits), floor)
     weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
     beaten = weighed.beaten_by()
     gain = gain_of(experiments, first.predicted, last.predicted)
     partly = last.test.alarm and len(steps) > 1
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
     lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
-    doubt = unconfirmed(experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden)
+    doubt = unconfirmed(
+        experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden, limits=limits
+    )
     stands = beaten is None and doubt is None
     vague = balance.vague(steps) if stands else {}
-    verdict: Verdict = (
-        "not_driven"
-        if not driven
-        else verdict_of(
-            steps,
+    found = [s for s in steps if s.chosen is not None and s.cause.name not in vague]
+    little = last.test.alarm and weighed.share < limits.enough
+    verdict: Verdict = "not_driven"
+    if driven:
+        verdict = verdict_by(
             missing=missing,
-            withdrawn=not stands,
-            share=weighed.share,
-            unseen=bool(unseen),
-            unnamed=vague,
+            withdrawn=not stands or not found or little,
+            ambiguous=bool(found and told_from(found[0], limits)),
+            more=last.test.alarm or bool(unseen) or bool(vague),
         )
-    )
     weak = verdict == "unexplained" and stands and not vague and weighed.adds
     kept = [s for s in steps if s.chosen] if verdict in NAMING or weak else []
     final = last if kept else first
@@ -269,6 +268,7 @@ def conclude(
         experiments,
         final.view.of.holdout_rms,
         colour,
+        limits,
     )
     missed = _misfits(experiments, base_errors, noise)
     spent = budget(
@@ -281,10 +281,14 @@ def conclude(
     )
     model = diagnosed_model(final.fit, experiments, final.predicted, stiffness_given, spent)
     named = kept if verdict in NAMING else []
-    small = too_small([c for c in spent.causes if c.what not in vague]) if partly and named else ()
+    small = (
+        too_small([c for c in spent.causes if c.what not in vague], limits)
+        if partly and named
+        else ()
+    )
     unnamed = {*vague, *(c.what for c in small)}
     causes = tuple(
-        _cause(s, model, spent, experiments) for s in named if s.cause.name not in unnamed
+        _cause(s, model, spent, experiments, limits) for s in named if s.cause.name not in unnamed
     )
     return Diagnosis(
         verdict=verdict,
@@ -294,7 +298,7 @@ def conclude(
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
-        blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps)]),
+        blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps, limits)]),
         remaining=_remaining(final, unseen if kept else beyond),
         next_experiment=next_experiment(
             causes,
@@ -309,7 +313,7 @@ def conclude(
             *(
                 withdrawn_names(steps, weighed, beaten, vague, doubt)
                 if verdict == "unexplained"
-                else vague_note(vague)
+                else vague_note(vague, limits)
             ),
             *(note("small", effect=c.what, share=max(c.share, 0.0)) for c in small),
             *coverage_notes(experiments),
@@ -323,11 +327,11 @@ def conclude(
         noise=noise,
         misfit=missed,
         remainder=_misfits(experiments, errors, noise) if kept else missed,
-        contenders=contenders(first, experiments) if verdict == "ambiguous" else (),
+        contenders=contenders(first, experiments, limits) if verdict == "ambiguous" else (),
         budget=spent,
         patch=patch,
         alternatives=alternatives(
-            kept, final.fit, experiments, table, stiffness_given=stiffness_given
+            kept, final.fit, experiments, table, limits, stiffness_given=stiffness_given
         ),
     )
 
@@ -346,9 +350,7 @@ def patched_model(d: Diagnosis) -> Model:
 
 
 def _misfits(
-    experiments: Sequence[Experiment],
-    errors: Sequence[FloatArray],
-    noise: Sequence[NoiseFloor],
+    experiments: Sequence[Experiment], errors: Sequence[FloatArray], noise: Sequence[NoiseFloor]
 ) -> tuple[Misfit, ...]:
     return tuple(
         misfit(e.record, error, floor)
@@ -357,7 +359,9 @@ def _misfits(
     )
 
 
-def _cause(s: Step, model: Model, spent: Budget, experiments: Sequence[Experiment]) -> Cause:
+def _cause(
+    s: Step, model: Model, spent: Budget, experiments: Sequence[Experiment], limits: Thresholds
+) -> Cause:
     """State a cause: its probability, the share of the error that it removes, what it changes."""
     records = [e.record for e in experiments]
     own = next((c for c in spent.causes if c.what == s.cause.name), None)
@@ -366,7 +370,7 @@ def _cause(s: Step, model: Model, spent: Budget, experiments: Sequence[Experimen
         belongs_to=s.cause.belongs_to,
         confidence=float(min(0.99, s.probability[s.cause.name])),
         parameters=estimates(s.cause, model),
-        cannot_be_told_from=told_from(s),
+        cannot_be_told_from=told_from(s, limits),
         explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
         remedy=s.cause.what_now.code,
         sizes=sizes(s.cause, model, records, unit=records[0].displacement_unit),
@@ -380,24 +384,19 @@ def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, .
     """
     base = float(np.mean(first.fit.residuals**2))
     excess = max(base - floor**2, 1e-300)
-    rows = []
-    scores = first.screening.best_by_effect()
-    for name in dict.fromkeys((*scores, *first.fitted)):  # a series of modes was not screened
-        known = first.fitted.get(name)
-        if known is not None:
-            gone = known.removes(first.view.of)
-        else:
-            level = first.screening.colour.level
-            gone = scores[name].decrease * level**2 / len(first.fit.residuals)
-        rows.append(
-            Candidate(
-                effect=name,
-                explained_share=float(np.clip(gone / excess, 0.0, 1.0)),
-                evidence=first.alone[name],
-                fitted=known is not None,
-                probability=first.probability.get(name, 0.0) if named else 0.0,
-            )
+    power = first.screening.colour.level**2 / len(first.fit.residuals)
+    gone = {n: s.decrease * power for n, s in first.screening.best_by_effect().items()}
+    gone |= {n: h.removes(first.view.of) for n, h in first.fitted.items()}
+    rows = [
+        Candidate(
+            effect=name,
+            explained_share=float(np.clip(removed / excess, 0.0, 1.0)),
+            evidence=first.alone[name],
+            fitted=name in first.fitted,
+            probability=first.probability.get(name, 0.0) if named else 0.0,
         )
+        for name, removed in gone.items()
+    ]
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.base_fit import from_resonances, ringing
+from psa_casadi.diagnosis.base_fit import from_resonances
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit
@@ -61,15 +61,6 @@ def test_a_missed_resonance_is_no_cause(tmp_path: Path) -> None:
     make_record(None, 118254, tmp_path / "a.csv", noise="ar")
     effects = [EFFECTS[n] for n in ("structural_mode", "sensor_delay", "sensor_lag", "drive_lag")]
     assert diagnose([read_record(tmp_path / "a.csv")], effects=effects).verdict == "adequate"
-
-
-@slow
-def test_a_base_that_misses_nothing_shows_no_ringing(tmp_path: Path) -> None:
-    for seed in (1, 2, 3):
-        _, experiments, base = _fitted(tmp_path / "a.csv", "rich", seed)
-        seen = ringing(base, experiments)
-        assert seen is not None
-        assert seen.decrease < 30.0
 
 
 def test_quick_fits_integrate_below_the_noise(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from scipy.signal import sawtooth
 from psa_casadi.diagnosis.confirmation import coverage_notes, unconfirmed
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out import Gain
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.start.doubts import doubtful_quantity
 from psa_casadi.records.record import Record
@@ -109,7 +110,9 @@ def test_what_held_out_samples_confirm(
 ) -> None:
     experiments = held(triangle, count)
     gain = Gain(40.0, interval)
-    said = unconfirmed(experiments, gain, whole=97.5, lost=lost, partly=partly, hidden=hidden)
+    said = unconfirmed(
+        experiments, gain, whole=97.5, lost=lost, partly=partly, hidden=hidden, limits=LIMITS
+    )
     assert told in str(said)
     assert (said is not None) == bool(told)
     few = [n for n in coverage_notes(experiments) if n.code == "held_out_says_little"]

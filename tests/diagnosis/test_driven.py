@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from psa_casadi.cli.diagnosis_files import write_patch
 from psa_casadi.diagnosis.diagnose import diagnose, filtered
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import load_model
@@ -98,7 +98,7 @@ def test_a_linear_filter_of_the_voltage_is_told_from_what_has_nothing_to_do_with
     modes = _modes()
     noise = np.random.default_rng(4).standard_normal(modes.n)
     shares = [filtered([split(r)]) for r in (modes, replace(modes, displacement=noise))]
-    assert shares[0] > thresholds().follows
+    assert shares[0] > LIMITS.follows
     assert abs(shares[1]) < 0.1
 
 

@@ -13,6 +13,7 @@ from psa_casadi.diagnosis.colour import colour_of
 from psa_casadi.diagnosis.confirmation import held_out_excess
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.noise import noise_floor
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
@@ -47,7 +48,7 @@ def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> fl
     seen = replace(found, residuals=used)
     colour = colour_of(used, [len(used)])
     noise = noise_floor([experiments[0].record], [error])
-    return held_out_excess(seen, experiments, (clean,), colour, noise).factor
+    return held_out_excess(seen, experiments, (clean,), colour, noise, LIMITS).factor
 
 
 @slow
@@ -99,7 +100,7 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)
         colour = colour_of(seen.residuals, [SAMPLES, 0])
-        told.append(held_out_excess(seen, experiments, predicted, colour, noise).factor)
+        told.append(held_out_excess(seen, experiments, predicted, colour, noise, LIMITS).factor)
     assert told == [1.0] * 25
 
 

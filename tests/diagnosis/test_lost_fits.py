@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
@@ -13,24 +12,6 @@ from psa_casadi.records.record import Record
 from tests.studies.plants.again import play_again
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
-
-
-@slow
-def test_a_slow_amplifier_is_found(tmp_path: Path) -> None:
-    """Of 7 ms, seventy times the ordinary lag, in a triangle and steps together."""
-    path = tmp_path / "triangle.csv"
-    truth = make_record("drive_lag", 11, path, excitation="triangle", gain=4e-3)
-    time = np.linspace(0.0, 0.749, 750)
-    steps = np.where((time // 0.15) % 2 == 1, 0.8, 0.2) * truth.stack.u_rated
-    steps[:20] = 0.0
-    play_again(truth, 11, tmp_path / "steps.csv", (time, steps))
-    records = [read_record(path).slice(0, 900), read_record(tmp_path / "steps.csv")]
-    found = diagnose(records, effects=[EFFECTS["drive_lag"], EFFECTS["backlash"]])
-    assert [c.effect for c in found.causes] == ["drive_lag"]
-    assert found.verdict == "cause_named"
-    lag = found.causes[0].parameters["drive_lag_time"].value
-    assert lag == pytest.approx(2.0 * truth.parameters["zeta"] * truth.gain, rel=0.02)
-    assert found.extended_errors.holdout_rms_m < 1.05 * truth.sigma
 
 
 @slow

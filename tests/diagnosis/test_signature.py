@@ -1,7 +1,5 @@
 """The signature of an effect: told along a coordinate that physics gives, for every effect."""
 
-import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +9,6 @@ from typer.testing import CliRunner
 from psa_casadi.cli.app import app
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.report.plots.figures import save_signature, size_sentence
 
 #: Coordinates along which physics says that an effect is to be seen.
 TOLD = {
@@ -71,18 +67,6 @@ def test_creep_grows_during_holds_and_hum_is_a_line_at_its_frequency() -> None:
     slope = np.polyfit(delay.telling.x, delay.telling.mean, 1)[0]
     gain = delay.stroke / np.ptp(delay.voltage)
     assert slope == pytest.approx(-delay.size * gain, rel=0.25)
-
-
-@pytest.mark.parametrize("name", ["slow_creep", "mains_hum"])
-def test_the_picture_is_written_whole(tmp_path: Path, name: str) -> None:
-    seen = signature(EFFECTS[name])
-    save_signature(EFFECTS[name], seen, tmp_path / "s.png")
-    data = (tmp_path / "s.png").read_bytes()
-    assert struct.unpack(">II", data[16:24]) == (1300, 620)
-    assert len(data) > 20_000
-    assert f"{seen.gain} = " in size_sentence(replace(seen, size=0.5))
-    with pytest.raises(InputError, match="does not exist"):
-        save_signature(EFFECTS[name], seen, tmp_path / "absent" / "s.png")
 
 
 def test_the_command_draws_one_effect_and_says_what_it_cannot_draw(tmp_path: Path) -> None:

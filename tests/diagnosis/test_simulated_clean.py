@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.diagnosis.noise import knowable, known_colour, noise_floor
-from psa_casadi.diagnosis.task import thresholds
+from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.records.noise import last_place_of
 from tests.studies.benchmarks.simulated import Case, all_cases, judged, record_of
 from tests.tiers import slow
@@ -38,7 +38,7 @@ def test_what_can_be_known_holds_rounding_error_and_form() -> None:
     record = record_of(Case("P-885.51", "sine", "1 nm"))
     whole = float(np.ptp(record.displacement)) if record.displacement is not None else np.nan
     rounding, error = 1e-9 / np.sqrt(12.0), 2e-10
-    rest = float(np.hypot(error, thresholds().form_of_range * whole))
+    rest = float(np.hypot(error, LIMITS.form_of_range * whole))
     signs = np.where(np.arange(record.n) % 2, 1.0, -1.0)
     small, large = rounding * signs, 2.0 * rounding * signs
     assert knowable(record, error, small) == pytest.approx(float(np.hypot(rest, rounding)))

@@ -59,11 +59,3 @@ def test_a_fit_switches_an_effect_on_that_the_model_has_off() -> None:
     found = fit_base(model, [whole(record)])
     assert found.model.values["memory_gain"] == 1.0
     assert found.rms < 0.5 * fit_base(base, [whole(record)]).rms
-
-
-@slow
-def test_relays_are_called_a_memory() -> None:
-    names = ("hysteresis_memory", "load_stiffness", "sensor_nonlinearity", "slow_creep")
-    d = psa.diagnose(_record(), effects=[EFFECTS[n] for n in names])
-    assert "hysteresis_memory" in {c.effect for c in d.causes}
-    assert d.extended_errors.holdout_rms_m < 0.4 * d.base_errors.holdout_rms_m

@@ -25,7 +25,7 @@ from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Progress, c
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
-from psa_casadi.diagnosis.task import FAST, thresholds
+from psa_casadi.diagnosis.task import FAST, LIMITS
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import note
@@ -117,7 +117,7 @@ def naming_probability(
     variance T; to be named alone it must exceed temperature * ln(c/(1 - c)), c = 0.95, where the
     temperature grows with the evidence over the base, of which the new record adds `over`/2.
     """
-    credible = thresholds().credible
+    credible = LIMITS.credible
     needed = temperature(truth.evidence + 0.5 * over) * float(np.log(credible / (1.0 - credible)))
     chances = []
     for other in others:

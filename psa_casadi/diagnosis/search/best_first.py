@@ -27,7 +27,7 @@ from psa_casadi.diagnosis.search.fits import (
     without,
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
-from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names, Searched, is_left
+from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names
 from psa_casadi.diagnosis.search.moves import (
     exchange,
     fit_from_other_parents,
@@ -35,7 +35,7 @@ from psa_casadi.diagnosis.search.moves import (
     one_mode,
     with_modes,
 )
-from psa_casadi.diagnosis.task import Task, thresholds
+from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -51,12 +51,12 @@ _SETTLED, _AFRESH, _AFRESH_FURTHER = 1.03, 5, 2
 _PACE = 2
 
 
-def best_first(base: Fit, task: Task) -> Searched:
+def best_first(base: Fit, task: Task) -> Known:
     """Return what a search from a base fit finds. Raises SimulationError where that one fails."""
     search = _Search(base, task)
     try:
         search.run()
-        return search.result()
+        return search.known
     except KeyboardInterrupt:
         task.keep(search.known.so_far().fit)
         raise
@@ -79,13 +79,11 @@ class _Search:
                 break
             self.known.tell(chosen, "visited")
             self.visit(chosen)
-
-    def result(self) -> Searched:
         best = self.known.best()
         if len(best.causes) > 1 and self.known.view(best).test.alarm:
             self.task.progress("all causes to the end")
             self.known.note(together(best, self.task.experiments))
-        return self.known.result()
+        self.known.conclude()
 
     # What to do next
 
@@ -95,7 +93,7 @@ class _Search:
         None where neither is new, and nothing dear is left to try.
         """
         best = self.known.best()
-        way = [self.known.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
+        way = [self.known.found.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
         for own in way:
             if own is not None and (own is best or own.names in self.expanded) and self.unseen(own):
                 return own
@@ -117,9 +115,9 @@ class _Search:
         if "rejected" in self.task.method.without:
             return None
         for h in self.known.rejected():
-            if len(h.causes) < thresholds().most_causes and self.unseen(h):
+            if len(h.causes) < self.task.limits.most_causes and self.unseen(h):
                 self.known.finish([] if h.final else [h])
-                return self.known.get(h.names)
+                return self.known.found.get(h.names)
         return None
 
     def otherwise(self) -> bool:
@@ -141,7 +139,7 @@ class _Search:
     def unseen(self, h: Hypothesis) -> bool:
         """Whether a hypothesis was not visited yet, or has become much better since."""
         last = self.expanded.get(h.names)
-        if last is None or h.fit.rms < thresholds().better * last.fit.rms:
+        if last is None or h.fit.rms < self.task.limits.better * last.fit.rms:
             return True
         return h is self.known.best() and self.known.gained(last, h)
 
@@ -155,7 +153,7 @@ class _Search:
 
     def closed(self, before: Hypothesis, h: Hypothesis) -> bool:
         """Close a hypothesis of which nothing is left and which has gained; whether that is so."""
-        if not self.known.gained(before, h) or is_left(self.known.view(h)):
+        if not self.known.gained(before, h) or self.known.view(h).leaves:
             return False
         self.known.closed.add(h.names)
         return True
@@ -173,7 +171,7 @@ class _Search:
         seen, self.expanded[h.names] = self.expanded.get(h.names), h
         if (seen is not None and self.closed(seen, h)) or self.several_modes(h, view):
             return
-        if view.shows and len(h.causes) < thresholds().most_causes:
+        if view.shows and len(h.causes) < self.task.limits.most_causes:
             if h.causes and not series:
                 self.several_at_once(h)
             self.add_causes(h, view)
@@ -216,7 +214,7 @@ class _Search:
             return False
         if STRUCTURAL_MODE not in self.task.table:
             return False
-        less = self.known.get(h.names - {name})
+        less = self.known.found.get(h.names - {name})
         if less is None or not (name in h.names or (self.task.fast and not h.causes)):
             return False
         if self.shaken.get(less.names) is less.fit:
@@ -272,11 +270,11 @@ class _Search:
         task = self.task
         if "base again" not in task.method.without:
             for cause in h.causes:
-                less = self.known.get(h.names - {cause.name})
+                less = self.known.found.get(h.names - {cause.name})
                 if less is None or not cause.more_of:
                     task.progress(f"without {cause.name}")
                     self.known.note(without(h, cause, task.experiments, less))
-        before = self.known.get(h.names_upto(len(h.causes) - 1))
+        before = self.known.found.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
             for one in one_mode(h, before, task.experiments):
@@ -308,13 +306,13 @@ class _Search:
         rung = ringing(h.fit, experiments)
         if rung is None or rung.decrease < SEEN:
             return False
-        if view.shows and rung.decrease < thresholds().ringing * view.decrease:
+        if view.shows and rung.decrease < self.task.limits.ringing * view.decrease:
             return False
         found = from_band(h.fit, experiments, task.progress)
         own = hypothesis(h.causes, found, experiments, final=True)
-        if own is not None and (h.causes or not is_left(examine(own, task, self.known.trials))):
+        if own is not None and (h.causes or not examine(own, task, self.known.trials).leaves):
             self.known.note(own)
-        return self.known.get(h.names) is not h
+        return self.known.found.get(h.names) is not h
 
     def seen_in_records(self) -> bool:
         """Fit the base from resonances and lags that the records show; whether it is better."""

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import Copy, Score, Together
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, ended, hypothesis, near_end
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis, near_end
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
@@ -40,31 +39,16 @@ def quick_fit(
     with the gain at 0: the loop may be such that no other start of the gain fits to it.
     """
     found: list[Fit] = []
-    for start in starts:
+    for values, gain, memory in starts:
         least = min([goal, before.cost, *(f.cost for f in found)])
-        own = fit_from(before, experiments, effect, start, reset, evaluations, least)
+        added = [(effect, values, gain)]
+        own = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
         found += [own] if own is not None else []
     if not any(f.cost < before.cost for f in found):
-        states = tuple(before.starts())
-        nested = (starts[0][0], 0.0, states)
-        last = fit_from(before, experiments, effect, nested, {}, 3 * QUICK, goal)
+        nested, states = [(effect, starts[0][0], 0.0)], tuple(before.starts())
+        last = fit_with_all(before, experiments, nested, states, {}, 3 * QUICK, goal)
         found += [last] if last is not None else []
-    return min(found, key=lambda f: f.cost) if found else None
-
-
-def fit_from(
-    before: Fit,
-    experiments: Sequence[Experiment],
-    effect: Component,
-    start: Start,
-    reset: dict[str, float],
-    evaluations: int,
-    goal: float = np.inf,
-) -> Fit | None:
-    """Fit with one more effect from a start, the other values `reset`; None if that fails."""
-    values, gain, memory = start
-    added = [(effect, values, gain)]
-    return fit_with_all(before, experiments, added, memory, reset, evaluations, goal)
+    return min(found, key=lambda f: f.cost, default=None)
 
 
 def fit_with_all(
@@ -198,7 +182,8 @@ def with_causes(
         {k: v for d in start.directions for k, v in d.memory[r].items()} | own
         for r, own in enumerate(before.fit.starts())
     )
-    return _with_all(before, experiments, added, memory, {}, goal)
+    quick = fit_with_all(before.fit, experiments, added, memory, {}, _SET_AFRESH, goal)
+    return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
 
 
 def with_causes_afresh(
@@ -211,30 +196,14 @@ def with_causes_afresh(
     """
     added = []
     for d, gain in zip(start.directions, start.gains, strict=True):
-        size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), _towards(d) * gain)
+        linear = d.effect.linear  # the side to which the declared weights move with it
+        side = sum(_declared(d.effect, n) * d.values[n] for n in linear) if linear else 1.0
+        size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), side * gain)
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
     ordinary = ordinary_values(before.fit.model, [e.record for e in fitted(experiments)])
-    return _with_all(before, experiments, added, tuple(before.fit.starts()), ordinary, goal)
-
-
-def _towards(direction: Direction) -> float:
-    """Return the side to which the effect's declared weights move with it, 1 where it has none."""
-    effect, values = direction.effect, direction.values
-    own = {p.name: p.value for p in effect.parameters}
-    return sum(own[n] * values[n] for n in effect.linear) if effect.linear else 1.0
-
-
-def _with_all(
-    before: Hypothesis,
-    experiments: Sequence[Experiment],
-    added: Sequence[tuple[Component, dict[str, float], float]],
-    memory: tuple[dict[str, float], ...],
-    reset: dict[str, float],
-    goal: float,
-) -> Hypothesis | None:
-    """Fit quickly with several more causes, each from its values and gain."""
-    quick = fit_with_all(before.fit, experiments, added, memory, reset, _SET_AFRESH, goal)
+    states = tuple(before.fit.starts())
+    quick = fit_with_all(before.fit, experiments, added, states, ordinary, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
 
 
@@ -378,10 +347,11 @@ def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.i
                 current, experiments, min(rtol, loosest), tolerance, evaluations, goal, patient=True
             )
         except PsaError:
-            return ended(of)
+            return replace(of, final=True)
         if current.cost > goal:
-            return hypothesis(of.causes, current, experiments) or ended(of)
-    return hypothesis(of.causes, current, experiments, final=True) or ended(of)
+            break
+    ended = hypothesis(of.causes, current, experiments, final=current.cost <= goal)
+    return ended or replace(of, final=True)
 
 
 def begun_again(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
@@ -427,11 +397,12 @@ def _from_ordinary(
         sizes.append(-_ORDINARY)
     values = _ordinary_form(effect, known)
     ordinary = ordinary_values(before.model, [e.record for e in fitted(experiments)])
-    starts = [(values, s * size, tuple(before.starts())) for s in sizes]
-    found = side_by_side(
-        lambda s: fit_from(before, experiments, effect, s, ordinary, QUICK), starts
-    )
-    return [f for f in found if f is not None]
+
+    def begun(share: float) -> Fit | None:
+        added, states = [(effect, values, share * size)], tuple(before.starts())
+        return fit_with_all(before, experiments, added, states, ordinary, QUICK)
+
+    return [f for f in side_by_side(begun, sizes) if f is not None]
 
 
 def _best_continued(

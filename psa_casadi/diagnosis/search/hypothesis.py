@@ -39,7 +39,7 @@ from psa_casadi.diagnosis.screening import (
     screen,
     without,
 )
-from psa_casadi.diagnosis.task import State, Task, Tried, thresholds
+from psa_casadi.diagnosis.task import LIMITS, Task, Thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import with_column
@@ -79,11 +79,6 @@ class Hypothesis:
         """Names of the first so many causes."""
         return frozenset(c.name for c in self.causes[:count])
 
-    @property
-    def power(self) -> float:
-        """Mean square of the residuals [m^2]."""
-        return self.fit.rms**2
-
     def removes(self, before: "Hypothesis") -> float:
         """Power [m^2] that it takes from the residual of another one.
 
@@ -94,7 +89,7 @@ class Hypothesis:
             len(old.residuals) / count * (old.rms**2 - new.rms**2) * (level / old.level) ** 2
             for old, new in zip(before.fit.further, self.fit.further, strict=True)
         )
-        return before.power - self.power + beside
+        return before.fit.rms**2 - self.fit.rms**2 + beside
 
     def share(self, before: "Hypothesis", root: "Hypothesis") -> float:
         """What it takes from another one's error over whole records, over what that one takes."""
@@ -135,14 +130,14 @@ def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """What hypotheses are compared by: the plain base, the colour of the noise, the price.
+    """What hypotheses are compared by: the plain base, the colour of the noise, the limits.
 
     `held` is the number of held-out samples; they choose between hypotheses, or `judge_only`.
     """
 
     base: Hypothesis
     colour: Colour
-    price: float
+    limits: Thresholds
     held: int = 0
     judge_only: bool = False
     _known: dict[Fit, float] = field(init=False, default_factory=dict)
@@ -151,7 +146,7 @@ class Scale:
         """Ln B, of the fitted samples alone; more modes than one have their price here."""
         if of.fit not in self._known:
             self._known[of.fit] = evidence(self.base.fit, of.fit, self.colour)
-        return self._known[of.fit] - self.price * sum(c.count - 1 for c in of.causes)
+        return self._known[of.fit] - self.limits.price * sum(c.count - 1 for c in of.causes)
 
     def held_out(self, of: Hypothesis, before: Hypothesis) -> float:
         """Ln of what one hypothesis gives the held-out samples over what another one does."""
@@ -174,38 +169,19 @@ class Scale:
 
     def score(self, of: Hypothesis) -> float:
         """Ln of the Bayes factor over the plain base, less the price of the causes."""
-        return self.gain(of, self.base) - self.price * len(of.causes)
+        return self.gain(of, self.base) - self.limits.price * len(of.causes)
 
     def of_fitted(self, of: Hypothesis) -> float:
         """The score of the fitted samples alone."""
-        return self.evidence(of) - self.price * len(of.causes)
+        return self.evidence(of) - self.limits.price * len(of.causes)
 
 
 def scale_of(
-    base: Hypothesis, colour: Colour, price: float, experiments: Sequence[Experiment]
+    base: Hypothesis, colour: Colour, limits: Thresholds, experiments: Sequence[Experiment]
 ) -> Scale:
     """Return the scale of a search; blocks of fitted records choose, whole records judge alone."""
     held = sum(int(e.held_out.sum()) for e in experiments)
-    return Scale(base, colour, price, held, any(e.held_out_whole for e in experiments))
-
-
-def tried(of: Hypothesis, state: State, root: Hypothesis, scale: Scale) -> Tried:
-    """Return what is told of a hypothesis while a search goes on."""
-    return Tried(
-        state,
-        tuple(c.name for c in of.causes),
-        evidence=float(scale.evidence(of)),
-        score=float(scale.score(of)),
-        rms_m=float(of.fit.rms),
-        holdout_rms_m=float(of.holdout_rms),
-        base_rms_m=float(root.holdout_rms),
-        noise_rms_m=float(scale.colour.rms),
-    )
-
-
-def ended(of: Hypothesis) -> Hypothesis:
-    """Return a hypothesis whose fit cannot go on."""
-    return replace(of, final=True)
+    return Scale(base, colour, limits, held, any(e.held_out_whole for e in experiments))
 
 
 #: So many starts each effect gets.
@@ -244,6 +220,11 @@ class View:
         seen = self.decrease >= self.screening.threshold and self.promise > self.test.knowable**2
         return seen and (self.test.alarm or not self.of.causes)
 
+    @property
+    def leaves(self) -> bool:
+        """Whether anything is left to explain."""
+        return self.test.alarm or self.shows
+
     def estimated(self) -> dict[str, float]:
         """Evidence of every further effect over this hypothesis, without a fit."""
         return estimated(self.of.fit, self.screening)
@@ -261,10 +242,19 @@ class View:
         own = [s for s in self.screening.scores if s.direction.effect.name == name]
         near = [s for s in own if s.decrease >= 0.3 * own[0].decrease]
         starts: list[Score] = []
+
+        def form(score: Score) -> dict[str, float]:
+            fitted = score.direction.effect.fitted
+            return {n: v for n, v in score.direction.values.items() if n not in fitted}
+
+        def differing(score: Score) -> int:
+            best = near[0].direction.values
+            return sum(v != best[n] for n, v in score.direction.values.items())
+
         for score in near:
-            if all(_form(score) != _form(s) for s in starts):
+            if all(form(score) != form(s) for s in starts):
                 starts.append(score)
-        for score in sorted(near, key=lambda s: -_differing(s, near[0])):
+        for score in sorted(near, key=lambda s: -differing(s)):
             known = [s.direction.values for s in starts]
             new = score.direction.values not in known or score.direction.finite
             if new and score not in starts and len(starts) < _STARTS:
@@ -281,62 +271,55 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     """
     task.progress("screening effects")
     fit, experiments = of.fit, task.experiments
-    table = [e for e in task.table if e not in fit.model.components]
-    kept = [d for d in known if d.effect in table]
+    effects = [e for e in task.table if e not in fit.model.components]
+    kept: list[Direction] = []
     if known:
-        lines = [e for e in table if e.from_residual]  # this residual's peaks are other ones
-        kept = [d for d in kept if d.effect not in lines] + _directions(fit, task, lines)
-    else:
-        kept = _directions(fit, task, table)
+        lines = [e for e in effects if e.from_residual]  # this residual's peaks are other ones
+        kept = [d for d in known if d.effect in effects and d.effect not in lines]
+        effects = lines
+    finite = "finite steps" not in task.method.without
+    kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
-    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
-    time = np.concatenate([e.record.time[e.used] for e in experiments])
-    test = omnibus(
-        fit.residuals,
-        voltage,
-        time,
-        screening.colour,
-        noise_rms(fit.residuals, screening.colour),
-        knowable=knowable_of(fit, experiments),
-        even=bool(of.causes),
-    )
-    test = _with_further(test, fit, experiments, screening.colour, even=bool(of.causes))
-    return View(of, tuple(kept), screening, test)
+    return View(
+        of, tuple(kept), screening,
+        tested(fit, experiments, screening.colour, task.limits, even=bool(of.causes)),
+    )  # fmt: skip
 
 
-def _with_further(
-    test: Omnibus, fit: Fit, experiments: Sequence[Experiment], colour: Colour, *, even: bool
+def tested(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    colour: Colour,
+    limits: Thresholds,
+    *,
+    even: bool,
 ) -> Omnibus:
     """Return the test of the residual, or that of a further column where only this one alarms."""
-    for f, own in zip(fit.further, colour.further, strict=True):
-        if test.alarm:
-            break
-        parts = [experiments[k] for k in with_column(experiments, f.column)]
+
+    def test_of(
+        residual: FloatArray, parts: Sequence[Experiment], own: Colour, least: float
+    ) -> Omnibus:
         voltage, time = (
             np.concatenate([getattr(e.record, name)[e.used] for e in parts])
             for name in ("voltage", "time")
         )
-        noise = noise_rms(f.residuals, own)
-        found = omnibus(f.residuals, voltage, time, own, noise, knowable=f.straight, even=even)
+        noise = noise_rms(residual, own)
+        return omnibus(
+            residual, voltage, time, own, noise,
+            knowable=least, even=even, alarms_below=limits.alarm,
+        )  # fmt: skip
+
+    test = test_of(fit.residuals, experiments, colour, knowable_of(fit, experiments, limits))
+    for f, own in zip(fit.further, colour.further, strict=True):
+        if test.alarm:
+            break
+        parts = [experiments[k] for k in with_column(experiments, f.column)]
+        found = test_of(f.residuals, parts, own, f.straight)
         p = min(1.0, found.p_value * (1 + len(fit.further)))
-        if found.alarm and p < thresholds().alarm:
+        if found.alarm and p < limits.alarm:
             size = max(test.size, 2.0 * test.knowable)
             test = replace(found, p_value=p, size=size, knowable=test.knowable, output=f.column)
     return test
-
-
-def _form(score: Score) -> dict[str, float]:
-    direction = score.direction
-    return {n: v for n, v in direction.values.items() if n not in direction.effect.fitted}
-
-
-def _differing(score: Score, other: Score) -> int:
-    return sum(v != other.direction.values[n] for n, v in score.direction.values.items())
-
-
-def _directions(fit: Fit, task: Task, effects: Sequence[Component]) -> list[Direction]:
-    finite = "finite steps" not in task.method.without
-    return directions(fit, task.experiments, effects, finite_steps=finite)
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
@@ -344,8 +327,10 @@ def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
     residuals = fit.residuals_of(task.experiments)
     known = [known_colour(e.record, r) for e, r in zip(task.experiments, residuals, strict=True)]
     if "remainder" in task.method.without:
-        return screen(fit, trials, lengths, colour=residual_colour(fit.residuals, lengths))
-    return screen(fit, trials, lengths, known)
+        return screen(
+            fit, trials, lengths, colour=residual_colour(fit.residuals, lengths), limits=task.limits
+        )
+    return screen(fit, trials, lengths, known, limits=task.limits)
 
 
 #: Fits of one set whose evidence differs by so many nats at most are the same minimum.
@@ -376,18 +361,19 @@ def held_out_confirms(
     after = max(of.holdout_rms, 1e-300)
     promise = 0.5 * samples * float(np.mean(change**2)) / after**2
     gained = scale.held_out(of, before)
-    return confirmed(gained, promise, scale.of_fitted(of) - scale.of_fitted(before))
+    score = scale.of_fitted(of) - scale.of_fitted(before)
+    return confirmed(gained, promise, score, scale.limits)
 
 
-def confirmed(gained: float, promise: float, score: float) -> bool:
+def confirmed(gained: float, promise: float, score: float, limits: Thresholds = LIMITS) -> bool:
     """Whether a gain of the held-out log-likelihood is enough, beside that of the score [nats].
 
     A promised gain p is found give or take sqrt(2 p). Found must be `held_out`, or, where these
     samples can hardly show the cause, two such errors less than what is promised; and so much must
     the fitted samples' score and what is found be together.
     """
-    least = min(thresholds().held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
-    return bool(gained > least and score + gained > thresholds().held_out)
+    least = min(limits.held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
+    return bool(gained > least and score + gained > limits.held_out)
 
 
 def another_minimum(gained: float, held_out: float) -> bool:
@@ -398,7 +384,9 @@ def another_minimum(gained: float, held_out: float) -> bool:
     return gained > _SAME and gained + held_out > 0.0
 
 
-def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment]) -> bool:
+def shows_memory(
+    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], limits: Thresholds
+) -> bool:
     """Whether what a cause adds to another hypothesis is more than a curve of the voltage.
 
     At most `static` of the power that the other's parameters cannot follow may be one. Elements
@@ -412,7 +400,7 @@ def shows_memory(of: Hypothesis, before: Hypothesis, experiments: Sequence[Exper
     place = (voltage - voltage.min()) / max(float(np.ptp(voltage)), 1e-300)
     curves = np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
     static = independent(without(curves, basis)).T @ target
-    return float(static @ static) < thresholds().static * float(target @ target)
+    return float(static @ static) < limits.static * float(target @ target)
 
 
 def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:

@@ -1,18 +1,16 @@
 """What a search has found so far: every hypothesis by its causes, and which of them is the best."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.probes import Direction
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
-    Scale,
     View,
     another_minimum,
     examine,
@@ -21,9 +19,8 @@ from psa_casadi.diagnosis.search.hypothesis import (
     root_of,
     scale_of,
     shows_memory,
-    tried,
 )
-from psa_casadi.diagnosis.task import State, Task, thresholds
+from psa_casadi.diagnosis.task import State, Task, Tried
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 
@@ -40,35 +37,24 @@ Names = frozenset[str]
 NONE: Names = frozenset()
 
 
-@dataclass(frozen=True, eq=False)
-class Searched:
-    """What a search has found: every hypothesis by its causes, and the best of them.
-
-    `views` are of hypotheses whose residual was looked at, `fitted` the effects fitted beside each,
-    `trials` what effects would add to the base.
-    """
-
-    best: Hypothesis
-    known: dict[Names, Hypothesis]
-    views: dict[Names, View]
-    fitted: dict[Names, tuple[str, ...]]
-    worth: frozenset[Names]
-    scale: Scale
-    trials: tuple[Direction, ...]
-
-
 class Known:
     """The hypotheses of a search, from a base fit on. Raises SimulationError where that one fails.
 
-    `closed` are the causes of hypotheses that leave nothing, whatever more causes would explain.
+    `found` holds them by their causes, `views` those whose residual was looked at, `fitted` the
+    effects fitted beside each, `trials` what effects would add to the base. `closed` are the causes
+    of hypotheses that leave nothing, whatever more causes would explain. A search that has ended
+    has an `answer`, and the causes of all that is worth having (`worthy`).
     """
+
+    answer: Hypothesis
+    worthy: frozenset[Names]
 
     def __init__(self, base: Fit, task: Task) -> None:
         self.base, self.task = base, task
         root = root_of(base, task.experiments)
         first = examine(root, task)
         self.trials = first.trials
-        own = scale_of(root, first.screening.colour, thresholds().price, task.experiments)
+        own = scale_of(root, first.screening.colour, task.limits, task.experiments)
         self.scale = replace(own, held=0) if "held out" in task.method.without else own
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
@@ -82,20 +68,15 @@ class Known:
         """The base without causes, as it is fitted by now."""
         return self.found[NONE]
 
-    def get(self, names: Names) -> Hypothesis | None:
-        """Return the hypothesis with these causes, None if there is none yet."""
-        return self.found.get(names)
-
-    def result(self) -> Searched:
-        """Return what was found, the best hypothesis looked at."""
+    def conclude(self) -> None:
+        """End the search: choose the answer, look at it, and ask what else is worth having."""
         self.view(self.best())
-        best = self.in_order(self.answer())
-        self.view(best)
-        self.tell(best, "best")
-        worth = frozenset(n for n, h in self.found.items() if self.worth(h))
-        return Searched(best, self.found, self.views, self.fitted, worth, self.scale, self.trials)
+        self.answer = self.in_order(self.likeliest())
+        self.view(self.answer)
+        self.tell(self.answer, "best")
+        self.worthy = frozenset(n for n, h in self.found.items() if self.worth(h))
 
-    def answer(self) -> Hypothesis:
+    def likeliest(self) -> Hypothesis:
         """Return the best hypothesis; where that removes too little, one that is nearly as likely.
 
         Too little of the held-out error, so that its causes would not be named. Of records that are
@@ -105,16 +86,16 @@ class Known:
         if self.scale.judge_only or not self.removes_little(best):
             return best
         own = self.scale.evidence(best)
-        least = self.scale.score(best) - thresholds().clearly * temperature(own)
-        near = [h for h in self.ranked() if h.causes and self.scale.score(h) > least]
-        self.finish([h for h in near if not h.final])
-        enough = [
-            h
-            for h in self.ranked()
-            if h.causes and self.scale.score(h) > least
-            if h.final and self.worth(h) and not self.removes_little(h)
-        ]
-        return next(iter(enough), best)
+        least = self.scale.score(best) - self.task.limits.clearly * temperature(
+            own, self.task.limits
+        )
+
+        def near() -> list[Hypothesis]:
+            return [h for h in self.ranked() if h.causes and self.scale.score(h) > least]
+
+        self.finish([h for h in near() if not h.final])
+        enough = (h for h in near() if h.final and self.worth(h) and not self.removes_little(h))
+        return next(enough, best)
 
     def removes_little(self, h: Hypothesis) -> bool:
         """Whether structure remains and the causes remove too little to be named."""
@@ -122,7 +103,7 @@ class Known:
         if not h.causes or root <= noise:
             return False
         share = (root**2 - h.holdout_rms**2) / (root**2 - noise**2)
-        return share < thresholds().enough and self.view(h).test.alarm
+        return share < self.task.limits.enough and self.view(h).test.alarm
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with its causes in the order in which they explain most.
@@ -161,7 +142,18 @@ class Known:
 
     def tell(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""
-        self.task.watch(tried(h, state, self.root, self.scale))
+        self.task.watch(
+            Tried(
+                state,
+                tuple(c.name for c in h.causes),
+                evidence=float(self.scale.evidence(h)),
+                score=float(self.scale.score(h)),
+                rms_m=float(h.fit.rms),
+                holdout_rms_m=float(h.holdout_rms),
+                base_rms_m=float(self.root.holdout_rms),
+                noise_rms_m=float(self.scale.colour.rms),
+            )
+        )
 
     def view(self, h: Hypothesis) -> View:
         """Look at what a hypothesis leaves; the noise of all others is told from the best one."""
@@ -175,16 +167,19 @@ class Known:
 
     def children(self, h: Hypothesis) -> list[Hypothesis]:
         """Return the hypotheses with one more cause that were fitted beside one, best first."""
-        names = self.fitted.get(h.names, ())
-        found = [self.found.get(h.names | {n}) for n in names]
-        own = [replace(c, causes=(*h.causes, _added(c, h))) for c in found if c is not None]
+        found = [self.found.get(h.names | {n}) for n in self.fitted.get(h.names, ())]
+        own = []
+        for child in found:
+            if child is not None:
+                added = [c for c in child.causes if c.name not in h.names]
+                own.append(replace(child, causes=(*h.causes, *added)))
         return sorted(own, key=lambda c: -self.scale.evidence(c))
 
     def leaders(self, h: Hypothesis) -> list[Hypothesis]:
         """Return those of the children that are nearly as likely as the best one, best first."""
         own, children = self.scale.evidence(h), self.children(h)
         gains = [self.scale.evidence(c) - own for c in children]
-        least = min(SHARE * gains[0], gains[0] - NEAR) if gains else 0.0
+        least = nearly(gains[0]) if gains else 0.0
         return [c for c, gained in zip(children, gains, strict=True) if gained > least]
 
     def near(self, h: Hypothesis, best: Hypothesis) -> float:
@@ -194,8 +189,7 @@ class Known:
         """
         count, reached = len(h.fit.residuals), cost_beside(best.fit, h.fit, self.task.experiments)
         gained = 0.5 * count * float(np.log(h.fit.cost / reached))
-        least = min(SHARE * gained, gained - NEAR)
-        return h.fit.cost * float(np.exp(-2.0 * least / count))
+        return h.fit.cost * float(np.exp(-2.0 * nearly(gained) / count))
 
     def remember(self, h: Hypothesis, *names: str) -> None:
         """Keep that these effects were fitted beside a hypothesis."""
@@ -255,12 +249,9 @@ class Known:
             before = self.found.get(h.names - {cause.name})
             if before is None:
                 continue
-            if h.removes(before) <= knowable**2:
-                return False
-            if (
-                before.causes
-                and "form" not in out
-                and h.share(before, root) <= thresholds().further
+            little = before.causes and "form" not in out
+            if h.removes(before) <= knowable**2 or (
+                little and h.share(before, root) <= self.task.limits.further
             ):
                 return False
             if not self.remembers(h, before, cause):
@@ -276,12 +267,14 @@ class Known:
         if not any(s.memory and not s.settles for s in cause.states):
             return True
         if (h, before) not in self.memories:
-            self.memories[h, before] = shows_memory(h, before, self.task.experiments)
+            self.memories[h, before] = shows_memory(
+                h, before, self.task.experiments, self.task.limits
+            )
         return self.memories[h, before]
 
     def gained(self, before: Hypothesis, after: Hypothesis) -> bool:
         """Whether a fit has more evidence than an earlier one by the price of a cause."""
-        return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.price
+        return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.limits.price
 
     def different(self, effect: Component, h: Hypothesis) -> bool:
         """Whether an effect is none of the causes, nor bends the same curve as one of them."""
@@ -295,14 +288,10 @@ class Known:
         colour = self.view(h).screening.colour
         floor = noise_rms(h.fit.residuals, colour)
         excess = excess_power(self.base.residuals, colour, floor)
-        explained = self.base.rms**2 - h.power
+        explained = self.base.rms**2 - h.fit.rms**2
         return self.view(h).test.alarm and explained < _EXPLAINED * excess
 
 
-def is_left(view: View) -> bool:
-    """Whether anything is left to explain."""
-    return view.test.alarm or view.shows
-
-
-def _added(child: Hypothesis, parent: Hypothesis) -> Component:
-    return next(c for c in child.causes if c.name not in parent.names)
+def nearly(gained: float) -> float:
+    """Return the evidence from which on a fit is nearly as likely as one that has `gained` more."""
+    return min(SHARE * gained, gained - NEAR)

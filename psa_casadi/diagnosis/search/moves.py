@@ -21,8 +21,8 @@ from psa_casadi.diagnosis.search.fits import (
     with_causes_afresh,
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, SHARE, Known
-from psa_casadi.diagnosis.task import Task, thresholds
+from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, Known, nearly
+from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -74,7 +74,12 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
     fit, states = before.fit, tuple(before.fit.starts())
     while len(modes) >= FEWEST:
         effect = MODAL_SERIES[len(modes)]
-        added = [(effect, _values(modes), 1.0)]
+        values = {
+            f"series_{name}_{k}": value
+            for k, mode in enumerate(modes, 1)
+            for name, value in asdict(mode).items()
+        }
+        added = [(effect, values, 1.0)]
         found = fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
         if found is None:
             return None
@@ -97,22 +102,19 @@ def one_mode(
     """
     fit = series.fit
     states = tuple(fit.starts())
-    starts = [_alone(mode, states) for mode in _modes(fit, series.causes[-1].count)]
+    low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
+    starts: list[Start] = []
+    for mode in _modes(fit, series.causes[-1].count):
+        lead = float(np.clip(mode.ahead / (mode.share or 1e-300), low, high))
+        form = {
+            "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": lead
+        }  # fmt: skip
+        starts.append((form, mode.share, states))
     found = side_by_side(
         lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit, experiments), starts
     )
     best = sorted((h for h in found if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
     return side_by_side(lambda h: to_end(h, experiments), best)
-
-
-def _alone(mode: Mode, states: tuple[dict[str, float], ...]) -> Start:
-    """Return where a single mode begins that stands for one of a series."""
-    low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
-    lead = np.clip(mode.ahead / (mode.share or 1e-300), low, high)
-    form = {
-        "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": float(lead)
-    }  # fmt: skip
-    return form, mode.share, states
 
 
 def _even(time: FloatArray) -> bool:
@@ -136,14 +138,6 @@ def _modes(fit: Fit, count: int) -> list[Mode]:
     return [Mode(*(values[f"series_{name}_{k}"] for name in names)) for k in range(1, count + 1)]
 
 
-def _values(modes: Sequence[Mode]) -> dict[str, float]:
-    return {
-        f"series_{name}_{k}": value
-        for k, mode in enumerate(modes, 1)
-        for name, value in asdict(mode).items()
-    }
-
-
 def _at_rest(model: Model, record: Record, count: int) -> FloatArray:
     """Return the displacement that the wafers' force has at rest [m], at the first samples."""
     t, u = record.time[:count] - record.time[0], record_inputs(model, record, count)
@@ -162,7 +156,7 @@ _MOST = 3
 def exchange(h: Hypothesis, known: Known, task: Task) -> None:
     """Fit in each cause's place what the screening beside all others finds near it."""
     for cause in h.causes:
-        less = known.get(h.names - {cause.name})
+        less = known.found.get(h.names - {cause.name})
         if less is None:
             continue
         if len(h.causes) > 1:
@@ -183,8 +177,8 @@ def _near(h: Hypothesis, less: Hypothesis, known: Known) -> list[list[Score]]:
     They are not among the causes, and bend no curve that one of them bends.
     """
     view = known.view(less)
-    promised, gained = view.estimated(), known.scale.evidence(h) - known.scale.evidence(less)
-    least = min(SHARE * gained, gained - NEAR)
+    promised = view.estimated()
+    least = nearly(known.scale.evidence(h) - known.scale.evidence(less))
     return [
         starts
         for starts in view.leading()
@@ -209,7 +203,7 @@ def _put_in_place(
     effect = _effect(starts)
     known.note(in_place(h, less, h.fit, rival.fit, effect, task.experiments, goal))
     known.remember(less, effect.name)
-    best = known.get(rival.names)
+    best = known.found.get(rival.names)
     if best is not None and known.scale.evidence(best) > known.scale.evidence(h) - NEAR:
         known.finish([best])
 
@@ -224,12 +218,12 @@ def _copies(h: Hypothesis, less: Hypothesis, known: Known, task: Task) -> list[C
     added = np.concatenate([(p - q)[e.used] for p, q, e in pairs])
     table = [e for e in task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
-    power, found = copies(less.fit, added, trials, known.scale.colour)
+    power, found = copies(less.fit, added, trials, known.scale.colour, task.limits)
     own = known.scale.evidence(h)
     lost: dict[str, float] = {}
     for name, copy in found.items():
         left = 0.5 * power * (1.0 - copy.share)
-        fitted = known.get(less.names | {name})
+        fitted = known.found.get(less.names | {name})
         reached = -np.inf if fitted is None else known.scale.evidence(fitted)
         if left < NEAR and reached < own - left - NEAR:
             lost[name] = left
@@ -255,14 +249,16 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     tried, as a fit that adds one cause to the other may end in another minimum than one that begins
     with both. These go to their end, since they need more steps for it.
     """
-    root, price = known.root, known.scale.price
+    root, price = known.root, known.scale.limits.price
     view, alike = known.view(root), task.alike(root.fit)
     if not view.trials:
         return
     every = [
         found
-        for size in range(2, thresholds().most_causes + 1)
-        for found in best_sets(root.fit, view.trials, view.screening.colour, size, alike)
+        for size in range(2, task.limits.most_causes + 1)
+        for found in best_sets(
+            root.fit, view.trials, view.screening.colour, size, alike, task.limits
+        )
     ]
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
     beside = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
@@ -279,8 +275,12 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     found = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
     fitted = [f for f in found if f is not None]
     better = [f for f in fitted if f.names in beside and known.scale.evidence(f) > 0.0]
-    others = [f for f in fitted if f not in better]
-    for f in _best_to_end(better, others, known, task, goal):
+    tried = sorted((f for f in fitted if f not in better), key=lambda h: -known.scale.score(h))
+    # of two fits of one set the better one so far need not be the one that ends lower
+    best, others = [*better, *tried[:FINALISTS]], tried[FINALISTS:]
+    task.progress(f"{', '.join('+'.join(sorted(h.names)) for h in best)} to the end")
+    ended = side_by_side(lambda h: to_end(h, task.experiments, goal), best)
+    for f in [*ended, *others]:
         known.note(f)
 
 
@@ -295,32 +295,13 @@ def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
         return
     evidence = known.scale.evidence
     for cause in h.causes:
-        shared = known.get(h.names - {cause.name})
+        shared = known.found.get(h.names - {cause.name})
         if shared is None or not shared.causes:
             continue
-        gained = evidence(h) - evidence(shared) - known.scale.price
+        gained = evidence(h) - evidence(shared) - known.scale.limits.price
         for child in known.children(h):
-            other = known.get(child.names - {cause.name})
+            other = known.found.get(child.names - {cause.name})
             if other is not None and evidence(other) + gained > evidence(child):
                 added = child.causes[-1].name
                 task.progress(f"cause {len(child.causes)}: {added} once more")
                 known.note(in_place(child, other, other.fit, h.fit, cause, task.experiments))
-
-
-def _best_to_end(
-    pairs: Sequence[Hypothesis],
-    found: Sequence[Hypothesis],
-    known: Known,
-    task: Task,
-    goal: float,
-) -> list[Hypothesis]:
-    """Return fits of sets, the pairs and the best others of them to their end.
-
-    Of two fits of one set the better one so far need not be the one that ends lower. One whose cost
-    will stay above the `goal` ends before.
-    """
-    ranked = sorted(found, key=lambda h: -known.scale.score(h))
-    best, others = [*pairs, *ranked[:FINALISTS]], ranked[FINALISTS:]
-    said = ", ".join("+".join(sorted(h.names)) for h in best)
-    task.progress(f"{said} to the end")
-    return [*side_by_side(lambda h: to_end(h, task.experiments, goal), best), *others]

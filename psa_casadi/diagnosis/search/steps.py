@@ -26,8 +26,8 @@ from psa_casadi.diagnosis.search.hypothesis import (
     root_of,
     scale_of,
 )
-from psa_casadi.diagnosis.search.known import Searched
-from psa_casadi.diagnosis.task import Task, same_curves, thresholds
+from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.task import Task, Thresholds, same_curves
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import as_read
@@ -93,16 +93,13 @@ class Step:
         return self.chosen.causes[-1]
 
 
-def steps_of(found: Searched, task: Task) -> list[Step]:
+def steps_of(found: Known, task: Task) -> list[Step]:
     """Return the steps to the best hypothesis; the last one is that itself."""
-    ways = [_way(found, task, k) for k in range(len(found.best.causes))]
-    ways.append(found.best)
+    ways = [_way(found, task, k) for k in range(len(found.answer.causes))]
+    ways.append(found.answer)
     views = [_view(found, h, task) for h in ways]
-    steps = []
-    for k, view in enumerate(views):
-        chosen = ways[k + 1] if k + 1 < len(ways) else None
-        steps.append(_step(found, task, view, chosen))
-    return steps
+    pairs = zip(views, [*ways[1:], None], strict=True)
+    return [_step(found, task, view, chosen) for view, chosen in pairs]
 
 
 def unsearched(base: Fit, task: Task) -> list[Step]:
@@ -111,10 +108,10 @@ def unsearched(base: Fit, task: Task) -> list[Step]:
     return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
 
-def _way(found: Searched, task: Task, count: int) -> Hypothesis:
+def _way(found: Known, task: Task, count: int) -> Hypothesis:
     """Return the hypothesis with the first so many of the best one's causes."""
-    best = found.best
-    own = found.known.get(best.names_upto(count))
+    best = found.answer
+    own = found.found.get(best.names_upto(count))
     if own is not None:
         return replace(own, causes=best.causes[:count])
     for cause in best.causes[: count - 1 : -1]:
@@ -123,13 +120,7 @@ def _way(found: Searched, task: Task, count: int) -> Hypothesis:
     return best
 
 
-def _without(found: Searched, task: Task, cause: Component) -> Hypothesis | None:
-    """Return the best hypothesis without one of its causes."""
-    known = found.known.get(found.best.names - {cause.name})
-    return known or without(found.best, cause, task.experiments)
-
-
-def _view(found: Searched, h: Hypothesis, task: Task) -> View:
+def _view(found: Known, h: Hypothesis, task: Task) -> View:
     """Look at a hypothesis; what effects would add is known from where the search began."""
     own = found.views.get(h.names)
     if own is None or own.of.fit is not h.fit:
@@ -137,34 +128,37 @@ def _view(found: Searched, h: Hypothesis, task: Task) -> View:
     return own if own.of is h else replace(own, of=h)
 
 
-def _step(found: Searched, task: Task, view: View, chosen: Hypothesis | None) -> Step:
+def _step(found: Known, task: Task, view: View, chosen: Hypothesis | None) -> Step:
     fitted = _fitted(found, view.of)
     if chosen is not None:
         fitted[chosen.causes[-1].name] = chosen
     gain, own = found.scale.gain, found.scale.evidence(view.of)
     alone = {**view.estimated(), **{n: gain(c, view.of) for n, c in fitted.items()}}
     if chosen is None:
-        refused = {n for n, c in fitted.items() if c.names not in found.worth}
+        refused = {n for n, c in fitted.items() if c.names not in found.worthy}
         return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, own, task)
     cause = chosen.causes[-1]
-    less = _without(found, task, cause)
+    known = found.found.get(found.answer.names - {cause.name})
+    less = known or without(found.answer, cause, task.experiments)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
         return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), own, task)
     there = _view(found, less, task)
-    beside = {**_fitted(found, less), cause.name: found.best}
+    beside = {**_fitted(found, less), cause.name: found.answer}
     evidence = {**there.estimated(), **{n: gain(c, less) for n, c in beside.items()}}
-    whole = found.scale.evidence(found.best)
-    for name in _promising(evidence, beside, cause.name, whole):
+    whole = found.scale.evidence(found.answer)
+    # only an estimate says that these are as likely as the cause
+    least = evidence[cause.name] - task.limits.clearly * temperature(whole, task.limits)
+    for name in [n for n, e in evidence.items() if n not in beside and e > least]:
         more = with_cause(less, task.experiments, there.starts_of(name))
         evidence[name] = -np.inf if more is None else gain(more, less)
-    refused = {n for n, c in beside.items() if c.names not in found.worth} - {cause.name}
+    refused = {n for n, c in beside.items() if c.names not in found.worthy} - {cause.name}
     step = Step(view, fitted, chosen, less, there, beside, alone)
     return _judged(step, evidence, beside, refused, whole, task)
 
 
-def _fitted(found: Searched, h: Hypothesis) -> dict[str, Hypothesis]:
+def _fitted(found: Known, h: Hypothesis) -> dict[str, Hypothesis]:
     """Return the hypotheses with one more effect, by its name."""
-    every = {n: found.known.get(h.names | {n}) for n in found.fitted.get(h.names, ())}
+    every = {n: found.found.get(h.names | {n}) for n in found.fitted.get(h.names, ())}
     return {n: child for n, child in every.items() if child is not None}
 
 
@@ -184,40 +178,34 @@ def _judged(
     """
     alike = task.alike(step.fit)
     good = set(fitted) - refused
-    fit = {n for n, c in fitted.items() if in_character(c.fit, _named(c, n), task.experiments)}
+    fit = {
+        n
+        for n, h in fitted.items()
+        if in_character(h.fit, next(c for c in h.causes if c.name == n), task.experiments)
+    }
     for group in alike:
         if good & set(group):
             refused = refused - (set(group) & fit)
         elif refused & set(group):
             refused = refused | set(group)
     shared = levelled(evidence, alike, good)
-    chances = probabilities({n: v for n, v in shared.items() if n not in refused}, whole)
+    chances = probabilities(
+        {n: v for n, v in shared.items() if n not in refused}, whole, task.limits
+    )
     return replace(step, evidence=shared, probability=chances)
 
 
-def _promising(
-    evidence: Mapping[str, float], fitted: Mapping[str, Hypothesis], cause: str, whole: float
-) -> list[str]:
-    """Return effects of which only an estimate says that they are as likely as the cause."""
-    least = evidence[cause] - thresholds().clearly * temperature(whole)
-    return [n for n, e in evidence.items() if n not in fitted and e > least]
-
-
-def _named(h: Hypothesis, name: str) -> Component:
-    return next(c for c in h.causes if c.name == name)
-
-
 def contenders(
-    step: Step, experiments: Sequence[Experiment], names: Sequence[str] = ()
+    step: Step, experiments: Sequence[Experiment], limits: Thresholds, names: Sequence[str] = ()
 ) -> tuple[Contender, ...]:
     """Return effects of one step of the search with their fits; those not fitted are fitted now.
 
     Without `names` they are the fewest that hold the cause with the probability `credible`. An
     effect whose fit fails is left out.
     """
-    names = names or credible_set(step.probability, thresholds().credible)
+    names = names or credible_set(step.probability, limits.credible)
     found = dict(step.fitted)
-    scale = scale_of(step.view.of, step.screening.colour, 0.0, experiments)
+    scale = scale_of(step.view.of, step.screening.colour, replace(limits, price=0.0), experiments)
     known = dict(step.evidence)
     for name in names:
         scores = [] if name in found else step.view.starts_of(name)
@@ -264,7 +252,7 @@ def fit_contenders(
     seen = examine(plain, task)
     progress("fitting the rivals")
     step = Step(seen, evidence=seen.estimated())
-    chosen = contenders(step, experiments, [e.name for e in effects])
+    chosen = contenders(step, experiments, task.limits, [e.name for e in effects])
     lost = {e.name for e in effects} - {c.effect for c in chosen}
     if lost:
         raise InputError(

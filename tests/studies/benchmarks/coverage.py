@@ -160,7 +160,7 @@ def one_run(name: str, seed: int) -> Run:
         level,
         lambda p: quantities(p, size),
     )
-    white = tuple(whiteness(r) > _WHITE for r in found.fit.residuals_of(found.experiments))
+    white = tuple(whiteness(r)[0] > _WHITE for r in found.fit.residuals_of(found.experiments))
     return Run(
         stack=name,
         seed=seed,

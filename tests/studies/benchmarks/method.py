@@ -12,7 +12,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
-from psa_casadi.diagnosis.search.known import Searched
+from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.search import fit_base
@@ -44,7 +44,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     table = tuple(e for e in table if set(e.needs) <= {c.name for c in base.model.components})
     found = best_first(base, Task(experiments, table, progress=progress))
     d = diagnose([record], progress=progress)
-    rows = [(_named(h), f"{found.scale.score(h):.0f}", "yes" if h.names in found.worth else "no")
+    rows = [(_named(h), f"{found.scale.score(h):.0f}", "yes" if h.names in found.worthy else "no")
             for h in _best(found)]  # fmt: skip
     head = ("hypothesis", "score", "may be the answer")
     return Outcome(
@@ -54,7 +54,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     )  # fmt: skip
 
 
-def picture(found: Searched, d: Diagnosis) -> Figure:
+def picture(found: Known, d: Diagnosis) -> Figure:
     """Return scores of the hypotheses, and the shares of the budget."""
     figure = Figure(figsize=(12.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
@@ -63,9 +63,9 @@ def picture(found: Searched, d: Diagnosis) -> Figure:
     return figure
 
 
-def _scores(axes: Axes, found: Searched) -> None:
+def _scores(axes: Axes, found: Known) -> None:
     rows = _best(found)[::-1]
-    colours = [_BLUE if h is found.best else _ORANGE if h.names in found.worth else _GREY
+    colours = [_BLUE if h is found.answer else _ORANGE if h.names in found.worthy else _GREY
                for h in rows]  # fmt: skip
     names = [_named(h) for h in rows]
     axes.barh(names, [max(found.scale.score(h), 0.0) for h in rows], color=colours)
@@ -96,8 +96,8 @@ def _shares(axes: Axes, d: Diagnosis) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _best(found: Searched) -> Sequence[Hypothesis]:
-    return sorted(found.known.values(), key=lambda h: -found.scale.score(h))[:_SHOWN]
+def _best(found: Known) -> Sequence[Hypothesis]:
+    return sorted(found.found.values(), key=lambda h: -found.scale.score(h))[:_SHOWN]
 
 
 def _named(h: Hypothesis) -> str:
