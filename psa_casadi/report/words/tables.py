@@ -125,8 +125,9 @@ def candidate_table(d: "Diagnosis | OdeDiagnosis") -> Table:
     return _table(head, rows)
 
 
-def error_table(d: Diagnosis, unit: str, factor: float) -> Table:
+def error_table(d: Diagnosis, scale: Scale) -> Table:
     """Return the errors of base and extended model beside the noise, in a unit of length."""
+    unit, factor = scale.unit, scale.factor
     rows = []
     models = [("base", d.base_errors), ("extended", d.extended_errors)]
     for name, e in models if added(d) else models[:1]:
