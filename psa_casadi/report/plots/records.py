@@ -7,7 +7,6 @@ from psa_casadi.report.words.phrases import in_brackets
 from psa_casadi.report.words.series import (
     MEASURED_COLOUR,
     NOISE_COLOUR,
-    FloatArray,
     IndexArray,
     Series,
     autocorrelation,
@@ -140,31 +139,25 @@ def distribution_plot(s: Series) -> Panel:
     small = s.residual_scale
     plot = Panel(in_brackets("residual", small.unit), "samples in a bin [%]")
     residuals = [s.residual(c) for c in s.curves]
-    low, high = _readable(residuals)
+    low, high = (np.array([f(r) for r in residuals]) for f in (np.nanmin, np.nanmax))
+    span = float(high[-1] - low[-1])
+    if 0.0 < span * _FAR < float(high.max() - low.min()):
+        low, high = low[-1] - 0.5 * span, high[-1] + 0.5 * span
+    else:
+        low, high = low.min(), high.max()
     for curve, residual in zip(s.curves, residuals, strict=True):
-        d = distribution(residual, low, high)
-        beyond = 100.0 - float(np.sum(d.shares))
+        centres, shares, width = distribution(residual, low, high)
+        beyond = 100.0 - float(np.sum(shares))
         said = f" ({beyond:.0f} % outside)" if beyond >= 0.5 else ""
         fill = "tozeroy" if curve is s.curves[-1] else "none"
-        plot.line(
-            small.factor * d.centres, d.shares, f"{curve.label}{said}", curve.colour, fill=fill
-        )
+        plot.line(small.factor * centres, shares, f"{curve.label}{said}", curve.colour, fill=fill)
         plot.data[-1]["line"]["shape"] = "hvh"
     mean, spread = float(np.nanmean(residuals[-1])), float(np.nanstd(residuals[-1]))
     if spread > 0:
         x = np.linspace(low, high, 161)
         normal = np.exp(-0.5 * ((x - mean) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
-        plot.line(small.factor * x, 100.0 * d.width * normal, "normal", INK, dash="dash")
+        plot.line(small.factor * x, 100.0 * width * normal, "normal", INK, dash="dash")
     return plot
-
-
-def _readable(residuals: list[FloatArray]) -> tuple[float, float]:
-    """Return the ends of an axis on which the last residual can be read: all, unless far wider."""
-    low, high = (np.array([f(r) for r in residuals]) for f in (np.nanmin, np.nanmax))
-    span = float(high[-1] - low[-1])
-    if 0.0 < span * _FAR < float(high.max() - low.min()):
-        return float(low[-1] - 0.5 * span), float(high[-1] + 0.5 * span)
-    return float(low.min()), float(high.max())
 
 
 def _with_noise(plot: Panel, s: Series) -> Panel:

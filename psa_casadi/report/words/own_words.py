@@ -121,7 +121,7 @@ def own_record_table(d: OdeDiagnosis, series: Sequence[Series]) -> Table:
     """Return the same of every record; rms over its used samples where none is held out."""
     rows = []
     for s in series:
-        rms = [_judged_rms(s, s.residual(c)) for c in s.curves]
+        rms = [s.judged_rms(c) for c in s.curves]
         rows.append(_errors(s.name, s.unit, s.noise, rms[0], rms[-1], d))
     return _error_table("record", rows, d)
 
@@ -139,11 +139,6 @@ def _error_table(what: str, rows: Sequence[tuple[str, ...]], d: OdeDiagnosis) ->
     head = (what, "unit", "noise rms", "base, held-out rms")
     more = ("extended, held-out rms", "falls by") if d.causes else ()
     return Table((*head, *more), tuple(rows))
-
-
-def _judged_rms(s: Series, residual: FloatArray) -> float:
-    counted = s.held_out if s.held_out.any() else np.isfinite(residual)
-    return float(np.sqrt(np.nanmean(residual[counted] ** 2)))
 
 
 def own_fit_table(found: OdeIdentification, series: Sequence[Series]) -> Table:
