@@ -15,6 +15,7 @@ from psa_casadi.report.words.phrases import (
     added,
     either,
     in_brackets,
+    labelled,
     listing,
     number,
     percent,
@@ -43,13 +44,11 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
     if d.verdict == "adequate":
         return f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}."
     if d.verdict == "unexplained" or not d.causes:
-        free = d.correction
-        words = ""
+        free, words = d.correction, ""
         if free is not None:
-            share = percent(within(free.share))
             words = (
-                f"a free function of {free.of} in {free.port} would remove {share} of the error"
-                " above the noise; "
+                f"a free function of {free.of} in {free.port} would remove"
+                f" {percent(within(free.share))} of the error above the noise; "
             )
         return (
             "Something is missing, and no effect in the table explains it: no cause is named;"
@@ -60,23 +59,19 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
 
 
 def _base_errors(d: OdeDiagnosis) -> str:
-    spans = _spans(d)
-    each = [f"{number(100.0 * e.base / spans[e.output], 2)} %" for e in d.errors]
+    """Say the base model's error in every output, over its range in all records."""
+    whole = np.vstack([r.outputs for r in d.runs])
+    spans = np.nanmax(whole, axis=0) - np.nanmin(whole, axis=0)
+    ranges = dict(zip(d.model.output_names, map(float, spans), strict=True))
+    shares = {e.output: 100.0 * e.base / ranges[e.output] for e in d.errors}
+    each = [f"{number(share, 2)} %" for share in shares.values()]
     if len(each) == 1:
         return f"the base model's held-out error is {each[0]} of the range"
     if len(each) > _NAMED:
-        shares = [100.0 * e.base / spans[e.output] for e in d.errors]
-        low, high = number(min(shares), 2), number(max(shares), 2)
+        low, high = (number(f(shares.values()), 2) for f in (min, max))
         return f"the base model's held-out errors are {low} to {high} % of the ranges"
-    pairs = [f"{share} of {e.output}" for e, share in zip(d.errors, each, strict=True)]
+    pairs = [f"{share} of {output}" for output, share in zip(shares, each, strict=True)]
     return f"the base model's held-out errors are {listing(pairs)}, over their ranges"
-
-
-def _spans(d: OdeDiagnosis) -> dict[str, float]:
-    """Return the range of every output over all records."""
-    whole = np.vstack([r.outputs for r in d.runs])
-    spans = np.nanmax(whole, axis=0) - np.nanmin(whole, axis=0)
-    return dict(zip(d.model.output_names, map(float, spans), strict=True))
 
 
 def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
@@ -88,13 +83,16 @@ def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
         extended = f", {shown[1]} of the extended model" if added(d) else ""
         text = f"{e.output}: held-out rms {shown[0]} of the base{extended}; noise {shown[2]}"
         lines.append(("error", text))
-    for c in d.causes:
+    for c, share in zip(d.causes, d.budget.causes, strict=True):
         told = f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
-        lines.append(("cause", f"{told}: {cause_size(d, c)}"))
+        removes = f"it removes {share.text} of the held-out error above the noise"
+        lines.append(("cause", f"{told}: {cause_size(d, c)}; {removes}"))
         if c.cannot_be_told_from:
             rivals = either(c.cannot_be_told_from)
             lines.append(("rivals", f"these data cannot distinguish it from {rivals}"))
-    return [*lines, ("remains", rest_sentence(d)), *(("note", n) for n in d.notes)]
+    lines += [("moved", m) for m in d.moved]
+    rest = [("note", n) for n in (*d.notes, d.unnamed) if n]
+    return [*lines, ("remains", rest_sentence(d)), *rest]
 
 
 def own_budget_table(d: OdeDiagnosis) -> Table:
@@ -226,45 +224,6 @@ def _series(
             )
 
 
-_VERDICTS = {
-    "adequate": "what the model leaves cannot be distinguished from noise",
-    "cause_named": "{} named, and nothing else is left",
-    "partly_explained": "{} named, and more is left",
-    "ambiguous": "a cause is found that these records cannot tell from others",
-    "unexplained": "something is missing that no effect of the table explains",
-}
-
-
-def _diagnosis(d: OdeDiagnosis) -> str:
-    """Return the verdict, the causes with their sizes, the errors and what remains, in lines."""
-    several = len(d.causes) > 1
-    named = f"{len(d.causes)} causes are" if several else "a cause is"
-    lines = [f"{d.verdict}: {_VERDICTS[d.verdict].format(named)}"]
-    for c, removed in zip(d.causes, d.budget.causes, strict=True):
-        lines.append(
-            f"  {c.effect} ({c.confidence:.0%} sure), {c.description}; it removes"
-            f" {removed.text} of the held-out error above the noise"
-        )
-        lines += [
-            f"    {n} = {with_unit(_estimate(e.value, *e.interval), e.unit)}"
-            for n, e in c.parameters.items()
-        ]
-        if c.cannot_be_told_from:
-            lines.append(f"    may as well be {', '.join(c.cannot_be_told_from)}")
-    if several:
-        lines.append(f"  together they remove {d.budget.together.text} of it")
-    for o in d.errors:
-        base, extended, noise = (
-            with_unit(f"{v:.3g}", o.unit) for v in (o.base, o.extended, o.noise)
-        )
-        lines.append(
-            f"  {o.output}: held-out rms {base} of the base, {extended} of the extended model,"
-            f" noise {noise}"
-        )
-    rest = (*d.moved, d.remaining.where, *d.notes, d.unnamed)
-    return "\n".join([*lines, *(f"  {line}" for line in rest if line)])
-
-
 def _identification(found: OdeIdentification) -> str:
     """Return the parameters with their standard errors, and what is left of the outputs."""
     model = found.model
@@ -302,7 +261,7 @@ def _withdrawn(names: Sequence[str], share: float, output: str, why: Note) -> st
 
 
 OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
-    "own_diagnosis": _diagnosis,
+    "own_diagnosis": lambda d: labelled(own_lines(d), 100),
     "own_identification": _identification,
     "moved": _moved,
     # the records
