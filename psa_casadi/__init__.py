@@ -76,8 +76,8 @@ if TYPE_CHECKING:
         write_record,
     )
     from psa_casadi.records.signals import Signals
+    from psa_casadi.report.documents.files import load_diagnosis
     from psa_casadi.report.documents.findings import read_findings
-    from psa_casadi.report.documents.reading import load_diagnosis
     from psa_casadi.report.page.devices import write_comparison, write_population
     from psa_casadi.report.page.results import write_fit_report, write_report
     from psa_casadi.report.plots.figures import save_figure
@@ -189,7 +189,7 @@ _HOMES = {
     "psa_casadi.devices.batch": ("BatchRun", "batch"),
     "psa_casadi.devices.jobs": ("Job", "Options"),
     "psa_casadi.report.documents.findings": ("read_findings",),
-    "psa_casadi.report.documents.reading": ("load_diagnosis",),
+    "psa_casadi.report.documents.files": ("load_diagnosis",),
     "psa_casadi.report.page.devices": ("write_comparison", "write_population"),
     "psa_casadi.export.fixed_step.export": ("CodeExport", "export_c"),
     "psa_casadi.export.fmu.archive": ("export_fmu",),

@@ -2,7 +2,7 @@
 
 import os
 import textwrap
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -116,7 +116,10 @@ def figure_of(result: Plotted) -> Figure:
     if isinstance(result, Diagnosis):
         return diagnosis_figure(result)
     if isinstance(result, Identification):
-        return fit_figure(result)
+        series = series_of_fit(result)
+        figure, grid, shown = _sheet(series, "measured", "model")
+        _draw_residual(figure.add_subplot(grid[1, :]), shown)
+        return figure
     if isinstance(result, Trajectory):
         return response_figure(result.time, result.voltage, result.displacement)
     if isinstance(result, Posterior):
@@ -128,28 +131,14 @@ def figure_of(result: Plotted) -> Figure:
 
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
-    series = series_of(diagnosis)
-    shown = most_telling(series)
-    figure, grid = _sheet(shown, origin)
+    verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
+    figure, grid, shown = _sheet(series_of(diagnosis), origin, "base model", verdict)
     _draw_residual(figure.add_subplot(grid[1, :2]), shown)
     evidence = figure.add_subplot(grid[1, 2])
     count = len(diagnosis.candidates)
     part = f" ({_MOST_BARS} of {count})" if count > _MOST_BARS else ""
     draw(evidence, evidence_plot(diagnosis, _MOST_BARS), f"Evidence, each effect alone{part}")
     evidence.grid(visible=False, axis="y")
-    which = _which(series, shown, origin, "base model")
-    lines = [*textwrap.wrap(verdict_sentence(diagnosis), 125), which]
-    figure.suptitle("\n".join(lines), fontsize=FONT + 3)
-    return figure
-
-
-def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
-    """Return the picture of an identification: the record it misses most, loop and residual."""
-    series = series_of_fit(found)
-    shown = most_telling(series)
-    figure, grid = _sheet(shown, origin)
-    _draw_residual(figure.add_subplot(grid[1, :]), shown)
-    figure.suptitle(_which(series, shown, origin, "model"), fontsize=FONT + 3)
     return figure
 
 
@@ -178,8 +167,14 @@ def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatAr
     return figure
 
 
-def _sheet(s: Series, origin: str) -> tuple[Figure, GridSpec]:
-    """Return a picture with a record, its telling window and its loop in the upper row."""
+def _sheet(
+    series: tuple[Series, ...], origin: str, model: str, head: Sequence[str] = ()
+) -> tuple[Figure, GridSpec, Series]:
+    """Return a picture with the record that the `model` misses most, and that record.
+
+    In the upper row are the record, its telling window and its loop, above it the lines of `head`.
+    """
+    s = most_telling(series)
     figure = sheet(SIZE_INCHES, DPI)
     ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
     grid = figure.add_gridspec(2, 3, **ratios)
@@ -194,14 +189,11 @@ def _sheet(s: Series, origin: str) -> tuple[Figure, GridSpec]:
     )
     draw(part, zoom_plot(s, origin, _MOST_POINTS), inside, legend={})
     draw(loop, loop_plot(s, origin, shown), "Loop", legend={"loc": "upper left"})
-    return figure, grid
-
-
-def _which(series: tuple[Series, ...], shown: Series, origin: str, model: str) -> str:
-    which = f"{origin} record: {shown.name}"
+    which = f"{origin} record: {s.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the {model} misses most)"
-    return which
+    figure.suptitle("\n".join([*head, which]), fontsize=FONT + 3)
+    return figure, grid, s
 
 
 def _draw_residual(axes: Axes, s: Series, origin: str = "measured") -> None:
@@ -236,31 +228,25 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     above.set_ylim(low, high + 0.32 * (high - low))  # for the legend
     above.legend(fontsize=font - 0.5, loc="upper left", ncols=2, columnspacing=0.9,
                  handlelength=1.2, framealpha=0.0)  # fmt: skip
-    _bars(below, diagnosis, font)
+    below.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
+    rows = [("base model", BASE_COLOUR, diagnosis.base_errors.holdout_rms_m)]
+    if added(diagnosis):
+        rows.append(("extended", EXTENDED_COLOUR, diagnosis.extended_errors.holdout_rms_m))
+    rows.append(("noise", NOISE_COLOUR, diagnosis.noise_floor_rms_m))
+    largest = max(rms for *_, rms in rows)
+    scale = scale_of(diagnosis.experiments, largest)
+    for k, (_, colour, rms) in enumerate(rows):
+        below.barh(k, rms, color=colour, height=0.7)
+        below.annotate(f" {scale.text(rms)}", (rms, k), va="center", fontsize=font)
+    below.axvline(diagnosis.noise_floor_rms_m, color="black", linestyle="--", linewidth=1.0)
+    below.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=font)
+    below.set(xlim=(0.0, 1.3 * largest), xticks=[])
+    below.invert_yaxis()
+    below.spines[["top", "right", "bottom"]].set_visible(False)
     causes = listing([plain(c.effect) for c in diagnosis.causes])
     verdict = VERDICTS[diagnosis.verdict].capitalize()
     figure.suptitle(f"{verdict}: {causes}" if causes else verdict, fontsize=font + 2, wrap=True)
     return figure
-
-
-def _bars(axes: Axes, d: Diagnosis, font: float) -> None:
-    """Draw the held-out errors, with the noise as their floor."""
-    rows = [("base model", BASE_COLOUR, d.base_errors.holdout_rms_m)]
-    if added(d):
-        rows.append(("extended", EXTENDED_COLOUR, d.extended_errors.holdout_rms_m))
-    rows.append(("noise", NOISE_COLOUR, d.noise_floor_rms_m))
-    largest = max(rms for *_, rms in rows)
-    scale = scale_of(d.experiments, largest)
-    for k, (_, colour, rms) in enumerate(rows):
-        axes.barh(k, rms, color=colour, height=0.7)
-        axes.annotate(f" {scale.text(rms)}", (rms, k), va="center", fontsize=font)
-    axes.axvline(d.noise_floor_rms_m, color="black", linestyle="--", linewidth=1.0)
-    axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=font)
-    axes.set_xlim(0.0, 1.3 * largest)
-    axes.invert_yaxis()
-    axes.set_xticks([])
-    axes.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
-    axes.spines[["top", "right", "bottom"]].set_visible(False)
 
 
 def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure:
@@ -281,22 +267,18 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         by_name = {f.name: f for f in result.figures}
         _draw_parameter(axes, result, by_name[_chosen(output, by_name, next(iter(by_name)))])
     else:
-        _draw_compared(axes, _series(result), output)
+        series = _series(result)
+        quantities = dict.fromkeys(s.quantity for s in series)
+        name = _chosen(output, [*quantities, "residual"], most_telling(series).quantity)
+        if name == "residual":
+            _draw_residual(axes, most_telling(series))
+        else:
+            shown = most_telling([s for s in series if s.quantity == name])
+            whole = replace(shown, held_out=np.zeros(len(shown.time), dtype=bool))
+            draw(axes, measured_plot(whole, "measured", slice(None)), shown.title, legend={})
+            axes.margins(x=0.01)
     found: Figure | SubFigure = axes.figure
     return found if isinstance(found, Figure) else found.figure
-
-
-def _draw_compared(axes: Axes, series: tuple[Series, ...], output: str | None) -> None:
-    """Draw what was measured beside the models; "residual" is what these leave."""
-    quantities = dict.fromkeys(s.quantity for s in series)
-    name = _chosen(output, [*quantities, "residual"], most_telling(series).quantity)
-    if name == "residual":
-        _draw_residual(axes, most_telling(series))
-        return
-    shown = most_telling([s for s in series if s.quantity == name])
-    whole = replace(shown, held_out=np.zeros(len(shown.time), dtype=bool))
-    draw(axes, measured_plot(whole, "measured", slice(None)), shown.title, legend={})
-    axes.margins(x=0.01)
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
@@ -367,10 +349,8 @@ def _draw_prior(axes: Axes, found: Posterior, record: int) -> None:
     low, high, _ = _band(found, "prior_predictive", record)
     span = float(np.nanmax(y) - np.nanmin(y))
     scale = length_scale(3.0 * span)
-    band = f"prior, {100.0 * HDI:.0f} %"
-    axes.fill_between(
-        r.time, scale.factor * low, scale.factor * high, color=BASE_COLOUR, alpha=0.3, label=band
-    )
+    band, look = f"prior, {100.0 * HDI:.0f} %", {"color": BASE_COLOUR, "alpha": 0.3}
+    axes.fill_between(r.time, scale.factor * low, scale.factor * high, label=band, **look)
     axes.plot(r.time, scale.factor * y, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
     middle = 0.5 * float(np.nanmax(y) + np.nanmin(y))
     axes.set_ylim(scale.factor * (middle - 1.5 * span), scale.factor * (middle + 1.5 * span))

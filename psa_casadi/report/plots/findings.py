@@ -182,23 +182,22 @@ def patch_plot(d: Diagnosis, patch: Patch) -> tuple[str, Panel]:
     e, added = d.experiments[k], patch.added[k] - np.mean(patch.added[k])
     counts = e.record.displacement_unit == "counts"
     scale = length_scale(float(np.max(np.abs(added), initial=1e-12)), counts=counts)
-    x, name, unit = _coordinate(d, patch, k)
-    part = slice(None, None, max(1, len(x) // _SAMPLES))
-    plot = Panel(f"{name} [{unit}]", f"added [{scale.unit}]", 320)
-    if patch.kind in ("curve", "direction", "memory"):
-        return name, plot.marks(x[part], scale.factor * added[part], size=3)
-    return name, plot.line(x[part], scale.factor * added[part], width=1.5)
-
-
-def _coordinate(d: Diagnosis, patch: Patch, k: int) -> tuple[FloatArray, str, str]:
-    record = d.experiments[k].record
+    curved = patch.kind in ("curve", "direction", "memory")
     if patch.kind == "curve" and patch.port != "drive voltage":
-        size = 1.0 if record.displacement_unit == "counts" else 1e6
-        unit = "counts" if size == 1.0 else "µm"
-        return size * d.extended[k], "predicted displacement", unit
-    if patch.kind in ("curve", "direction", "memory"):
-        return record.voltage, "voltage", "V"
-    return record.time - record.time[0], "time", "s"
+        unit, size = ("counts", 1.0) if counts else ("µm", 1e6)
+        x, name = size * d.extended[k], "predicted displacement"
+    elif curved:
+        x, name, unit = e.record.voltage, "voltage", "V"
+    else:
+        x, name, unit = e.record.time - e.record.time[0], "time", "s"
+    part = slice(None, None, max(1, len(x) // _SAMPLES))
+    plot, shown = (
+        Panel(f"{name} [{unit}]", f"added [{scale.unit}]", 320),
+        scale.factor * added[part],
+    )
+    if curved:
+        return name, plot.marks(x[part], shown, size=3)
+    return name, plot.line(x[part], shown, width=1.5)
 
 
 def free_plot(f: FreeFunction) -> Panel:
