@@ -17,14 +17,8 @@ from math import copysign, exp, sqrt
 import numpy as np
 import scipy
 
+from psa_casadi import online
 from psa_casadi.model.compose import Model
-from psa_casadi.online import (
-    AdaptiveFeedForward,
-    Estimate,
-    FeedForward,
-    identifier_for,
-    stack_values,
-)
 from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
@@ -130,7 +124,7 @@ class Drive:
     voltage: FloatArray
     displacement: FloatArray
     linear: FloatArray
-    estimate: Estimate | None = None
+    estimate: online.Estimate | None = None
 
     def nonlinearity(self, part: slice = slice(None)) -> float:
         """Return the largest distance from the best line through (linear, displacement) [1].
@@ -191,8 +185,8 @@ def driven(
     estimate = None
     voltage, moved = np.zeros(time.size), np.zeros(time.size)
     if control == "tracked":
-        tuned = identifier_for(known, period, noise=ERROR * stroke, memory=memory)
-        adaptive = AdaptiveFeedForward(tuned.values)
+        tuned = online.identifier_for(known, period, noise=ERROR * stroke, memory=memory)
+        adaptive = online.AdaptiveFeedForward(tuned.values)
         x = 0.0
         for k in range(time.size):
             voltage[k] = adaptive.step_voltage(
@@ -201,7 +195,7 @@ def driven(
             moved[k] = x = stack.step(float(voltage[k]))
         estimate = adaptive.estimate
     else:
-        plain = FeedForward(stack_values(known, period))
+        plain = online.FeedForward(online.stack_values(known, period))
         step = plain.step_voltage if control == "feed-forward" else float
         voltage[:] = [step(w) for w in wanted.tolist()]
         moved[:] = [stack.step(u) for u in voltage.tolist()]

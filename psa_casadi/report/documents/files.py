@@ -454,9 +454,8 @@ def posterior_file(found: Posterior) -> dict[str, Any]:
     )
     parameters = {
         f.name: SampledParameter(
-            f.unit, f.mean, f.sd, (f.low, f.high),
-            *map(_finite, (f.mc_error, f.ess, f.r_hat, f.prior_share)),
-            meaning=found.model.parameter(f.name).description,
+            f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),
+            _finite(f.r_hat), _finite(f.prior_share), found.model.parameter(f.name).description,
         )
         for f in found.figures
     }  # fmt: skip

@@ -186,8 +186,8 @@ def _joined(found: Sequence[_Read]) -> list[_Read]:
             for name, p in finding.parameters.items():
                 meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
                 parameters[name] = replace(p, meaning=meaning)
-            more = {"trace": own.trace, "force_scale": own.force_scale}
-            rows[same[0]] = path, replace(finding, parameters=parameters, **more)
+            whole = replace(finding, parameters=parameters, trace=own.trace)
+            rows[same[0]] = path, replace(whole, force_scale=own.force_scale)
             del rows[k]
     return list(rows.values())
 

@@ -20,14 +20,7 @@ from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import INK, Panel
-from psa_casadi.report.words.design_words import (
-    Titled,
-    design_tables,
-    mechanism_sentences,
-    mechanism_table,
-    pole_table,
-    sentences,
-)
+from psa_casadi.report.words import design_words
 from psa_casadi.report.words.phrases import length_scale, number, plain
 from psa_casadi.report.words.series import (
     BASE_COLOUR,
@@ -51,7 +44,7 @@ def write_design_page(
     *,
     title: str,
     summary: Sequence[str],
-    tables: Sequence[Titled] = (),
+    tables: Sequence[design_words.Titled] = (),
     figures: Sequence[Picture] = (),
     badges: Sequence[str] = (),
     live: LiveModel | None = None,
@@ -174,8 +167,8 @@ def write_experiment_page(
     write_design_page(
         path,
         title="Experiment that separates effects" if several else "Experiment for the parameters",
-        summary=sentences(design, model.values.get("C_p")),
-        tables=design_tables(design, model),
+        summary=design_words.sentences(design, model.values.get("C_p")),
+        tables=design_words.design_tables(design, model),
         figures=(Picture("The voltage to apply", applied), _responses(record, responses)),
         badges=(f"{record.n} samples", f"{number(design.limits.duration)} s"),
         live=live,
@@ -230,9 +223,12 @@ def write_mechanism_page(
     write_design_page(
         path,
         title=f"Prestress mechanism for {model.name}",
-        summary=[*mechanism_sentences(d), *why],
+        summary=[*design_words.mechanism_sentences(d), *why],
         live=live,
-        tables=(Titled("Mechanism", mechanism_table(d)), Titled("Poles", pole_table(d), acts)),
+        tables=(
+            design_words.Titled("Mechanism", design_words.mechanism_table(d)),
+            design_words.Titled("Poles", design_words.pole_table(d), acts),
+        ),
         figures=(
             Picture("Root locus", _root_locus(d), locus),
             Picture("Step of the rated voltage", _step(d), linear),

@@ -118,7 +118,7 @@ def design_tables(design: Separated | Informative, model: Model) -> tuple[Titled
 
 def _intervals(design: Informative, model: Model) -> Table:
     """Return the predicted 95 % interval of every chosen parameter, before and after."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, after in design.intervals.items():
         unit, display = shown_in(model, name)
         cells = (

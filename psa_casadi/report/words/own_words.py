@@ -11,6 +11,7 @@ from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note
+from psa_casadi.report.words import verdict_words
 from psa_casadi.report.words.phrases import (
     added,
     either,
@@ -26,14 +27,6 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, FloatArray, Series
 from psa_casadi.report.words.tables import Table
-from psa_casadi.report.words.verdict_words import (
-    VERDICTS,
-    cause_size,
-    named_cause,
-    naming_sentence,
-    share_row,
-    within,
-)
 
 #: Outputs that a sentence names one by one.
 _NAMED = 4
@@ -48,14 +41,14 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
         if free is not None:
             words = (
                 f"a free function of {free.of} in {free.port} would remove"
-                f" {percent(within(free.share))} of the error above the noise; "
+                f" {percent(verdict_words.within(free.share))} of the error above the noise; "
             )
         return (
             "Something is missing, and no effect in the table explains it: no cause is named;"
             f" {words}{_base_errors(d)}."
         )
-    named = [named_cause(c, c.port) for c in d.causes]
-    return naming_sentence(d, named)
+    named = [verdict_words.named_cause(c, c.port) for c in d.causes]
+    return verdict_words.naming_sentence(d, named)
 
 
 def _base_errors(d: OdeDiagnosis) -> str:
@@ -76,7 +69,7 @@ def _base_errors(d: OdeDiagnosis) -> str:
 
 def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
     """Return the lines of a terminal's story: a label and what is told."""
-    lines = [("verdict", f"{VERDICTS[d.verdict]}. {own_verdict_sentence(d)}")]
+    lines = [("verdict", f"{verdict_words.VERDICTS[d.verdict]}. {own_verdict_sentence(d)}")]
     lines += [("records", listing([f"{r.name} ({len(r.time)} samples)" for r in d.runs]))]
     for e in d.errors:
         shown = [with_its_unit(v, e.unit) for v in (e.base, e.extended, e.noise)]
@@ -86,7 +79,7 @@ def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
     for c, share in zip(d.causes, d.budget.causes, strict=True):
         told = f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
         removes = f"it removes {share.text} of the held-out error above the noise"
-        lines.append(("cause", f"{told}: {cause_size(d, c)}; {removes}"))
+        lines.append(("cause", f"{told}: {verdict_words.cause_size(d, c)}; {removes}"))
         if c.cannot_be_told_from:
             rivals = either(c.cannot_be_told_from)
             lines.append(("rivals", f"these data cannot distinguish it from {rivals}"))
@@ -98,14 +91,16 @@ def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
 def own_budget_table(d: OdeDiagnosis) -> Table:
     """Return the shares of the base model's held-out error above the noise, with intervals."""
     b = d.budget
-    rows = [share_row(plain(s.what), s) for s in b.causes]
+    rows = [verdict_words.share_row(plain(s.what), s) for s in b.causes]
     if len(rows) > 1:
-        rows.append(share_row("all causes together", b.together))
+        rows.append(verdict_words.share_row("all causes together", b.together))
     if b.unnamed is not None:
-        rows.append(share_row(f"unnamed: a free function of {b.unnamed.what}", b.unnamed))
+        rows.append(
+            verdict_words.share_row(f"unnamed: a free function of {b.unnamed.what}", b.unnamed)
+        )
     low, high = b.together.interval
     left = Share("left", 1.0 - b.together.share, (1.0 - high, 1.0 - low))
-    rows.append(share_row("remains above the noise", left))
+    rows.append(verdict_words.share_row("remains above the noise", left))
     return Table(("what", "removes", "95 % interval"), tuple(rows))
 
 

@@ -4,15 +4,8 @@ import math
 from collections.abc import Sequence
 
 from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.population import population
 from psa_casadi.population.finding import NORMAL_95, Finding
-from psa_casadi.population.population import (
-    Difference,
-    Estimates,
-    Frequency,
-    Population,
-    differences,
-    display_unit,
-)
 from psa_casadi.population.statistics import FEWEST
 from psa_casadi.report.words.phrases import (
     Scale,
@@ -45,8 +38,8 @@ METHOD = (
 class _Shown:
     """A parameter's estimates as text, in the unit that the parameter is shown in."""
 
-    def __init__(self, e: Estimates) -> None:
-        self.e, self.name, self.unit = e, e.name, display_unit(e.name, e.unit)
+    def __init__(self, e: population.Estimates) -> None:
+        self.e, self.name, self.unit = e, e.name, population.display_unit(e.name, e.unit)
 
     def number(self, value: float) -> str:
         """Return a value of the parameter, without its unit."""
@@ -79,7 +72,7 @@ def _p(p: float | None) -> str:
     return "< 0.001" if p < 1e-3 else number(p, 2)
 
 
-def population_sentences(p: Population) -> tuple[str, ...]:
+def population_sentences(p: population.Population) -> tuple[str, ...]:
     """Return the main findings, a sentence each."""
     devices = list(dict.fromkeys(o.device for o in p.outliers))
     if devices:
@@ -110,7 +103,7 @@ def population_sentences(p: Population) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def population_tables(p: Population) -> dict[str, Table]:
+def population_tables(p: population.Population) -> dict[str, Table]:
     """Return who stands out, every parameter over the devices, batches, drift, and how often what.
 
     That is: value, what the others predict, z and adjusted p; mean and spread; the means of batches
@@ -162,7 +155,7 @@ def population_tables(p: Population) -> dict[str, Table]:
     }  # fmt: skip
 
 
-def _counts(what: str, rows: Sequence[Frequency]) -> Table:
+def _counts(what: str, rows: Sequence[population.Frequency]) -> Table:
     return Table(
         (what, "devices", "share", "95 % interval"),
         tuple(
@@ -173,7 +166,7 @@ def _counts(what: str, rows: Sequence[Frequency]) -> Table:
     )  # fmt: skip
 
 
-def left_out_sentence(p: Population) -> str:
+def left_out_sentence(p: population.Population) -> str:
     """Say which parameters too few devices tell, "" where there are none."""
     if not p.left_out:
         return ""
@@ -181,10 +174,10 @@ def left_out_sentence(p: Population) -> str:
 
 
 def difference_sentence(
-    findings: Sequence[Finding], found: Sequence[Difference] | None = None
+    findings: Sequence[Finding], found: Sequence[population.Difference] | None = None
 ) -> str:
     """Say which parameters differ beyond noise, and how the verdicts do."""
-    rows = differences(findings) if found is None else found
+    rows = population.differences(findings) if found is None else found
     differing = [d.estimates.name for d in rows if d.differs]
     if not rows:
         sentence = "The files share no parameter that two devices determine."
@@ -242,7 +235,7 @@ def budget_table(findings: Sequence[Finding]) -> Table:
     return Table(("removed by", *(f.device for f in diagnosed)), tuple(rows))
 
 
-def difference_table(findings: Sequence[Finding], rows: Sequence[Difference]) -> Table:
+def difference_table(findings: Sequence[Finding], rows: Sequence[population.Difference]) -> Table:
     """Return the shared parameters with intervals, one device a column, and whether they differ."""
     body = []
     for d in rows:

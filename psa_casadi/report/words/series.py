@@ -12,14 +12,7 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.phrases import (
-    Scale,
-    added,
-    handy_scale,
-    in_brackets,
-    length_scale,
-    prefixed_scale,
-)
+from psa_casadi.report.words import phrases
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
@@ -80,11 +73,11 @@ class Series:
         return float(np.nanmax(self.measured) - np.nanmin(self.measured))
 
     @property
-    def scale(self) -> Scale:
+    def scale(self) -> phrases.Scale:
         """The unit to show what was measured in."""
         if self.unit:
-            return prefixed_scale(self.span, self.unit)
-        return handy_scale(self.span, counts=self.counts)
+            return phrases.prefixed_scale(self.span, self.unit)
+        return phrases.handy_scale(self.span, counts=self.counts)
 
     @property
     def title(self) -> str:
@@ -94,27 +87,27 @@ class Series:
     @property
     def label(self) -> str:
         """What an axis of the measured quantity says."""
-        return in_brackets(self.quantity, self.scale.unit)
+        return phrases.in_brackets(self.quantity, self.scale.unit)
 
     @property
-    def time_scale(self) -> Scale:
+    def time_scale(self) -> phrases.Scale:
         """The unit to show times in: `shown = factor * seconds`."""
         return time_scale(float(self.time[-1] - self.time[0]))
 
     @property
-    def residual_scale(self) -> Scale:
+    def residual_scale(self) -> phrases.Scale:
         """The unit to show residuals in."""
         largest = max(float(np.nanmax(np.abs(self.residual(c)))) for c in self.curves)
         if self.unit:
-            return prefixed_scale(largest, self.unit)
-        return length_scale(largest, counts=self.counts)
+            return phrases.prefixed_scale(largest, self.unit)
+        return phrases.length_scale(largest, counts=self.counts)
 
 
-def time_scale(span: float) -> Scale:
+def time_scale(span: float) -> phrases.Scale:
     """Return the unit to show times of a span [s] in: `shown = factor * seconds`."""
     if span >= 1.0:
-        return Scale("s", 1.0)
-    return Scale("ms", 1e3) if span >= 1e-3 else Scale("µs", 1e6)
+        return phrases.Scale("s", 1.0)
+    return phrases.Scale("ms", 1e3) if span >= 1e-3 else phrases.Scale("µs", 1e6)
 
 
 def series_of(d: Diagnosis) -> tuple[Series, ...]:
@@ -123,7 +116,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     levels = [n.level for n in d.noise] or [d.noise_floor_rms_m] * len(d.experiments)
     for e, base, extended, noise in zip(d.experiments, d.base, d.extended, levels, strict=True):
         curves = [Curve("base model", BASE_COLOUR, base)]
-        if added(d):
+        if phrases.added(d):
             curves.append(Curve("extended model", EXTENDED_COLOUR, extended))
         rows.append(_series(e, curves, noise))
     return tuple(rows)

@@ -15,6 +15,7 @@ from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
+from psa_casadi.report.words import verdict_words
 from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.own_words import own_lines
@@ -34,14 +35,6 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
-from psa_casadi.report.words.verdict_words import (
-    VERDICTS,
-    alternative_sentence,
-    budget_sentence,
-    cause_size,
-    column_sentence,
-    verdict_sentence,
-)
 from psa_casadi.units import convert
 
 if TYPE_CHECKING:
@@ -79,7 +72,9 @@ def story(
 
 def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
-    lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
+    lines = [
+        ("verdict", f"{verdict_words.VERDICTS[d.verdict]}. {verdict_words.verdict_sentence(d)}")
+    ]
     wrong = strongest(d.misfit)
     lines += [("wrong", brief_text(wrong))] if wrong else []
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
@@ -92,11 +87,11 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
         lines.append(("extended", _errors(d.extended_errors, scale)))
     for c in d.causes:
         sure = f"{c.belongs_to}, {percent(c.confidence)}"
-        lines.append(("cause", f"{plain(c.effect)} ({sure}): {cause_size(d, c)}"))
+        lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
         lines.append(("rivals", _rivals(d, c)))
-    lines.extend(("column", column_sentence(d, c)) for c in d.columns)
-    lines.extend(("export", f"{alternative_sentence(d, a)}.") for a in d.alternatives)
-    spent = budget_sentence(d, scale)
+    lines.extend(("column", verdict_words.column_sentence(d, c)) for c in d.columns)
+    lines.extend(("export", f"{verdict_words.alternative_sentence(d, a)}.") for a in d.alternatives)
+    spent = verdict_words.budget_sentence(d, scale)
     if spent and d.verdict not in ("adequate", "not_driven"):
         lines.append(("budget", f"{spent}."))
     lines.append(("remains", rest_sentence(d)))
