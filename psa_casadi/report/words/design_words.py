@@ -118,7 +118,7 @@ def design_tables(design: Separated | Informative, model: Model) -> tuple[Titled
 
 def _intervals(design: Informative, model: Model) -> Table:
     """Return the predicted 95 % interval of every chosen parameter, before and after."""
-    rows: list[tuple[str, ...]] = []
+    rows = []
     for name, after in design.intervals.items():
         unit, display = shown_in(model, name)
         cells = (
@@ -148,8 +148,8 @@ def mechanism_table(d: MechanismDesign) -> Table:
         ("overshoot in a step of rated voltage", "overshoot", 100.0, "%"),
         ("peak force in the mechanism in that step", "peak_force", 1.0, "N"),
     ):
-        both = (number(factor * getattr(r, figure), 4) for r in (d.free, d.reached))
-        rows.append((name, *both, unit))
+        free, reached = (number(factor * getattr(r, figure), 4) for r in (d.free, d.reached))
+        rows.append((name, free, reached, unit))
     return Table(("", "free stack", "with the mechanism", "unit"), tuple(rows))
 
 
