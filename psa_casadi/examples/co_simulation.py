@@ -111,7 +111,7 @@ class Slave:
 
     def __enter__(self) -> "Slave":
         self._fmu.instantiate()
-        self._fmu.setupExperiment(tolerance=1e-8, startTime=0.0, stopTime=END)
+        self._fmu.setupExperiment(tolerance=1e-8)
         self._fmu.enterInitializationMode()
         self._fmu.exitInitializationMode()
         return self

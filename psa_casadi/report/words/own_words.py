@@ -10,7 +10,6 @@ from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note
 from psa_casadi.report.words import verdict_words
 from psa_casadi.report.words.phrases import (
     added,
@@ -231,13 +230,6 @@ def _identification(found: OdeIdentification) -> str:
     return "\n".join([f"identified '{model.name}':", *rows, *left, *said])
 
 
-def _moved(
-    name: str, estimate: tuple[float, float, float], without: float, unit: str, causes: int
-) -> str:
-    value = with_unit(_estimate(*estimate), unit)
-    return f"{name} = {value}, without the cause{'s' * (causes > 1)} {without:.4g}"
-
-
 def _estimate(value: float, low: float, high: float) -> str:
     """Return a value with its interval, in as many digits as tell them apart, four at least."""
     half = max(high - value, value - low)
@@ -247,18 +239,13 @@ def _estimate(value: float, low: float, high: float) -> str:
     return f"{value:.{digits}g} ({low:.{digits}g} to {high:.{digits}g})"
 
 
-def _withdrawn(names: Sequence[str], share: float, output: str, why: Note) -> str:
-    of = f" of {output}" if output else ""
-    return (
-        f"{' and '.join(names)} would remove {share:.0%} of the held-out error above the noise{of};"
-        f" not named, because {why}."
-    )
-
-
 OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     "own_diagnosis": lambda d: labelled(own_lines(d), 100),
     "own_identification": _identification,
-    "moved": _moved,
+    "moved": lambda name, estimate, without, unit, causes: (
+        f"{name} = {with_unit(_estimate(*estimate), unit)}, without the cause{'s' * (causes > 1)}"
+        f" {without:.4g}"
+    ),
     # the records
     "stairs": (
         "The input '{input}' stands still between jumps in {records}, and each jump is read as a"
@@ -297,7 +284,10 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         "A free function of {of} in {port} would remove {share:.0%} of what is left above the"
         " noise."
     ),
-    "own_withdrawn": _withdrawn,
+    "own_withdrawn": lambda names, share, output, why: (
+        f"{' and '.join(names)} would remove {share:.0%} of the held-out error above the noise"
+        f"{f' of {output}' if output else ''}; not named, because {why}."
+    ),
     "free_beats": "a free function of {of} in {port} explains more ({share:.0%})",
     "own_little": "that is less than {least:.0%} and much remains",
     "slight": (

@@ -217,13 +217,20 @@ def plain(name: str) -> str:
 MOST_NAMES = 5
 
 
-def listing(words: Sequence[str], joint: str = "and", *, most: int | None = None) -> str:
+def listing(
+    words: Sequence[str], joint: str = "and", between: str = ",", *, most: int | None = None
+) -> str:
     """Return "a, b and c", or "a, b and 7 more" of more words than `most`."""
     if most is not None and len(words) > most:
         return f"{', '.join(words[:most])} {joint} {len(words) - most} more"
     if len(words) < 2:
         return "".join(words)
-    return f"{', '.join(words[:-1])} {joint} {words[-1]}"
+    return f"{f'{between} '.join(words[:-1])}{'' if joint[0] == ';' else ' '}{joint} {words[-1]}"
+
+
+def are(names: Sequence[str], between: str = ", ") -> str:
+    """Return names with "is" or "are" behind them."""
+    return f"{between.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def either(effects: Sequence[str]) -> str:
