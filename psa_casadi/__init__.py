@@ -76,8 +76,8 @@ if TYPE_CHECKING:
         write_record,
     )
     from psa_casadi.records.signals import Signals
+    from psa_casadi.report.documents.files import load_diagnosis
     from psa_casadi.report.documents.findings import read_findings
-    from psa_casadi.report.documents.reading import load_diagnosis
     from psa_casadi.report.page.devices import write_comparison, write_population
     from psa_casadi.report.page.results import write_fit_report, write_report
     from psa_casadi.report.plots.figures import save_figure
@@ -131,7 +131,7 @@ _HOMES = {
     "report.page.results": "write_report write_fit_report",
     "report.page.devices": "write_comparison write_population",
     "report.documents.findings": "read_findings",
-    "report.documents.reading": "load_diagnosis",
+    "report.documents.files": "load_diagnosis",
     "devices.batch": "BatchRun batch",
     "devices.jobs": "Job Options",
     "export.fixed_step.export": "CodeExport export_c",

@@ -105,11 +105,11 @@ def _serve(port: int, no_browser: bool, modules: list[str]) -> None:
         folder.mkdir()
         desk = Desk(folder, list(known_effects(given.effects)), modules)
         with served(port, desk) as server:
-            show(f"Open {server.gate.address}")
+            show(f"Open {server.address}")
             tell("Ctrl-C ends the page and removes its files.")
             sys.stdout.flush()
             if not no_browser:
-                _open(server.gate.address, place)
+                _open(server.address, place)
             try:
                 while True:
                     time.sleep(3600.0)

@@ -3,7 +3,6 @@
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -43,41 +42,6 @@ class Original:
     name: str
     url: str
     sha256: str
-
-
-class Conversion(Protocol):
-    """What makes the CSV file of a record of its originals, the same bytes on every machine."""
-
-    @property
-    def words(self) -> str:
-        """What is taken of the originals, in words."""
-
-    def csv(self, originals: Sequence[bytes]) -> bytes:
-        """Return the CSV file of the record."""
-
-
-@dataclass(frozen=True)
-class DatasetFile:
-    """One record of a dataset: its CSV file, the originals, and what makes it of them."""
-
-    name: str
-    description: str
-    sha256: str
-    originals: tuple[Original, ...]
-    conversion: Conversion
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """Public records of one device."""
-
-    name: str
-    description: str
-    source: str
-    citation: str
-    licence: str
-    licence_text: str
-    files: tuple[DatasetFile, ...]
 
 
 #: The columns of every record: time in s, voltage in V with six decimals, displacement in um with
@@ -202,6 +166,30 @@ def own_part(
     return own
 
 
+@dataclass(frozen=True)
+class DatasetFile:
+    """One record of a dataset: its CSV file, the originals, and what makes it of them."""
+
+    name: str
+    description: str
+    sha256: str
+    originals: tuple[Original, ...]
+    conversion: Columns | OneAxis
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Public records of one device."""
+
+    name: str
+    description: str
+    source: str
+    citation: str
+    licence: str
+    licence_text: str
+    files: tuple[DatasetFile, ...]
+
+
 _FOLDER = (
     "https://raw.githubusercontent.com/yan9a/DiscreteBacklashOperator/"
     "79fd060d86cdf69be2388e29bf57b0766c273650/MatLabCode/DiscreteBacklashModel/"
@@ -293,7 +281,7 @@ _ORIGINALS = {
     "u_300mV_test.npy": "2bc566ae64d9000e69fbbc95092ac9c04c083bb398e4f16f2eb105645844e401",
     "y_300mV_test.npy": "b46edea962a149b7a5abd89f819e6f1ec03ba4d68b0ac83e2a8fc84c2b0ebaf3",
 }
-_TRAINING = {
+_AXES = {
     "axis_1_100mV.csv": "e7464cb9adf92382e5ed113ae0438c09ee27c9cb1278c54030518d91f111c041",
     "axis_2_100mV.csv": "5e417107d46b3a3020b606eb38ed40951b9ed2a26d733e15019411f803a79e5d",
     "axis_3_100mV.csv": "682a8c0ab0109bc7d770d778d1da4b2a2cf675499fedb9a2861559d92d1ae910",
@@ -303,8 +291,6 @@ _TRAINING = {
     "axis_1_300mV.csv": "370531ab989cf3e7555c679bab8946d2cb9b2fb418b8b1ae5d5e6ee56cf3de17",
     "axis_2_300mV.csv": "d426292410bf6a9e51c2c526a9511a0919705f702caa06cfd4285dd5affdc87d",
     "axis_3_300mV.csv": "8c8cf8b11ad0a411238d38eb5e9d75e33620610a2f9203b7cf37d617fbdcb745",
-}
-_MIRROR_TEST = {
     "axis_1_100mV_test_1.csv": "509d16d22f73c294e5941db22587bf36cdf77d4db287d3638af9f627710a4fc9",
     "axis_1_100mV_test_2.csv": "2cc2c71b2380d0e113478a3cd8b2349b7aa949b05bc5e20342761c96002bb925",
     "axis_1_100mV_test_3.csv": "b26c922f6bd14a6690daa04caf6fdacda8b5a63d25a9da58b027e566287002af",
@@ -335,34 +321,19 @@ _MIRROR_TEST = {
 }
 
 
-def _original(name: str) -> Original:
-    return Original(name, f"{_MIRROR_FOLDER}{name}", _ORIGINALS[name])
-
-
-def _pair(level: int, part: str) -> tuple[Original, Original]:
-    return _original(f"u_{level}mV_{part}.npy"), _original(f"y_{level}mV_{part}.npy")
-
-
-def _training(axis: int, level: int) -> DatasetFile:
-    name = f"axis_{axis + 1}_{level}mV.csv"
+def _axis(axis: int, level: int, signal: int | None = None) -> DatasetFile:
+    """Return the record of one axis: of the first training signal, or of a test signal."""
+    name = f"axis_{axis + 1}_{level}mV{'' if signal is None else f'_test_{signal + 1}'}.csv"
+    parts = ("train",) if signal is None else ("train", "test")
+    originals = [f"{what}_{level}mV_{part}.npy" for part in parts for what in "uy"]
+    said = "first training signal" if signal is None else f"test signal {signal + 1}"
+    length = "one period" if signal is None else "two periods"
     return DatasetFile(
         name,
-        f"axis {axis + 1} and its own actuator, first training signal, {level} mV rms, one period",
-        _TRAINING[name],
-        _pair(level, "train"),
-        OneAxis(axis, SIGNS[axis], experiment=0, periods=1, sample_rate=_RATE),
-    )
-
-
-def _test(axis: int, level: int, signal: int) -> DatasetFile:
-    name = f"axis_{axis + 1}_{level}mV_test_{signal + 1}.csv"
-    return DatasetFile(
-        name,
-        f"axis {axis + 1} and its own actuator, test signal {signal + 1}, {level} mV rms,"
-        " two periods",
-        _MIRROR_TEST[name],
-        (*_pair(level, "train"), *_pair(level, "test")),
-        OneAxis(axis, SIGNS[axis], experiment=signal, periods=2, sample_rate=_RATE),
+        f"axis {axis + 1} and its own actuator, {said}, {level} mV rms, {length}",
+        _AXES[name],
+        tuple(Original(o, f"{_MIRROR_FOLDER}{o}", _ORIGINALS[o]) for o in originals),
+        OneAxis(axis, SIGNS[axis], signal or 0, len(parts), _RATE),
     )
 
 
@@ -386,13 +357,13 @@ STEERING_MIRROR = _mirror(
     "steering_mirror",
     "a satellite's mirror on three piezo actuators, each axis with its own one: random-phase"
     " multisines up to 3 kHz, 6.4 kHz, steady state, three levels",
-    tuple(_training(axis, level) for level in LEVELS for axis in range(3)),
+    tuple(_axis(axis, level) for level in LEVELS for axis in range(3)),
 )
 
 STEERING_MIRROR_TEST = _mirror(
     "steering_mirror_test",
     "the same mirror: the test signals of the benchmark, to judge a model by",
-    tuple(_test(a, level, k) for level in LEVELS for a in range(3) for k in range(3)),
+    tuple(_axis(a, level, k) for level in LEVELS for a in range(3) for k in range(3)),
 )
 
 

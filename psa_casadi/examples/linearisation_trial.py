@@ -17,19 +17,15 @@ from math import copysign, exp, sqrt
 import numpy as np
 import scipy
 
+from psa_casadi import online
 from psa_casadi.model.compose import Model
-from psa_casadi.online import (
-    AdaptiveFeedForward,
-    Estimate,
-    FeedForward,
-    identifier_for,
-    stack_values,
-)
 from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
 
-_SHAPES = ("A", "beta", "gamma", "delta", "n", "k_L")
+Drift = Callable[[float], Values]
+#: Parameters that drift, and that are tracked.
+TRACKED = ("A", "beta", "gamma", "delta", "n", "k_L")
 
 
 class DriftingStack:
@@ -41,7 +37,7 @@ class DriftingStack:
     """
 
     def __init__(
-        self, values: Values, period: float, drift: Callable[[float], Values] | None = None,
+        self, values: Values, period: float, drift: Drift | None = None,
         parts: int = 6,
     ) -> None:  # fmt: skip
         self._p, self._drift, self._parts = dict(values), drift or (lambda _: {}), parts
@@ -65,7 +61,7 @@ class DriftingStack:
         """Move on by one period, the command [V] going in a line to `command`; return x [m]."""
         slope = (self._p["G"] * command - self._command) / self._parts
         factors = self._drift(self._time)
-        p = {n: self._p[n] * factors.get(n, 1.0) for n in _SHAPES}
+        p = {n: self._p[n] * factors.get(n, 1.0) for n in TRACKED}
         delay = self._p["R_s"] * self._p["C_p"] / self._h
         for _ in range(self._parts):
             behind = slope * delay
@@ -109,9 +105,6 @@ def _discrete(p: Values, h: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     return whole[:5, :5], whole[:5, 5] - whole[:5, 6], whole[:5, 6]
 
 
-Drift = Callable[[float], Values]
-
-TRACKED = ("A", "beta", "gamma", "delta", "n", "k_L")
 #: Share of the stroke that the sensor's noise has (rms).
 NOISE = 1e-4
 #: The rms error of sensor and model that the identification is told, as a share of the stroke.
@@ -130,17 +123,18 @@ class Drive:
     voltage: FloatArray
     displacement: FloatArray
     linear: FloatArray
-    estimate: Estimate | None = None
+    estimate: online.Estimate | None = None
+
+    def errors(self, part: slice = slice(None)) -> FloatArray:
+        """Return the distance from the line through (linear, displacement) best for a part [m]."""
+        table = np.column_stack([self.linear, np.ones_like(self.linear)])
+        best = np.linalg.lstsq(table[part], self.displacement[part], rcond=None)[0]
+        off: FloatArray = self.displacement - table @ best
+        return off
 
     def nonlinearity(self, part: slice = slice(None)) -> float:
-        """Return the largest distance from the best line through (linear, displacement) [1].
-
-        As a share of the range of the displacement, over part of the run.
-        """
-        x, line = self.displacement[part], self.linear[part]
-        table = np.column_stack([line, np.ones_like(line)])
-        best = np.linalg.lstsq(table, x, rcond=None)[0]
-        return float(np.abs(x - table @ best).max() / np.ptp(x))
+        """Return the largest of the `errors` in a part as a share of the displacement's range."""
+        return float(np.abs(self.errors(part)[part]).max() / np.ptp(self.displacement[part]))
 
 
 def wanted_voltage(time: FloatArray, span: float, frequency: float = 5.0) -> FloatArray:
@@ -191,8 +185,8 @@ def driven(
     estimate = None
     voltage, moved = np.zeros(time.size), np.zeros(time.size)
     if control == "tracked":
-        tuned = identifier_for(known, period, noise=ERROR * stroke, memory=memory)
-        adaptive = AdaptiveFeedForward(tuned.values)
+        tuned = online.identifier_for(known, period, noise=ERROR * stroke, memory=memory)
+        adaptive = online.AdaptiveFeedForward(tuned.values)
         x = 0.0
         for k in range(time.size):
             voltage[k] = adaptive.step_voltage(
@@ -201,15 +195,10 @@ def driven(
             moved[k] = x = stack.step(float(voltage[k]))
         estimate = adaptive.estimate
     else:
-        plain = FeedForward(stack_values(known, period))
+        plain = online.FeedForward(online.stack_values(known, period))
         step = plain.step_voltage if control == "feed-forward" else float
         voltage[:] = [step(w) for w in wanted.tolist()]
         moved[:] = [stack.step(u) for u in voltage.tolist()]
-    return Drive(time, wanted, voltage, moved, _linear(plant, wanted, period), estimate)
-
-
-def _linear(plant: Model, wanted: FloatArray, period: float) -> FloatArray:
-    """Return what the plant does without its hysteresis force and without drift [m]."""
-    bare = {**plant.values, "A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
-    stack = DriftingStack(bare, period)
-    return np.array([stack.step(w) for w in wanted.tolist()])
+    bare = DriftingStack({**p, "A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}, period)
+    linear = np.array([bare.step(w) for w in wanted.tolist()])
+    return Drive(time, wanted, voltage, moved, linear, estimate)

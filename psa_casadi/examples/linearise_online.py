@@ -9,15 +9,11 @@ microseconds, and the identification is also exported: as FMU 2.0, FMU 3.0 and M
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import psa_casadi as psa
 from psa_casadi.examples.linearisation_trial import Drive, ageing, driven, off_values
 from psa_casadi.online import identifier_for
-
-FloatArray = NDArray[np.float64]
 
 END, PERIOD = 4.0, 5e-4
 #: The part that is looked at: the last second, five periods.
@@ -59,21 +55,11 @@ def _draw(path: Path, runs: dict[str, Drive]) -> None:
     for kind, label, colour in _LOOK:
         d = runs[kind]
         loops.plot(d.wanted[LAST], 1e6 * d.displacement[LAST], color=colour, label=label)
-        errors.plot(d.time, _error(d), color=colour, label=label, linewidth=0.8)
-    _label(loops, "wanted voltage of a linear stack [V]", "displacement [um]")
-    _label(errors, "time [s]", "distance from a straight line [% of the range]")
+        error = 100.0 * d.errors(LAST) / float(np.ptp(d.displacement))
+        errors.plot(d.time, error, color=colour, label=label, linewidth=0.8)
+    loops.set(xlabel="wanted voltage of a linear stack [V]", ylabel="displacement [um]")
+    errors.set(xlabel="time [s]", ylabel="distance from a straight line [% of the range]")
+    for axes in (loops, errors):
+        axes.grid(color="#e4e7ea")
     loops.legend(loc="upper left")
     figure.savefig(path, dpi=110)
-
-
-def _error(d: Drive) -> FloatArray:
-    """Return the distance from the line that fits the last second best [%]."""
-    table = np.column_stack([d.linear, np.ones_like(d.linear)])
-    best = np.linalg.lstsq(table[LAST], d.displacement[LAST], rcond=None)[0]
-    error: FloatArray = 100.0 * (d.displacement - table @ best) / float(np.ptp(d.displacement))
-    return error
-
-
-def _label(axes: Axes, x: str, y: str) -> None:
-    axes.set(xlabel=x, ylabel=y)
-    axes.grid(color="#e4e7ea")

@@ -11,9 +11,6 @@ from pathlib import Path
 
 import matplotlib.ticker
 import numpy as np
-from fmpy import extract, read_model_description
-from fmpy.fmi2 import FMU2Slave
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -27,6 +24,7 @@ from psa_casadi.design.mechanism.mechanism import (
     root_locus,
 )
 from psa_casadi.design.mechanism.search import Limits
+from psa_casadi.examples.co_simulation import Slave
 
 FloatArray = NDArray[np.float64]
 
@@ -44,7 +42,7 @@ def main(folder: Path) -> dict[str, float]:
         psa.export_fmu(port_model(stack), folder / "stack.fmu"),
         psa.export_fmu(mechanism_model(design), folder / "mechanism.fmu"),
     ]
-    time, x = _coupled(fmus, folder, stack.values["u_rated"])
+    time, x = _coupled(fmus, stack.values["u_rated"])
     expected = step_response(design.mechanics, design.mounting, time).displacement
     _draw(folder / "prestress_mechanism.png", design, time, x)
     return {
@@ -62,37 +60,19 @@ def main(folder: Path) -> dict[str, float]:
     }
 
 
-def _coupled(fmus: list[Path], folder: Path, voltage: float) -> tuple[FloatArray, FloatArray]:
+def _coupled(fmus: list[Path], voltage: float) -> tuple[FloatArray, FloatArray]:
     """Step both FMUs in turn with fmpy, values held; return times and displacement."""
-    parts, names = [], []
-    for path in fmus:
-        description = read_model_description(str(path))
-        names.append({v.name: v.valueReference for v in description.modelVariables})
-        part = FMU2Slave(
-            guid=description.guid,
-            unzipDirectory=str(extract(str(path), str((folder / path.stem).resolve()))),
-            modelIdentifier=description.coSimulation.modelIdentifier,
-        )
-        part.instantiate()
-        part.setupExperiment(tolerance=1e-8)
-        part.enterInitializationMode()
-        part.exitInitializationMode()
-        parts.append(part)
-    stack, mechanism = parts
-    out, into = [names[0][n] for n in _MOTION], [names[1][n] for n in _PLACES]
-    force, back = [names[1]["reaction_force"]], [names[0]["prestress_force"]]
-    stack.setReal([names[0]["voltage"]], [voltage])
     time = np.linspace(0.0, END, round(END / STEP) + 1)
     x = np.zeros(len(time))
-    for k, t in enumerate(time[:-1]):
-        mechanism.setReal(into, stack.getReal(out))
-        stack.setReal(back, mechanism.getReal(force))
-        stack.doStep(float(t), STEP)
-        mechanism.doStep(float(t), STEP)
-        x[k + 1] = stack.getReal(out[:1])[0]
-    for part in parts:
-        part.terminate()
-        part.freeInstance()
+    stack, mechanism = (Slave(path) for path in fmus)
+    with stack, mechanism:
+        stack.set({"voltage": voltage})
+        for k, t in enumerate(time[:-1].tolist()):
+            mechanism.set(dict(zip(_PLACES, stack.get(_MOTION), strict=True)))
+            stack.set({"prestress_force": mechanism.get(["reaction_force"])[0]})
+            stack.step(t, STEP)
+            mechanism.step(t, STEP)
+            x[k + 1] = stack.get(_MOTION[:1])[0]
     return time, x
 
 
@@ -113,16 +93,11 @@ def _draw(path: Path, d: MechanismDesign, time: FloatArray, x: FloatArray) -> No
         (np.array([complex(d.lag_pole)]), "s", "#222222", "lag, cannot be moved"),
     ):
         plane.plot(1e-3 * poles.real, 1e-3 * poles.imag, mark, color=colour, label=label)
-    _near(plane, d)
+    tall = 1.2e-3 * float(np.abs(d.free_poles).max())  # around the free stack's poles and the lag's
+    plane.set(xlim=(-0.25 * tall, 0.02 * tall), ylim=(-tall, tall))
+    plane.set(xlabel="real part [1000 rad/s]", ylabel="imaginary part [1000 rad/s]")
+    plane.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6))
     for axes in (steps, plane):
         axes.grid(color="#e4e7ea")
         axes.legend()
     figure.savefig(path, dpi=110)
-
-
-def _near(plane: Axes, d: MechanismDesign) -> None:
-    """Show the plane around the free stack's poles and the lag's."""
-    tall = 1.2e-3 * float(np.abs(d.free_poles).max())
-    plane.set(xlim=(-0.25 * tall, 0.02 * tall), ylim=(-tall, tall))
-    plane.set(xlabel="real part [1000 rad/s]", ylabel="imaginary part [1000 rad/s]")
-    plane.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6))

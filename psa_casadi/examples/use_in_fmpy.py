@@ -22,7 +22,8 @@ END, STEP = 4e-2, 1e-4
 def main(folder: Path) -> dict[str, float]:
     """Run the FMU of a P-885.51 on a triangle of 100 V; draw its loop with less hysteresis too."""
     fmu = psa.export_fmu(psa.stack_model("P-885.51"), folder / "stack.fmu")
-    voltage = _triangle()
+    rows = [(0.0, 0.0, 0.0), (END / 2, 100.0, 0.0), (END, 0.0, 0.0)]  # a triangle, as fmpy reads it
+    voltage = np.array(rows, dtype=[(n, np.float64) for n in ("time", "voltage", "load_force")])
     whole = _run(fmu, voltage, {})
     less = _run(fmu, voltage, {"A": 0.5 * psa.stack_model("P-885.51").values["A"]})
     by_steps, again = _step_by_step(fmu, voltage)
@@ -55,12 +56,6 @@ def _expected() -> float:
     u = np.column_stack([100.0 * (1.0 - np.abs(2.0 * t / END - 1.0)), np.zeros_like(t)])
     y = psa.run(plant, t, u, np.zeros(len(plant.state_names)), rtol=1e-10).y
     return float(y[-1, plant.output_names.index("displacement")])
-
-
-def _triangle() -> Any:
-    """Return one period of a triangle, 0 to 100 V to 0, as the table that fmpy reads."""
-    rows = [(0.0, 0.0, 0.0), (END / 2, 100.0, 0.0), (END, 0.0, 0.0)]
-    return np.array(rows, dtype=[(n, np.float64) for n in ("time", "voltage", "load_force")])
 
 
 def _run(fmu: Path, voltage: Any, start_values: dict[str, float]) -> Any:

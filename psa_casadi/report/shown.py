@@ -63,9 +63,9 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
 
 def line(result: Plotted | Told) -> str:
     """Return a result in one line."""
-    if isinstance(result, OdeDiagnosis | OdeIdentification | Record):
+    if isinstance(result, OdeIdentification | Record):
         return repr(result).partition("\n")[0]
-    if isinstance(result, OwnModelFile):
+    if isinstance(result, OwnModelFile | OdeDiagnosis):
         return f"<Diagnosis of an own model {result.verdict}{_causes(result)}>"
     if isinstance(result, Diagnosis | DiagnosisFile):
         before, after = (
@@ -89,7 +89,7 @@ def line(result: Plotted | Told) -> str:
     return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
 
 
-def _causes(d: Diagnosis | Told) -> str:
+def _causes(d: Diagnosis | OdeDiagnosis | Told) -> str:
     causes = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
     return f": {causes}" if causes else ""
 

@@ -33,16 +33,6 @@ class Limits:
     files: int = MOST_FILES
 
 
-@dataclass(frozen=True)
-class Upload:
-    """A file that was given: the name that it had, and where it lies by a name without marks."""
-
-    key: int
-    name: str
-    path: Path
-    size: int
-
-
 def stored_name(name: str, taken: Collection[str]) -> str:
     """Return a name to store a file by: without paths and marks, and unlike those that are taken.
 
@@ -82,26 +72,36 @@ def received(stream: BufferedIOBase, size: int, target: Path, admit: Callable[[i
         raise InputError("The file did not arrive whole; give it again.")
 
 
-#: What is said of what a run forbids.
-BUSY = "A diagnosis runs; stop it first, or wait until it has ended."
-
-
 class BusyError(Exception):
     """Something cannot be done while a command runs."""
+
+    def __init__(self) -> None:
+        super().__init__("A diagnosis runs; stop it first, or wait until it has ended.")
 
 
 @dataclass(frozen=True)
 class Item:
-    """A file on the workbench: kept for judging only or not, and how it reads, once it is known."""
+    """A file on the workbench: the name that it had, and where it lies by a name without marks.
 
-    file: Upload
+    It may be kept for judging only; `seen` says how it reads, once that is known.
+    """
+
+    key: int
+    name: str
+    path: Path
+    size: int
     held: bool = False
     seen: dict[str, Any] | None = field(default=None, compare=False)
 
     @property
     def is_model(self) -> bool:
         """Whether it is a MODEL.json to start from, and no record."""
-        return self.file.path.suffix.lower() == ".json"
+        return self.path.suffix.lower() == ".json"
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows of it."""
+        told = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
+        return {**told, "held": self.held, "model": self.is_model, "seen": self.seen}
 
 
 class Desk:
@@ -152,10 +152,10 @@ class Desk:
             with self._lock:
                 self._idle()
                 self._admit(key, name, size)
-                taken = [i.file.path.name for i in self._items.values()]
+                taken = [i.path.name for i in self._items.values()]
                 path = self._records / stored_name(name, taken)
                 coming.rename(path)
-                self._items[key] = Item(Upload(key, shown_name(name), path, size))
+                self._items[key] = Item(key, shown_name(name), path, size)
                 self._changed()
         finally:
             removed(coming)
@@ -166,7 +166,7 @@ class Desk:
     def _admit(self, key: int, name: str, size: int) -> None:
         """Refuse a file of so many bytes that finds no room beside what is there and arrives."""
         with self._lock:
-            there = sum(i.file.size for i in self._items.values())
+            there = sum(i.size for i in self._items.values())
             there += sum(n for k, n in self._arrived.items() if k != key)
             if len(self._items) >= self.limits.files:
                 raise InputError(f"There are {self.limits.files} files already; remove one first.")
@@ -181,8 +181,8 @@ class Desk:
             self._idle()
             item = self._items.pop(key, None)
             if item is not None:
-                removed(item.file.path)
-                self._settings = self._settings.without(item.file.path.name)
+                removed(item.path)
+                self._settings = self._settings.without(item.path.name)
             self._changed()
 
     def hold(self, key: int, held: bool) -> None:
@@ -199,12 +199,9 @@ class Desk:
         with self._lock:
             self._idle()
             old, self._settings = self._settings, self._settings.changed(given, self.effects)
-            again = (old.columns, old.sample_time) != (
-                self._settings.columns,
-                self._settings.sample_time,
-            )
+            new = self._settings
             self._changed()
-        if again:
+        if (old.columns, old.sample_time) != (new.columns, new.sample_time):
             self._look(list(self._items))
 
     # Runs
@@ -214,11 +211,11 @@ class Desk:
         with self._lock:
             self._idle()
             records = [i for i in self._items.values() if not i.is_model]
-            fitted = [i.file.path.name for i in records if not i.held]
+            fitted = [i.path.name for i in records if not i.held]
             if not fitted:
                 raise InputError("There is no record to fit; give a file that is not held out.")
-            held = [i.file.path.name for i in records if i.held]
-            models = [i.file.path.name for i in self._items.values() if i.is_model]
+            held = [i.path.name for i in records if i.held]
+            models = [i.path.name for i in self._items.values() if i.is_model]
             words = runs.diagnosis(fitted, held, models[-1] if models else None, self._settings)
             runs.clear(self.folder)
             self._export, self._number = None, self._number + 1
@@ -241,17 +238,17 @@ class Desk:
     def stop(self) -> None:
         """Let what runs end and keep what it has."""
         for own in self.running():
-            own.job.stop()
+            own.stop()
 
     def close(self) -> None:
         """End what runs, at once."""
         for own in self.running():
-            own.job.end()
+            own.end()
 
     def running(self) -> list[Run]:
         """Return what runs: nothing, or one command."""
         both = (self._run, self._export)
-        return [r for r in both if r is not None and r.job.status == "running"]
+        return [r for r in both if r is not None and r.status == "running"]
 
     # What is told
 
@@ -262,10 +259,10 @@ class Desk:
             if self._run is not None:
                 self._run.look()
                 new = self._run.events[seen if number == self._number else 0 :]
-                told["run"] = {**self._run.told(), "number": self._number, "events": new}
-            told["export"] = None if self._export is None else self._export.told()
+                told["run"] = {**self._run.state(), "number": self._number, "events": new}
+            told["export"] = None if self._export is None else self._export.state()
             if version != self._version:
-                told["items"] = [_told(i) for i in self._items.values()]
+                told["items"] = [i.state() for i in self._items.values()]
                 told["settings"] = vars(self._settings)
                 told["result"] = runs.found(self.folder)
                 told["files"] = runs.files_left(self.folder)
@@ -283,7 +280,7 @@ class Desk:
             if item is None or item.is_model:
                 continue
             seen = preview(
-                self.folder, item.file.path, settings.columns or None, settings.seconds,
+                self.folder, item.path, settings.columns or None, settings.seconds,
                 held=item.held,
             )  # fmt: skip
             with self._lock:
@@ -298,15 +295,3 @@ class Desk:
     def _changed(self) -> None:
         with self._lock:
             self._version += 1
-
-
-def _told(item: Item) -> dict[str, Any]:
-    return {
-        "key": item.file.key,
-        "name": item.file.name,
-        "stored": item.file.path.name,
-        "size": item.file.size,
-        "held": item.held,
-        "model": item.is_model,
-        "seen": item.seen,
-    }

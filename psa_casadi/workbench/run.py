@@ -1,5 +1,6 @@
 """One diagnosis or export: the command it is, what the search tells meanwhile, what it leaves."""
 
+import contextlib
 import json
 import math
 import shlex
@@ -20,93 +21,6 @@ Status = Literal["running", "done", "failed", "stopped"]
 _LINES, _LONGEST_LINE = 400, 2000
 #: Time [s] that an interrupted command has to write what it keeps.
 _PATIENCE = 20.0
-
-
-class Job:
-    """A module of Python that runs in a folder; it and its children end with this process.
-
-    `said` and `told` are what it has written to its two streams by now, line by line; `seconds` is
-    how long it has run. `ended` is called once, from the thread that waits for it.
-    """
-
-    def __init__(
-        self, module: str, arguments: Sequence[str], folder: Path, ended: Callable[[], None]
-    ) -> None:
-        self._module, self._arguments, self._folder = module, tuple(arguments), folder
-        self._ended, self._stopped = ended, False
-        self._child: Child | None = None
-        self._begin, self._end = time.monotonic(), 0.0
-        self.status: Status = "running"
-        self.said: deque[str] = deque(maxlen=_LINES)
-        self.told: deque[str] = deque(maxlen=_LINES)
-        # this thread lives as long as the child: on Linux a child ends with its parent's thread
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    @property
-    def seconds(self) -> float:
-        """Time [s] that it has run by now, or took."""
-        return (self._end or time.monotonic()) - self._begin
-
-    @property
-    def pid(self) -> int | None:
-        """Number of its process, None before it has started."""
-        return None if self._child is None else self._child.pid
-
-    def stop(self) -> None:
-        """Let it end and keep what it has; after a while it is killed."""
-        self._stopped = True
-        child = self._child
-        if child is not None:
-            interrupt(child)
-            threading.Timer(_PATIENCE, kill, (child,)).start()
-
-    def end(self) -> None:
-        """Kill it and wait until it is gone."""
-        self._stopped = True
-        if self._child is not None:
-            kill(self._child)
-        self._thread.join()
-
-    def _run(self) -> None:
-        code = 1
-        try:
-            with started_python(self._module, *self._arguments, directory=self._folder) as child:
-                self._child = child
-                if self._stopped:
-                    interrupt(child)
-                code = self._heard(child)
-        except MachineError as error:
-            self.told.append(str(error))
-        finally:
-            self._end = time.monotonic()
-            self.status = "stopped" if self._stopped and code else "failed" if code else "done"
-            self._ended()
-
-    def _heard(self, child: Child) -> int:
-        """Keep what a child says until it ends; return its exit code."""
-        pairs = ((child.stdout, self.said), (child.stderr, self.told))
-        readers = [
-            threading.Thread(target=_keep, args=(stream, lines), daemon=True)
-            for stream, lines in pairs
-            if stream is not None
-        ]
-        if child.stdin is not None:
-            child.stdin.close()
-        for reader in readers:
-            reader.start()
-        code = child.wait()
-        for reader in readers:
-            reader.join(1.0)  # one that the child has started may still hold its streams
-        close_pipes(child)
-        return code
-
-
-def _keep(stream: IO[bytes], lines: deque[str]) -> None:
-    while row := stream.readline(_LONGEST_LINE):
-        lines.append(row.decode("utf-8", "replace").rstrip("\r\n"))
-
-
 #: The module that is the command `psa` in a child.
 PSA = "psa_casadi.cli.child"
 #: The folder of the records, beside what a run leaves.
@@ -143,7 +57,11 @@ class Settings:
         if not isinstance(left_out, list | tuple) or not set(left_out) <= set(effects):
             raise InputError("An effect to leave out is not known.")
         for name in ("sample_time", "stiffness"):
-            _positive(name, new.get(name, ""))
+            text = new.get(name, "")
+            with contextlib.suppress(ValueError):
+                if not text or 0.0 < float(text) < math.inf:
+                    continue
+            raise InputError(f"{name.replace('_', ' ')} is '{text[:40]}'; give a positive number.")
         if new.get("hysteresis", "") not in _FORMS:
             raise InputError("The form of the hysteresis is not known.")
         if any(not text.isprintable() for text in new.values()):
@@ -171,7 +89,12 @@ class Settings:
 
 
 class Run:
-    """A command that runs or has run in the folder of its results, beside that of the records."""
+    """A command that runs, or has run, in the folder of its results; it ends with this process.
+
+    `said` and `told` are what it has written to its two streams by now, line by line; `seconds` is
+    how long it has run, `events` what the search has told. `ended` is called once, from the thread
+    that waits for it.
+    """
 
     def __init__(
         self,
@@ -182,14 +105,42 @@ class Run:
         hidden: Sequence[str] = (),
     ) -> None:
         """Start it; `hidden` arguments are not part of what a person is shown to type."""
-        self.folder, self.shown = folder, shlex.join(["psa", *arguments])
+        self._module, self._arguments, self._folder = module, (*arguments, *hidden), folder
+        self._ended, self._stopped, self._read = ended, False, 0
+        self._child: Child | None = None
+        self._begin, self._end = time.monotonic(), 0.0
+        self.command = shlex.join(["psa", *arguments])
+        self.status: Status = "running"
         self.events: list[dict[str, Any]] = []
-        self._read = 0
-        self.job = Job(module, [*arguments, *hidden], folder, ended)
+        self.said: deque[str] = deque(maxlen=_LINES)
+        self.told: deque[str] = deque(maxlen=_LINES)
+        # this thread lives as long as the child: on Linux a child ends with its parent's thread
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int | None:
+        """Number of its process, None before it has started."""
+        return None if self._child is None else self._child.pid
+
+    def stop(self) -> None:
+        """Let it end and keep what it has; after a while it is killed."""
+        self._stopped = True
+        child = self._child
+        if child is not None:
+            interrupt(child)
+            threading.Timer(_PATIENCE, kill, (child,)).start()
+
+    def end(self) -> None:
+        """Kill it and wait until it is gone."""
+        self._stopped = True
+        if self._child is not None:
+            kill(self._child)
+        self._thread.join()
 
     def look(self) -> None:
         """Read what the search has told since the last look."""
-        path = self.folder / EVENTS
+        path = self._folder / EVENTS
         if not path.exists():
             return
         with path.open("rb") as file:
@@ -200,17 +151,52 @@ class Run:
                 self._read += len(row)
                 self.events.append(json.loads(row))
 
-    def told(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
         """Return what the page shows of it."""
-        job = self.job
         return {
-            "command": self.shown,
-            "status": job.status,
-            "seconds": job.seconds,
-            "line": job.told[-1] if job.told else "",
-            "said": list(job.said),
-            "told": list(job.told)[-40:],
+            "command": self.command,
+            "status": self.status,
+            "seconds": (self._end or time.monotonic()) - self._begin,
+            "line": self.told[-1] if self.told else "",
+            "said": list(self.said),
+            "told": list(self.told)[-40:],
         }
+
+    def _run(self) -> None:
+        code = 1
+        try:
+            with started_python(self._module, *self._arguments, directory=self._folder) as child:
+                self._child = child
+                if self._stopped:
+                    interrupt(child)
+                code = self._heard(child)
+        except MachineError as error:
+            self.told.append(str(error))
+        finally:
+            self._end = time.monotonic()
+            self.status = "stopped" if self._stopped and code else "failed" if code else "done"
+            self._ended()
+
+    def _heard(self, child: Child) -> int:
+        """Keep what a child says until it ends; return its exit code."""
+
+        def keep(stream: IO[bytes], lines: deque[str]) -> None:
+            while row := stream.readline(_LONGEST_LINE):
+                lines.append(row.decode("utf-8", "replace").rstrip("\r\n"))
+
+        readers = [
+            threading.Thread(target=keep, args=pair, daemon=True)
+            for pair in ((child.stdout, self.said), (child.stderr, self.told))
+        ]
+        if child.stdin is not None:
+            child.stdin.close()
+        for reader in readers:
+            reader.start()
+        code = child.wait()
+        for reader in readers:
+            reader.join(1.0)  # one that the child has started may still hold its streams
+        close_pipes(child)
+        return code
 
 
 def diagnosis(
@@ -253,12 +239,3 @@ def removed(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
-
-
-def _positive(name: str, text: str) -> None:
-    try:
-        good = not text or 0.0 < float(text) < math.inf
-    except ValueError:
-        good = False
-    if not good:
-        raise InputError(f"{name.replace('_', ' ')} is '{text[:40]}'; give a positive number.")

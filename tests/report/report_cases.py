@@ -6,20 +6,11 @@ from functools import cache
 import numpy as np
 
 from psa_casadi.components import BASE
+from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.held_out import Errors, Gain
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.diagnosis.result import (
-    BlindSpot,
-    Candidate,
-    Cause,
-    Diagnosis,
-    Estimate,
-    NextExperiment,
-    Remaining,
-    Verdict,
-)
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import Simulated, measured
@@ -86,7 +77,7 @@ def periodic(counts: bool = False) -> tuple[Experiment, NoiseFloor, Misfit, Misf
     return split(record), floor, before, after
 
 
-def with_periodic(d: Diagnosis, *, counts: bool = False) -> Diagnosis:
+def with_periodic(d: result.Diagnosis, *, counts: bool = False) -> result.Diagnosis:
     """Return a diagnosis of one record with another in its place, of a periodic voltage."""
     e, floor, before, after = periodic(counts)
     y = measured(e.record)
@@ -103,8 +94,8 @@ def _fit(model: Model, records: int) -> Fit:
 
 
 def diagnosis(
-    verdict: Verdict, names: tuple[str, ...] = ("plant_a",), samples: int = 1500
-) -> Diagnosis:
+    verdict: result.Verdict, names: tuple[str, ...] = ("plant_a",), samples: int = 1500
+) -> result.Diagnosis:
     """Return a diagnosis with the given verdict on the named records."""
     added = verdict in ADDED
     parts = [experiment(n, samples) for n in names]
@@ -112,33 +103,33 @@ def diagnosis(
     model = compose((*BASE, EFFECTS["slow_creep"]) if added else BASE)
     intervals = {"k_L": Interval(9.9, 10.1), "tau": Interval(1e-7, 1.0)}
     model = replace(model, provenance=Provenance(free=("k_L", "tau"), intervals=intervals))
-    cause = Cause("slow_creep", "plant", 0.97,
-                  {"creep_gain": Estimate(0.04, "1", (0.037, 0.043)),
-                   "creep_time": Estimate(0.3, "s", (0.2, 0.45))},
+    cause = result.Cause("slow_creep", "plant", 0.97,
+                  {"creep_gain": result.Estimate(0.04, "1", (0.037, 0.043)),
+                   "creep_time": result.Estimate(0.3, "s", (0.2, 0.45))},
                   ("offset_drift",) if verdict == "ambiguous" else (), 0.9,
                   "wait_or_feed_forward",
                   (Size("hold", 4e-8, "m", (3.7e-8, 4.3e-8), 10.0, "s", (0.0, 100.0)),
                    Size("hold", 9e-8, "m", None, 600.0, "s", (0.0, 100.0), True)))  # fmt: skip
     errors = Errors(4e-8, 5e-8, 1.5e-7, 0.31)
     seen = [misfits(n, samples) for n in names]
-    return Diagnosis(
+    return result.Diagnosis(
         verdict=verdict,
         causes=(cause,) if added else (),
         candidates=(
-            Candidate("slow_creep", 0.93, 1250.0, True, 0.91 if added else 0.0),
-            Candidate("offset_drift", -40.0, -3000.0, True, 0.08 if added else 0.0),
-            Candidate("sensor_delay", 0.004, 0.2, False),
+            result.Candidate("slow_creep", 0.93, 1250.0, True, 0.91 if added else 0.0),
+            result.Candidate("offset_drift", -40.0, -3000.0, True, 0.08 if added else 0.0),
+            result.Candidate("sensor_delay", 0.004, 0.2, False),
         ),
         noise_floor_rms_m=NOISE,
         base_errors=errors,
         extended_errors=Errors(5.1e-9, 8.5e-9, 2e-8, 0.052) if added else errors,
         gain=Gain(83.0, (79.0, 86.0)) if added else Gain(0.0, (0.0, 0.0)),
         blind_to=(
-            BlindSpot("sensor_delay", 0.002, "s", "The record is slow <and> short."),
-            BlindSpot("current_limit", 1e300, "1/A", "The current stays small."),
+            result.BlindSpot("sensor_delay", 0.002, "s", "The record is slow <and> short."),
+            result.BlindSpot("current_limit", 1e300, "1/A", "The current stays small."),
         ),
-        remaining=Remaining(verdict in ("adequate", "cause_named"), 0.4, "Nothing is left."),
-        next_experiment=NextExperiment(None, (), ("Hold the voltage for a minute.",)),
+        remaining=result.Remaining(verdict in ("adequate", "cause_named"), 0.4, "Nothing is left."),
+        next_experiment=result.NextExperiment(None, (), ("Hold the voltage for a minute.",)),
         remarks=("Forces are assumed.",),
         experiments=tuple(p[0] for p in parts),
         base_fit=_fit(compose(BASE), len(names)),

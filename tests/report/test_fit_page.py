@@ -8,13 +8,7 @@ import pytest
 from psa_casadi.errors import InputError
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
-from psa_casadi.report.page.results import (
-    MOST_RECORDS,
-    fit_page,
-    points_each,
-    write_fit_report,
-    write_report,
-)
+from psa_casadi.report.page import results
 from psa_casadi.report.plots.panel import DARK
 from psa_casadi.report.plots.records import time_plot
 from psa_casadi.report.words.fit_words import (
@@ -43,7 +37,7 @@ def text(tmp_path_factory: pytest.TempPathFactory) -> str:
         combinations=(Combination("group", ("k_L", "A")),),
         advice=(Advice("ringing", ("m_P",)),),
     )
-    write_fit_report(found, path, origin="synthetic", still=True)
+    results.write_fit_report(found, path, origin="synthetic", still=True)
     assert [p.name for p in path.parent.iterdir()] == ["fit.html"]
     return path.read_text(encoding="utf-8")
 
@@ -70,7 +64,7 @@ def test_the_page_of_a_fit_tells_all_of_it(text: str) -> None:
 
 def test_sections_without_content_are_left_out() -> None:
     found = replace(identification(), doubts=(), starts=(), combinations=(), advice=())
-    page = Page(fit_page(found, series_of_fit(found)))
+    page = Page(results.fit_page(found, series_of_fit(found)))
     for title in ("Warning", "Starts", "leave open", "What to measure next"):
         assert title not in page.text
     assert "measured data" in page.text
@@ -83,14 +77,14 @@ def test_a_model_without_fitted_parameters_has_its_page() -> None:
         covariance=np.zeros((0, 0)), correlations=np.zeros((0, 0)),
     )  # fmt: skip
     bare = replace(found, determinacy=none)
-    page = fit_page(bare, series_of_fit(bare))
+    page = results.fit_page(bare, series_of_fit(bare))
     assert "No intervals were estimated" in Page(page).text
     assert "parameters determined" not in Page(page).text
     assert len(figures(page)) == 7 * len(found.experiments)
 
 
 def test_every_colour_of_a_plot_has_a_counterpart_at_night(text: str, tmp_path: Path) -> None:
-    write_report(diagnosis("cause_named"), tmp_path / "d.html", still=True)
+    results.write_report(diagnosis("cause_named"), tmp_path / "d.html", still=True)
     other = (tmp_path / "d.html").read_text(encoding="utf-8")
     for page in (text, other):
         used = set(re.findall(r'"(#[0-9a-fA-F]{3,8})"', str(figures(page)).replace("'", '"')))
@@ -100,7 +94,7 @@ def test_every_colour_of_a_plot_has_a_counterpart_at_night(text: str, tmp_path: 
 
 def test_a_fit_report_that_cannot_be_written_is_the_users_problem(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        write_fit_report(identification(), tmp_path / "absent" / "x.html", still=True)
+        results.write_fit_report(identification(), tmp_path / "absent" / "x.html", still=True)
 
 
 def test_parameters_are_graded_as_the_determinacy_says() -> None:
@@ -168,12 +162,12 @@ def test_long_and_many_records_stay_below_1_5_mb_and_keep_their_spikes(
     records: int, samples: int
 ) -> None:
     found, series = long_fit(records, samples)
-    page = fit_page(found, series)
+    page = results.fit_page(found, series)
     assert len(page.encode()) < 3e6
     drawn = figures(page)[2:]
-    assert len(drawn) == 7 * min(records, MOST_RECORDS)
+    assert len(drawn) == 7 * min(records, results.MOST_RECORDS)
     words = Page(page).text
-    assert ("are drawn" in words) == (records > MOST_RECORDS)
+    assert ("are drawn" in words) == (records > results.MOST_RECORDS)
     assert all(words.count(s.name) >= 2 for s in series)
     pictured = [s for s in series if f"{s.name} (measured)" in words]
     for figure, s in zip(drawn[::7], pictured, strict=True):
@@ -210,7 +204,7 @@ def test_every_column_of_pixels_keeps_its_extremes() -> None:
 
 def test_a_short_record_is_drawn_whole_and_a_gap_stays_a_gap() -> None:
     _, (s,) = long_fit(1, 900)
-    trace = time_plot(s, "measured", points_each(1)).data[0]
+    trace = time_plot(s, "measured", results.points_each(1)).data[0]
     assert np.array_equal(np.isnan(trace["y"]), np.isnan(s.measured))
     assert extremes([np.arange(10.0)], np.array([0, 5, 10])).tolist() == [0, 4, 5, 9]
 

@@ -16,7 +16,7 @@ from psa_casadi.export.check.check import CheckReport, CheckRow
 from psa_casadi.report.page.results import write_report
 from psa_casadi.report.plots.figures import save_figure
 from psa_casadi.report.plots.findings import evidence_plot
-from psa_casadi.report.words.phrases import length_scale, listing, number, plain, share_text
+from psa_casadi.report.words.phrases import Scale, length_scale, listing, number, plain, share_text
 from psa_casadi.report.words.series import noise_density, series_of, spectrum, telling_window
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
 from psa_casadi.report.words.text import check_sentence, effect_page, story
@@ -166,9 +166,16 @@ def test_tables_show_display_units_and_say_what_is_not_known() -> None:
     assert rows["k_L"][2:5] == ("9.90 to 10.1", "N/V", "fit")
     assert rows["m_P"][4] == "not fitted"
     assert [row[1] for row in blind_table(d).rows] == ["at no size", "0.00200 s"]
-    assert [row[0] for row in error_table(d, "nm", 1e9).rows] == ["base", "extended", "noise"]
-    assert error_table(d, "nm", 1e9).rows[1][2] == "8.50"
-    assert [r[0] for r in error_table(diagnosis("adequate"), "nm", 1e9).rows] == ["base", "noise"]
+    assert [row[0] for row in error_table(d, Scale("nm", 1e9)).rows] == [
+        "base",
+        "extended",
+        "noise",
+    ]
+    assert error_table(d, Scale("nm", 1e9)).rows[1][2] == "8.50"
+    assert [r[0] for r in error_table(diagnosis("adequate"), Scale("nm", 1e9)).rows] == [
+        "base",
+        "noise",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ class Tab:
     """A browser's tab, as far as the server sees one; `cookie` is what the door has given."""
 
     def __init__(self, server: Server) -> None:
-        self.server, self.port = server, server.gate.port
+        self.server, self.port = server, server.port
         self.cookie = ""
 
     def headers(self, method: str) -> dict[str, str]:
@@ -53,7 +53,7 @@ class Tab:
             line.close()
 
     def enter(self) -> "Tab":
-        status, headers, _ = self.ask("GET", f"/?token={self.server.gate.token}")
+        status, headers, _ = self.ask("GET", f"/?token={self.server.token}")
         assert status == 200
         assert "HttpOnly; SameSite=Strict" in headers["Set-Cookie"]
         self.cookie = headers["Set-Cookie"].split(";")[0]
@@ -97,7 +97,7 @@ def test_only_who_has_the_address_gets_in(server: Server) -> None:
     for path in ("/", "/state", "/report", "/?token=", "/?token=guess", "/files/report.html"):
         assert stranger.ask("GET", path)[0] == 403, path
     assert stranger.post("/start") == 403
-    stranger.cookie = f"psa_{server.gate.port}=guess"
+    stranger.cookie = f"psa_{server.port}=guess"
     assert stranger.ask("GET", "/")[0] == 403
 
 
@@ -109,7 +109,7 @@ def test_the_page_asks_for_nothing_outside_and_stands_in_no_frame(tab: Tab) -> N
     assert "frame-ancestors 'none'" in policy
     assert "unsafe" not in policy
     assert b"http" not in text.replace(b"http://www.w3.org/2000/svg", b"")
-    assert tab.server.gate.token.encode() not in text
+    assert tab.server.token.encode() not in text
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_a_run_ends_with_the_server(tmp_path: Path) -> None:
         tab.until("running")
         while not tab.state()["run"]["events"]:
             time.sleep(0.02)
-        job = desk.running()[0].job
+        job = desk.running()[0]
         pid = job.pid
         assert pid is not None
         assert runs(pid)
@@ -336,9 +336,9 @@ def test_what_is_given_runs_in_no_command(tmp_path: Path, monkeypatch: pytest.Mo
         data = f"open({str(ran)!r}, 'w')".encode()
         desk.add(f"{name}.py", io.BytesIO(data), len(data))
     told = Run(["effects", "encoder_ripple", "--effects=gratings"], folder, lambda: None)
-    while told.job.status == "running":
+    while told.status == "running":
         time.sleep(0.05)
-    assert (told.job.status, ran.exists()) == ("done", False), told.told()
+    assert (told.status, ran.exists()) == ("done", False), told.state()
     assert sorted(p.name for p in folder.iterdir()) == ["records"]
 
 

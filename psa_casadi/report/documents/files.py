@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,19 +13,15 @@ import numpy as np
 
 from psa_casadi.any_model.result import OdeBudget, OutputError, PortCause
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
-from psa_casadi.diagnosis.result import (
-    Candidate,
-    Cause,
-    Verdict,
-    unnamed_causes,
-)
+from psa_casadi.diagnosis.result import Candidate, Cause, Verdict, unnamed_causes
+from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport
 from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.profile import Profile
-from psa_casadi.posterior.sample import Figures, Posterior
-from psa_casadi.records.record import Record
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.report.words.fit_words import Degree, grade
 from psa_casadi.shown import Lined
+from psa_casadi.strict_json import decode, read_json, shown
 from psa_casadi.version import __version__
 
 CHECK_FORMAT: Literal["psa_casadi.check/1"] = "psa_casadi.check/1"
@@ -59,17 +56,11 @@ class CheckFile:
 
 def check_file(report: CheckReport) -> dict[str, Any]:
     """Return what `--json` writes of the checks of an FMU."""
-    rows = (
-        CheckedRow(
-            r.name, r.figure if math.isfinite(r.figure) else None, r.limit, r.passed, r.remark
-        )
-        for r in report.rows
+    rows = tuple(
+        CheckedRow(r.name, _finite(r.figure), r.limit, r.passed, r.remark) for r in report.rows
     )
-    passed, compared = report.passed, report.compared
-    path, left_out = str(report.path), report.left_out
-    return asdict(
-        CheckFile(CHECK_FORMAT, __version__, path, passed, compared, tuple(rows), left_out)
-    )
+    head = (CHECK_FORMAT, __version__, str(report.path))
+    return asdict(CheckFile(*head, report.passed, report.compared, rows, report.left_out))
 
 
 DEVICE_FORMAT: Literal["psa_casadi.device/1"] = "psa_casadi.device/1"
@@ -379,32 +370,28 @@ def identification_file(found: Identification, profiles: Iterable[Profile] = ())
         )
         for p in found.model.structure.parameters
     }
+    records = []
     residuals = found.fit.residuals_of(found.experiments)
-    records = [
-        _fitted(e.record, int(e.used.sum()), r, sigma)
-        for e, r, sigma in zip(found.experiments, residuals, found.fit.sigma, strict=True)
-    ]
+    for e, r, sigma in zip(found.experiments, residuals, found.fit.sigma, strict=True):
+        rms = float(np.sqrt(np.mean(r**2)))
+        share, samples = 100.0 * rms / e.record.range_m, int(e.used.sum())
+        named = (e.record.name, e.record.sha256)
+        records.append(FittedRecord(*named, samples, rms, float(sigma), share))
     content = IdentificationFile(
-        IDENTIFICATION_FORMAT,
-        __version__,
-        found.model.name,
-        parameters,
-        found.fit.rms,
-        found.fit.converged,
-        found.interrupted,
-        tuple(records),
-        found.warnings,
-        found.sentences,
-        tuple(AdvisedRecord(a.sentence, a.parameters, a.repeats) for a in found.advice),
-        {p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
+        format=IDENTIFICATION_FORMAT,
+        package_version=__version__,
+        model=found.model.name,
+        parameters=parameters,
+        rms_m=found.fit.rms,
+        converged=found.fit.converged,
+        interrupted=found.interrupted,
+        records=tuple(records),
+        warnings=found.warnings,
+        notes=found.sentences,
+        advice=tuple(AdvisedRecord(a.sentence, a.parameters, a.repeats) for a in found.advice),
+        profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
     )
     return asdict(content)
-
-
-def _fitted(record: Record, samples: int, residual: Any, noise: float) -> FittedRecord:
-    rms = float(np.sqrt(np.mean(residual**2)))
-    share = 100.0 * rms / record.range_m
-    return FittedRecord(record.name, record.sha256, samples, rms, float(noise), share)
 
 
 POSTERIOR_FORMAT: Literal["psa_casadi.posterior/1"] = "psa_casadi.posterior/1"
@@ -465,34 +452,27 @@ def posterior_file(found: Posterior) -> dict[str, Any]:
         SampledRecord(e.record.name, e.record.sha256, int(e.used.sum()), float(worth), float(rms))
         for e, worth, rms in zip(task.experiments, task.inflation, task.levels, strict=True)
     )
+    parameters = {
+        f.name: SampledParameter(
+            f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),
+            _finite(f.r_hat), _finite(f.prior_share), found.model.parameter(f.name).description,
+        )
+        for f in found.figures
+    }  # fmt: skip
     content = PosteriorFile(
-        POSTERIOR_FORMAT,
-        __version__,
-        found.model.name,
-        {f.name: _parameter(found, f) for f in found.figures},
-        found.chains,
-        found.draws,
-        found.seed,
-        found.divergences,
-        records,
-        found.warnings,
-        found.sentences,
+        format=POSTERIOR_FORMAT,
+        package_version=__version__,
+        model=found.model.name,
+        parameters=parameters,
+        chains=found.chains,
+        draws=found.draws,
+        seed=found.seed,
+        divergences=found.divergences,
+        records=records,
+        warnings=found.warnings,
+        notes=found.sentences,
     )
     return asdict(content)
-
-
-def _parameter(found: Posterior, f: Figures) -> SampledParameter:
-    return SampledParameter(
-        unit=f.unit,
-        mean=f.mean,
-        sd=f.sd,
-        interval=(f.low, f.high),
-        mc_error=_finite(f.mc_error),
-        ess=_finite(f.ess),
-        r_hat=_finite(f.r_hat),
-        prior_share=_finite(f.prior_share),
-        meaning=found.model.parameter(f.name).description,
-    )
 
 
 def _finite(figure: float) -> float | None:
@@ -532,3 +512,26 @@ class OwnModelFile(Told):
     values: Mapping[str, float]
     records: tuple[RecordUsed, ...]
     budget: OdeBudget | None = None
+
+
+_READ_ADVICE = "give a file that `psa diagnose --json` or `Diagnosis.to_json` wrote"
+_KINDS: dict[str, type[DiagnosisFile | OwnModelFile]] = {
+    "psa_casadi.diagnosis/1": DiagnosisFile,
+    "psa_casadi.own_model_diagnosis/1": OwnModelFile,
+}
+
+
+def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile:
+    """Return what DIAGNOSIS.json holds: verdict, causes, errors by the names of a `Diagnosis`.
+
+    The file has no samples and no model (`load_model` reads that); to keep a whole result, pickle
+    it. A diagnosis of an own model gives what `OdeDiagnosis` names so.
+
+    Raises InputError for a file that cannot be read, is none of a diagnosis, or lacks something.
+    """
+    source = os.fspath(path)
+    content = read_json(source, f"{_READ_ADVICE}.")
+    found = content.get("format") if isinstance(content, dict) else None
+    if found not in _KINDS:
+        raise InputError(f"{source}: its format is {shown(found)}, no diagnosis; {_READ_ADVICE}.")
+    return decode(_KINDS[found], content, source)

@@ -1,8 +1,9 @@
 """Files of diagnoses, identifications and models read as findings, those of one device joined."""
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -29,16 +30,10 @@ from psa_casadi.strict_json import decode, read_json
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 _DIAGNOSIS = "psa_casadi.diagnosis/1"
+#: A file, and the finding from it.
+_Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
 _PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
-
-
-@dataclass(frozen=True)
-class _Read:
-    """A finding from one file, and the file."""
-
-    path: Path
-    finding: Finding
 
 
 def read_findings(
@@ -77,7 +72,7 @@ def device_finding(
         raise InputError(damaged)
     (found,) = _joined([r for name in told.files for r in _read(folder / name, effects, traces)])
     day = date.fromisoformat(told.date) if told.date else None
-    return replace(found.finding, device=told.device, batch=told.batch, day=day)
+    return replace(found[1], device=told.device, batch=told.batch, day=day)
 
 
 def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]:
@@ -86,23 +81,18 @@ def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]
     content = read_json(path, _ADVICE)
     kind = content.get("format") if isinstance(content, dict) else None
     if kind == DEVICE:
-        return _of_device(path, decode(DeviceFile, content, source), effects, traces)
+        told = decode(DeviceFile, content, source)
+        if told.status != "done":
+            why = " ".join(told.problems)
+            raise InputError(f"{path}: the work on this device was {told.status}: {why}")
+        return [(path, device_finding(path.parent, told, effects, traces=traces))]
     if kind == _DIAGNOSIS:
-        return [_Read(path, _diagnosis(decode(DiagnosisFile, content, source)))]
+        return [(path, _diagnosis(decode(DiagnosisFile, content, source)))]
     if kind == IDENTIFICATION:
-        return [_Read(path, _identification(decode(IdentificationFile, content, source)))]
+        return [(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
-        return [_Read(path, _model(model_of(content, source, effects), traces))]
+        return [(path, _model(model_of(content, source, effects), traces))]
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
-
-
-def _of_device(
-    path: Path, told: DeviceFile, effects: Sequence[Component], traces: bool
-) -> list[_Read]:
-    if told.status != "done":
-        why = " ".join(told.problems)
-        raise InputError(f"{path}: the work on this device was {told.status}: {why}")
-    return [_Read(path, device_finding(path.parent, told, effects, traces=traces))]
 
 
 def _diagnosis(d: DiagnosisFile) -> Finding:
@@ -176,75 +166,67 @@ def _model(model: Model, traces: bool) -> Finding:
 
 
 def _joined(found: Sequence[_Read]) -> list[_Read]:
-    """Join every model to the first finding of the same records that has none yet."""
-    rows: list[_Read | None] = list(found)
+    """Join every model to the first finding of the same records that has none yet.
+
+    That gets all that the model holds: all parameters, and the record that it carries.
+    """
+    rows = dict(enumerate(found))
     full: set[int] = set()
-    for k, own in enumerate(found):
-        if own.finding.kind != "model" or not own.finding.records:
-            continue
-        for j, other in enumerate(found):
-            same = _hashes(other.finding) == _hashes(own.finding)
-            if other.finding.kind != "model" and same and j not in full:
-                full.add(j)
-                rows[j] = replace(other, finding=_with(other.finding, own.finding))
-                rows[k] = None
-                break
-    return [r for r in rows if r is not None]
-
-
-def _with(finding: Finding, model: Finding) -> Finding:
-    """Add to a finding what its model holds: all parameters, and the record that it carries."""
-    parameters = {**model.parameters}
-    for name, p in finding.parameters.items():
-        meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
-        parameters[name] = replace(p, meaning=meaning)
-    return replace(finding, parameters=parameters, trace=model.trace, force_scale=model.force_scale)
-
-
-def _hashes(finding: Finding) -> frozenset[str]:
-    return frozenset(sha for _, sha in finding.records)
+    for k, (_, own) in enumerate(found):
+        same = [
+            j
+            for j, (_, other) in enumerate(found)
+            if own.kind == "model" != other.kind and j not in full
+            if own.records and {s for _, s in own.records} == {s for _, s in other.records}
+        ]
+        if same:
+            full.add(same[0])
+            path, finding = rows[same[0]]
+            parameters = {**own.parameters}
+            for name, p in finding.parameters.items():
+                meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
+                parameters[name] = replace(p, meaning=meaning)
+            whole = replace(finding, parameters=parameters, trace=own.trace)
+            rows[same[0]] = path, replace(whole, force_scale=own.force_scale)
+            del rows[k]
+    return list(rows.values())
 
 
 def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
-    """Name findings by their device, else by the shortest end of their path that is their own."""
-    names = [r.finding.device or _name(r.path) for r in found]
-    depth = 1
-    while len(set(names)) < len(names) and depth < max(len(r.path.parts) for r in found):
+    """Name findings by their device, else by the shortest end of their path that is their own.
+
+    A file whose name says only what it is has that of its folder.
+    """
+    names, depth = [], 1
+    for path, finding in found:
+        folder = path.resolve().parent.name
+        plain = path.stem in _PLAIN_NAMES and folder
+        names.append(finding.device or (folder if plain else path.stem))
+    while len(set(names)) < len(names) and depth < max(len(path.parts) for path, _ in found):
         depth += 1
         names = [
-            name if names.count(name) == 1 else "/".join(r.path.with_suffix("").parts[-depth:])
-            for name, r in zip(names, found, strict=True)
+            name if names.count(name) == 1 else "/".join(path.with_suffix("").parts[-depth:])
+            for name, (path, _) in zip(names, found, strict=True)
         ]
-    counted: dict[str, int] = {}
+    counted: Counter[str] = Counter()
     out: list[Finding] = []
-    for name, r in zip(names, found, strict=True):
-        counted[name] = counted.get(name, 0) + 1
+    for name, (_, finding) in zip(names, found, strict=True):
+        counted[name] += 1
         own = name if counted[name] == 1 else f"{name} ({counted[name]})"
-        out.append(replace(r.finding, device=own))
+        out.append(replace(finding, device=own))
     return tuple(out)
-
-
-def _name(path: Path) -> str:
-    """Return a file's name; that of its folder where the file's says only what it is."""
-    folder = path.resolve().parent.name
-    return folder if path.stem in _PLAIN_NAMES and folder else path.stem
 
 
 def finding_content(found: Finding) -> dict[str, Any]:
     """Return a finding's main figures as one row of a table of devices."""
-    row: dict[str, Any] = {"verdict": found.verdict, "cause": _causes(found)}
+    causes = "; ".join(" or ".join((c.effect, *c.or_else)) for c in found.causes)
+    row: dict[str, Any] = {"verdict": found.verdict, "cause": causes}
     row["confidence"] = found.causes[0].confidence if found.causes else None
-    e = found.errors
-    row["base_rms [m]"] = e.base if e else None
-    row["extended_rms [m]"] = e.extended if e else None
-    row["noise_rms [m]"] = e.noise if e else None
+    for name in ("base", "extended", "noise"):
+        row[f"{name}_rms [m]"] = getattr(found.errors, name, None)
     row["rms [m]"], row["rms [% of range]"] = found.rms_m, found.rms_percent
     for name, p in found.parameters.items():
         if p.told and p.interval is not None:
             row[f"{name} [{p.unit}]"] = p.value
             row[f"{name} low"], row[f"{name} high"] = p.interval
     return row
-
-
-def _causes(found: Finding) -> str:
-    return "; ".join(" or ".join((c.effect, *c.or_else)) for c in found.causes)

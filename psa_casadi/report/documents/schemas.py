@@ -6,25 +6,18 @@ from typing import Any
 import msgspec
 
 from psa_casadi.model.model_file import ModelFile
-from psa_casadi.report.documents.files import (
-    CheckFile,
-    DeviceFile,
-    DiagnosisFile,
-    IdentificationFile,
-    OwnModelFile,
-    PosteriorFile,
-)
+from psa_casadi.report.documents import files
 from psa_casadi.strict_json import json_text
 
 #: The record of each file that is written as JSON, by the name of its schema.
 FILES: dict[str, type] = {
     "model": ModelFile,
-    "diagnosis": DiagnosisFile,
-    "own_model": OwnModelFile,
-    "identification": IdentificationFile,
-    "posterior": PosteriorFile,
-    "check": CheckFile,
-    "device": DeviceFile,
+    "diagnosis": files.DiagnosisFile,
+    "own_model": files.OwnModelFile,
+    "identification": files.IdentificationFile,
+    "posterior": files.PosteriorFile,
+    "check": files.CheckFile,
+    "device": files.DeviceFile,
 }
 
 

@@ -4,7 +4,6 @@ import os
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from psa_casadi.design.experiment.experiment import Informative, Separated
 from psa_casadi.design.mechanism.loop import Mounting, response_times, step_response
@@ -21,23 +20,14 @@ from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import INK, Panel
-from psa_casadi.report.words.design_words import (
-    Titled,
-    design_tables,
-    mechanism_sentences,
-    mechanism_table,
-    pole_table,
-    sentences,
-)
+from psa_casadi.report.words import design_words
 from psa_casadi.report.words.phrases import length_scale, number, plain
 from psa_casadi.report.words.series import (
     BASE_COLOUR,
     EXTENDED_COLOUR,
     MEASURED_COLOUR,
     NOISE_COLOUR,
-    Curve,
     FloatArray,
-    Series,
 )
 
 _COLOURS = (EXTENDED_COLOUR, BASE_COLOUR, MEASURED_COLOUR)
@@ -48,16 +38,13 @@ _FREE = Mounting(0.0, 0.0, 0.0)
 #: Samples of the step that the page's model runs on.
 _STEP_SAMPLES = 3000
 
-#: A curve over time: its name, values, colour and width.
-Line = tuple[str, FloatArray, str, float]
-
 
 def write_design_page(
     path: str | os.PathLike[str],
     *,
     title: str,
     summary: Sequence[str],
-    tables: Sequence[Titled] = (),
+    tables: Sequence[design_words.Titled] = (),
     figures: Sequence[Picture] = (),
     badges: Sequence[str] = (),
     live: LiveModel | None = None,
@@ -66,32 +53,24 @@ def write_design_page(
 
     The first sentence of `summary` is the result, the others follow as a list; then come the
     figures and the tables with their notes. `badges` are short marks under the title, such as
-    "2,000 samples". `live` is a model that runs in the page on the designed voltage.
+    "2,000 samples". `live` is a model that runs in the page on the designed voltage; where no
+    script runs, a picture of it is seen, beside its path if it has one.
 
     Raises InputError when `path` cannot be written to.
     """
+    still = None
+    if live is not None:
+        s = live.records[0].series
+        if live.records[0].residual.any():
+            still = record_figure(s, origin=live.aim), f"The {live.aim} and the model"
+        else:
+            figure = response_figure(s.time, s.voltage, s.measured)
+            still = figure, "The model's answer to the voltage"
     page = render(
-        "design.html",
-        title,
-        tuple(badges),
-        summary=summary,
-        still=None if live is None else _still(live),
-        figures=figures,
-        live=live,
-        tables=tables,
-    )
+        "design.html", title, tuple(badges), summary=summary, still=still, figures=figures,
+        live=live, tables=tables,
+    )  # fmt: skip
     atomic_write(path, page)
-
-
-def _still(live: LiveModel) -> tuple[Figure, str]:
-    """Return what is seen of a design where no script runs: beside its path, where it has one."""
-    r = live.records[0]
-    time, voltage, model = r.time, r.inputs["voltage"], r.measured - r.residual
-    if not r.residual.any():
-        return response_figure(time, voltage, model), "The model's answer to the voltage"
-    curves = (Curve("model", EXTENDED_COLOUR, model),)
-    s = Series(r.name, time, voltage, r.measured, curves, r.held_out, noise=0.0, counts=False)
-    return record_figure(s, origin=live.aim), f"The {live.aim} and the model"
 
 
 # Inputs
@@ -99,71 +78,72 @@ def _still(live: LiveModel) -> tuple[Figure, str]:
 
 def tracking_pictures(found: TrackedInput, uncompensated: FloatArray) -> list[Picture]:
     """Return path and response, the error, and the voltage with its limits."""
-    t, wanted = found.target.time, found.target.displacement
-    share = 100.0 / found.target.span
-    paths = _path_and("designed, simulated", found.target, found.response.displacement)
-    paths.append(("uncompensated, simulated", 1e6 * uncompensated, BASE_COLOUR, 1.4))
-    error = share * (found.response.displacement - wanted)
-    errors: list[Line] = [("simulated", error, EXTENDED_COLOUR, 1.4)]
+    target, x = found.target, found.response.displacement
+    share = 100.0 / target.span
+    paths = _path_and("designed, simulated", target, x)
+    _curve(paths, target.time, 1e6 * uncompensated, "uncompensated, simulated", BASE_COLOUR)
+    errors = Panel("time [ms]", "error [% of range]", _HEIGHT)
+    _curve(errors, target.time, share * (x - target.displacement), "simulated")
     if found.by_program:
-        predicted = share * (found.predicted - wanted)
-        errors.append(("predicted by the program", predicted, BASE_COLOUR, 1.2))
+        predicted = share * (found.predicted - target.displacement)
+        _curve(errors, target.time, predicted, "predicted by the program", BASE_COLOUR, 1.2)
     return [
-        Picture("Path and response", _over_time(t, paths, "displacement [µm]")),
-        Picture("Error of the designed input", _over_time(t, errors, "error [% of range]")),
+        Picture("Path and response", paths),
+        Picture("Error of the designed input", errors),
         _voltage(found.response, found.limits),
     ]
 
 
 def inversion_pictures(found: InvertedInput, limits: AmplifierLimits) -> list[Picture]:
     """Return path and response of an inverted input, and the voltage with its limits."""
-    shown = _path_and("inverted, simulated", found.target, found.response.displacement)
-    plot = _over_time(found.target.time, shown, "displacement [µm]")
+    plot = _path_and("inverted, simulated", found.target, found.response.displacement)
     return [Picture("Path and response", plot), _voltage(found.response, limits)]
 
 
 def trial_pictures(found: CorrectedInput) -> list[Picture]:
     """Return path and measured trial, and the voltages played and corrected."""
-    shown = _path_and("trial, measured", found.target, found.measured)
-    plot = _over_time(found.target.time, shown, "displacement [µm]")
-    played: Line = ("played in the trial", found.played, BASE_COLOUR, 1.4)
-    return [Picture("Path and trial", plot), _voltage(found.response, found.limits, played)]
+    plot = _path_and("trial, measured", found.target, found.measured)
+    return [Picture("Path and trial", plot), _voltage(found.response, found.limits, found.played)]
 
 
 def move_pictures(found: QuickMove) -> list[Picture]:
     """Return the displacement of a quickest move with its hold, and the voltage."""
-    shown: Line = ("simulated", 1e6 * found.response.displacement, EXTENDED_COLOUR, 1.8)
-    plot = _over_time(found.response.time, [shown], "displacement [µm]").across(1e6 * found.end)
+    plot = Panel("time [ms]", "displacement [µm]", _HEIGHT).across(1e6 * found.end)
+    r = found.response
+    _curve(plot, r.time, 1e6 * r.displacement, "simulated", width=1.8)
     note = "Dashed: the position to reach. The voltage holds its last value behind the move."
-    pictures = [Picture("Move and hold", plot, note), _voltage(found.response, found.limits)]
+    pictures = [Picture("Move and hold", plot, note), _voltage(r, found.limits)]
     for picture in pictures:
         picture.panel.axes({"range": [0.0, _SHOWN * 1e3 * found.move_time]})
     return pictures
 
 
-def _over_time(time: FloatArray, shown: Sequence[Line], label: str) -> Panel:
-    """Return curves over time [ms]."""
-    plot, part = (
-        Panel("time [ms]", label, _HEIGHT),
-        slice(None, None, max(1, len(time) // _MOST_POINTS)),
-    )
-    for name, values, colour, width in shown:
-        plot.line(1e3 * time[part], values[part], name, colour, width)
-    return plot
+def _path_and(name: str, target: Target, displacement: FloatArray) -> Panel:
+    """Return the path over time, and a displacement [m] on it."""
+    plot = Panel("time [ms]", "displacement [µm]", _HEIGHT)
+    _curve(plot, target.time, 1e6 * target.displacement, "path", MEASURED_COLOUR, 3.0)
+    return _curve(plot, target.time, 1e6 * displacement, name)
 
 
-def _path_and(name: str, target: Target, displacement: FloatArray) -> list[Line]:
-    return [
-        ("path", 1e6 * target.displacement, MEASURED_COLOUR, 3.0),
-        (name, 1e6 * displacement, EXTENDED_COLOUR, 1.4),
-    ]
-
-
-def _voltage(response: Response, limits: AmplifierLimits, *others: Line) -> Picture:
-    """Return the voltage over time with its limits, and other voltages beside it."""
-    shown: list[Line] = [*others, ("designed", response.voltage, EXTENDED_COLOUR, 1.6)]
+def _voltage(
+    response: Response, limits: AmplifierLimits, played: FloatArray | None = None
+) -> Picture:
+    """Return the voltage over time with its limits, and another one that was played."""
+    plot = Panel("time [ms]", "voltage [V]", _HEIGHT)
+    if played is not None:
+        _curve(plot, response.time, played, "played in the trial", BASE_COLOUR)
+    _curve(plot, response.time, response.voltage, "designed", width=1.6)
     bounds = [v for v in (limits.min_voltage, limits.max_voltage) if np.isfinite(v)]
-    return Picture("Voltage", _over_time(response.time, shown, "voltage [V]").across(*bounds))
+    return Picture("Voltage", plot.across(*bounds))
+
+
+def _curve(
+    plot: Panel, time: FloatArray, values: FloatArray, name: str, colour: str = EXTENDED_COLOUR,
+    width: float = 1.4,
+) -> Panel:  # fmt: skip
+    """Add values over time [s], thinned to what a screen shows."""
+    part = slice(None, None, max(1, len(time) // _MOST_POINTS))
+    return plot.line(1e3 * time[part], values[part], name, colour, width)
 
 
 # Experiments
@@ -181,23 +161,18 @@ def write_experiment_page(
     `live` is the model that runs in the page on the designed voltage. Raises InputError where the
     page cannot be written.
     """
-    several = isinstance(design, Separated)
+    several, record = isinstance(design, Separated), design.record
+    applied = Panel("time [s]", "voltage [V]", 320)
+    applied.line(record.time, record.voltage, colour=MEASURED_COLOUR)
     write_design_page(
         path,
         title="Experiment that separates effects" if several else "Experiment for the parameters",
-        summary=sentences(design, model.values.get("C_p")),
-        tables=design_tables(design, model),
-        figures=(_applied(design.record), _responses(design.record, responses)),
-        badges=(f"{design.record.n} samples", f"{number(design.limits.duration)} s"),
+        summary=design_words.sentences(design, model.values.get("C_p")),
+        tables=design_words.design_tables(design, model),
+        figures=(Picture("The voltage to apply", applied), _responses(record, responses)),
+        badges=(f"{record.n} samples", f"{number(design.limits.duration)} s"),
         live=live,
     )
-
-
-def _applied(record: Record) -> Picture:
-    plot = Panel("time [s]", "voltage [V]", 320).line(
-        record.time, record.voltage, colour=MEASURED_COLOUR
-    )
-    return Picture("The voltage to apply", plot)
 
 
 def _responses(record: Record, responses: Mapping[str, FloatArray]) -> Picture:
@@ -229,10 +204,16 @@ def write_mechanism_page(
     it cannot be written.
     """
     why, live = [], None
-    try:
-        live = None if still else _mounted(d, model)
-    except InputError as error:
-        why = [f"The model does not run in this page. {error}"]
+    if not still:
+        try:
+            whole = mounted_model(model, d)
+            end = 2.0 * float(response_times(d.mechanics, d.mounting)[-1])
+            time = np.linspace(0.0, end, _STEP_SAMPLES)
+            voltage = np.where(time > 0.02 * end, model.values["u_rated"], 0.0)
+            played = respond(whole, time, voltage)
+            live = live_design(whole, (time, voltage, played.displacement), rest=True)
+        except InputError as error:
+            why = [f"The model does not run in this page. {error}"]
     acts = (
         "A mechanism acts as feedback around the mechanics (position, velocity and acceleration"
         " by its stiffness, damping and mass); the lag stands before the loop."
@@ -242,24 +223,17 @@ def write_mechanism_page(
     write_design_page(
         path,
         title=f"Prestress mechanism for {model.name}",
-        summary=[*mechanism_sentences(d), *why],
+        summary=[*design_words.mechanism_sentences(d), *why],
         live=live,
-        tables=(Titled("Mechanism", mechanism_table(d)), Titled("Poles", pole_table(d), acts)),
+        tables=(
+            design_words.Titled("Mechanism", design_words.mechanism_table(d)),
+            design_words.Titled("Poles", design_words.pole_table(d), acts),
+        ),
         figures=(
             Picture("Root locus", _root_locus(d), locus),
             Picture("Step of the rated voltage", _step(d), linear),
         ),
     )
-
-
-def _mounted(d: MechanismDesign, model: Model) -> LiveModel:
-    """Begin what lets the mounted stack run in the page, on a step of the rated voltage."""
-    whole = mounted_model(model, d)
-    end = 2.0 * float(response_times(d.mechanics, d.mounting)[-1])
-    time = np.linspace(0.0, end, _STEP_SAMPLES)
-    voltage = np.where(time > 0.02 * end, model.values["u_rated"], 0.0)
-    played = respond(whole, time, voltage)
-    return live_design(whole, (time, voltage, played.displacement), rest=True)
 
 
 def _root_locus(d: MechanismDesign) -> Panel:

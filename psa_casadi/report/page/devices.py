@@ -1,39 +1,17 @@
 """Pages of several devices: a few side by side, or a population and who stands out of it."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.population.finding import Finding
-from psa_casadi.population.population import Difference, Population, differences
+from psa_casadi.population.population import Population, differences
 from psa_casadi.report.page.document import Picture, render
-from psa_casadi.report.plots.device_plots import (
-    budget_plot,
-    difference_plot,
-    drift_plot,
-    error_plots,
-    spread_plot,
-)
+from psa_casadi.report.plots import device_plots as plots
+from psa_casadi.report.words import population_words as words
 from psa_casadi.report.words.phrases import number, one_unit
-from psa_casadi.report.words.population_words import (
-    METHOD,
-    batch_table,
-    budget_table,
-    causes_text,
-    difference_sentence,
-    difference_table,
-    drift_table,
-    error_scale,
-    file_table,
-    frequency_table,
-    left_out_sentence,
-    outlier_table,
-    population_sentences,
-    spread_table,
-    verdict_table,
-)
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import VERDICTS
 
@@ -64,18 +42,28 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
             f"{len(findings)} devices have no room side by side; give {MOST} at most, or the folder"
             " of results of `psa batch` for the page of a population."
         )
-    rows, scale = differences(findings), error_scale(findings)
+    rows, scale = differences(findings), words.error_scale(findings)
     with one_unit(scale):
         page = render(
             "comparison.html",
             f"Comparison of {len(findings)} devices",
             findings=findings,
-            verdict=difference_sentence(findings, rows),
+            verdict=words.difference_sentence(findings, rows),
             tiles=[_tile(f) for f in findings[:_MOST_TILES]],
-            verdicts=verdict_table(findings, scale),
-            **_compared(findings, rows),
+            verdicts=words.verdict_table(findings, scale),
+            budget=any(f.budget for f in findings)
+            and {
+                "panel": plots.budget_plot(findings),
+                "table": words.budget_table(findings),
+            },
+            parameters=rows
+            and {
+                "panel": plots.difference_plot(findings, rows),
+                "table": words.difference_table(findings, rows),
+            },
+            traces=any(f.trace for f in findings) and plots.error_plots(findings),
             scales=len({f.force_scale for f in findings if f.force_scale}),
-            files=file_table(findings),
+            files=words.file_table(findings),
         )
     atomic_write(path, page)
 
@@ -83,25 +71,10 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
 def _tile(f: Finding) -> tuple[str, str, str]:
     """Return a device with its verdict and cause, or with the error of its fit."""
     if f.verdict:
-        return f.device, VERDICTS.get(f.verdict, f.verdict), causes_text(f)
+        return f.device, VERDICTS.get(f.verdict, f.verdict), words.causes_text(f)
     if f.rms_percent is not None:
         return f.device, f"{number(f.rms_percent, 2)} % of range", "rms of the fit"
     return f.device, "model", ""
-
-
-def _compared(findings: Sequence[Finding], rows: Sequence[Difference]) -> dict[str, Any]:
-    """Return plots and tables of error budgets, parameters and errors, where there are any."""
-    found: dict[str, Any] = dict.fromkeys(("budget", "parameters", "traces"))
-    if any(f.budget for f in findings):
-        found["budget"] = {"panel": budget_plot(findings), "table": budget_table(findings)}
-    if rows:
-        found["parameters"] = {
-            "panel": difference_plot(findings, rows),
-            "table": difference_table(findings, rows),
-        }
-    if any(f.trace for f in findings):
-        found["traces"] = error_plots(findings)
-    return found
 
 
 def write_population(
@@ -119,33 +92,26 @@ def write_population(
     p, batches = found, {f.batch for f in found.findings if f.batch}
     badges = [f"{len(p.findings)} devices"]
     badges += [f"{len(batches)} batch{'es' if len(batches) > 1 else ''}"] if batches else []
-    counts = {s.estimates.name: 0 for s in p.spreads}
-    for o in p.outliers:
-        counts[o.parameter] += 1
+    counts = Counter(o.parameter for o in p.outliers)
     shown = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
     page = render(
         "population.html",
         "Population of devices",
         badges,
         p=p,
-        verdict=" ".join(population_sentences(p)),
+        verdict=" ".join(words.population_sentences(p)),
         tiles=_tiles(p, len(without)),
-        outliers=outlier_table(p),
-        method=METHOD,
-        spreads=spread_table(p),
-        left_out=left_out_sentence(p),
+        method=words.METHOD,
+        **words.population_tables(p),
+        left_out=words.left_out_sentence(p),
         spread_pictures=[
-            Picture(s.estimates.name, spread_plot(p, s), s.estimates.meaning) for s in shown
+            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning) for s in shown
         ],
-        batches=batch_table(p),
-        drifts=drift_table(p),
         drift_pictures=[
-            Picture(f"{s.estimates.name} over the date", drift_plot(p, s))
+            Picture(f"{s.estimates.name} over the date", plots.drift_plot(p, s))
             for s in p.spreads
             if s.estimates.name in p.drifting
         ],
-        verdict_counts=frequency_table("verdict", p.verdicts),
-        cause_counts=frequency_table("cause", p.causes),
         without=Table(("device", "ended", "why"), tuple(without)) if without else None,
     )
     atomic_write(path, page)

@@ -25,6 +25,7 @@ from plotly.offline import get_plotlyjs
 from psa_casadi.characters import plain
 from psa_casadi.command_line import typed
 from psa_casadi.report.plots.panel import DARK, Panel, plotly_figure
+from psa_casadi.report.words import phrases
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
 
@@ -58,7 +59,7 @@ def render(template: str, title: str, badges: Sequence[str] = (), **given: Any) 
 
 def filled(template: str, **given: Any) -> str:
     """Return the text of a template that is filled in."""
-    return _environment().get_template(template).render(given)
+    return environment().get_template(template).render(given)
 
 
 class _Page:
@@ -122,12 +123,14 @@ class _Page:
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
+    """Return what fills templates in: words are escaped, a percent sign stays with its number."""
     made = Environment(
         loader=PackageLoader(_HOME, "templates"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, finalize=_words,
     )  # fmt: skip
     made.globals.update(column_styles=_column_styles, still_picture=_still_picture)
+    made.filters.update(plain=phrases.plain, percent=phrases.percent, either=phrases.either)
     return made
 
 

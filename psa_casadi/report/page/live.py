@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,16 +22,15 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words.fit_words import determined
 from psa_casadi.report.words.phrases import added, handy_scale, length_scale, plain, shown_in
-from psa_casadi.report.words.series import Series, spans, time_scale
+from psa_casadi.report.words.series import EXTENDED_COLOUR, Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
 from psa_casadi.simulation.simulate import output_of
 from psa_casadi.units import convert
-from psa_casadi.variables import Parameter
+from psa_casadi.variables import Output, Parameter, State
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Samples of all records in a page, and records; of more, those that the model misses most.
 _SAMPLES, _RECORDS = 12_000, 6
@@ -49,26 +48,24 @@ _NO_BOUND = 1e300
 
 @dataclass(frozen=True, eq=False)
 class LiveRecord:
-    """A record that a model runs on, arrays (n,) in SI units: what it is compared with, and how.
+    """A record that a model runs on, with the model's curve, as it was fitted, as its last.
 
-    `deviation` holds the start of states off where the voltage puts them, `center` the residual of
-    the model as it was fitted, `floor` the noise that errors are judged by (0: `noise`), `base` the
-    base model's rms error, `correction` what an unnamed correction adds. It begins in motion, or
-    at `rest`.
+    `inputs` are arrays (n,) in SI units by name. `deviation` holds the start of states off where
+    the voltage puts them, `floor` the noise that errors are judged by, `correction` what an unnamed
+    correction adds. It begins in motion, or at `rest`.
     """
 
-    name: str
-    time: FloatArray
+    series: Series
     inputs: Mapping[str, FloatArray]
-    measured: FloatArray
-    held_out: BoolArray
-    residual: FloatArray
-    deviation: Mapping[str, float]
-    noise: float
+    deviation: Mapping[str, float] = field(default_factory=dict)
     floor: float = 0.0
-    base: float = 0.0
     correction: FloatArray | None = None
     rest: bool = False
+
+    @property
+    def residual(self) -> FloatArray:
+        """What the model leaves as it was fitted [m]."""
+        return self.series.residual(self.series.curves[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +82,36 @@ class LiveModel:
     design: bool = False
     extended: bool = False
     correction: str = ""
-    counts: bool = False
 
     def told(self) -> dict[str, Any] | None:
         """Return what live.js must know, once the module is there; None where there is none."""
         module = self.module.result()
-        return None if module is None else _told(self, module)
+        if module is None:
+            return None
+        shown = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
+        first, counts = shown[0].series, any(r.series.counts for r in self.records)
+        largest = max(float(np.nanmax(np.abs(r.residual))) for r in shown)
+        scales = {
+            "time": first.time_scale,
+            "length": handy_scale(first.span, counts=counts),
+            "error": length_scale(largest or 1e-2 * first.span, counts=counts),
+        }
+        return {
+            "kind": "report",
+            **live_data(self.model, module),
+            "records": [_record(r, _SAMPLES // len(shown), self.design) for r in shown],
+            **{name: {"unit": s.unit, "factor": s.factor} for name, s in scales.items()},
+            "extended": self.extended,
+            "design": self.design,
+            "aim": self.aim,
+            "correction": self.correction,
+            "legend": [["--measured", self.aim], ["--model", "model"], ["--fitted", "as it was"]],
+            "captions": {
+                "time": "Displacement over time",
+                "loop": "Displacement over voltage",
+                "residual": f"{self.aim} minus model".capitalize(),
+            },
+        }
 
     def cure(self) -> str:
         """Return what would make the model run in the page."""
@@ -111,18 +132,13 @@ def live_diagnosis(d: Diagnosis, rows: Sequence[Series]) -> LiveModel:
         records=_fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond, share),
         extended=added(d),
         correction="" if patch is None else f"{patch.name}, as it was found: it does not follow",
-        counts=any(s.counts for s in rows),
     )
 
 
 def live_fit(found: Identification, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of an identification alive; `rows` are its `series_of_fit`."""
-    return LiveModel(
-        model=found.model,
-        module=begun_module(found.model),
-        records=_fitted_records(found.model, found.fit, found.experiments, rows, []),
-        counts=any(s.counts for s in rows),
-    )
+    records = _fitted_records(found.model, found.fit, found.experiments, rows)
+    return LiveModel(found.model, begun_module(found.model), records)
 
 
 def live_design(
@@ -138,13 +154,10 @@ def live_design(
     to follow, where there is one. The model begins in motion, or at `rest`.
     """
     time, voltage, shown = record
-    aim = shown if wanted is None else wanted
-    row = LiveRecord(
-        name="design", time=time, inputs={"voltage": voltage}, measured=aim,
-        held_out=np.zeros(len(time), dtype=bool), residual=aim - shown, deviation={}, noise=0.0,
-        rest=rest,
-    )  # fmt: skip
-    words = "design" if wanted is None else "path"
+    aim, words = (shown, "design") if wanted is None else (wanted, "path")
+    curve, none = Curve("model", EXTENDED_COLOUR, shown), np.zeros(len(time), dtype=bool)
+    series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
+    row = LiveRecord(series, {"voltage": voltage}, rest=rest)
     return LiveModel(model, begun_module(model), [row], aim=words, design=True)
 
 
@@ -153,7 +166,7 @@ def _fitted_records(
     fit: Fit,
     experiments: Sequence[Experiment],
     series: Sequence[Series],
-    beyond: Sequence[FloatArray],
+    beyond: Sequence[FloatArray] = (),
     share: float = 1.0,
 ) -> list[LiveRecord]:
     """Return the records of a fit; `beyond` is what an unnamed correction adds to each.
@@ -164,91 +177,37 @@ def _fitted_records(
     rows = []
     for k, (e, s) in enumerate(zip(experiments, series, strict=True)):
         columns = {n: getattr(e.record, n, None) for n in model.input_names}
-        rows.append(
-            LiveRecord(
-                name=s.name,
-                time=s.time,
-                inputs={n: v for n, v in columns.items() if v is not None},
-                measured=s.measured,
-                held_out=s.held_out,
-                residual=s.residual(s.curves[-1]),
-                deviation=fit.unknowns.start(theta, k),
-                noise=s.noise,
-                floor=share * s.noise,
-                base=_judged_rms(s.residual(s.curves[0]), s.held_out),
-                correction=beyond[k] if beyond else None,
-            )
-        )
+        inputs = {n: v for n, v in columns.items() if v is not None}
+        deviation = fit.unknowns.start(theta, k)
+        correction = beyond[k] if beyond else None
+        rows.append(LiveRecord(s, inputs, deviation, share * s.noise, correction))
     return rows
 
 
-def _told(live: LiveModel, module: bytes) -> dict[str, Any]:
-    shown = sorted(live.records, key=_miss, reverse=True)[:_RECORDS]
-    first, counts = shown[0], live.counts
-    time = time_scale(float(first.time[-1] - first.time[0]))
-    length = handy_scale(_range(first), counts=counts)
-    largest = max(float(np.nanmax(np.abs(r.residual))) for r in shown)
-    error = length_scale(largest or 1e-2 * _range(first), counts=counts)
-    legend = [["--measured", live.aim], ["--model", "model"], ["--fitted", "as it was"]]
-    return {
-        "kind": "report",
-        **live_data(live.model, module),
-        "records": [_record(r, _SAMPLES // len(shown)) for r in shown],
-        **{
-            name: {"unit": scale.unit, "factor": scale.factor}
-            for name, scale in (("time", time), ("length", length), ("error", error))
-        },
-        "extended": live.extended,
-        "design": live.design,
-        "aim": live.aim,
-        "correction": live.correction,
-        "legend": legend,
-        "captions": {
-            "time": "Displacement over time",
-            "loop": "Displacement over voltage",
-            "residual": f"{live.aim} minus model".capitalize(),
-        },
-    }
-
-
-def _miss(r: LiveRecord) -> float:
-    """Return the error over the spread, by which records are chosen."""
-    return float(np.sqrt(np.nanmean(r.residual**2))) / (float(np.nanstd(r.measured)) or 1.0)
-
-
-def _range(r: LiveRecord) -> float:
-    return float(np.nanmax(r.measured) - np.nanmin(r.measured))
-
-
-def _judged_rms(residual: FloatArray, held_out: BoolArray) -> float:
-    """Return the rms of a residual over the samples held out, or all if none is."""
-    counted = held_out if held_out.any() else np.ones(len(residual), dtype=bool)
-    return float(np.sqrt(np.nanmean(residual[counted] ** 2)))
-
-
-def _record(r: LiveRecord, limit: int) -> dict[str, Any]:
+def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
     """Return a record as a page holds it, in SI units, its time from its own first sample on."""
-    part, note = thinned(r.time, r.inputs["voltage"], limit)
-    t = r.time[part] - r.time[0]
+    s = r.series
+    part, note = thinned(s.time, r.inputs["voltage"], limit)
+    t = s.time[part] - s.time[0]
     residual = r.residual[part]
-    fitted = np.isfinite(residual) & ~r.held_out[part]
+    fitted = np.isfinite(residual) & ~s.held_out[part]
     even = len(t) > 2 and float(np.ptp(np.diff(t))) <= ALIKE * float(t[1])
     return {
-        "name": r.name,
+        "name": s.name,
         "note": note,
         "t": None if even else doubles(t),
         "n": len(t),
         "step": float(t[-1] / (len(t) - 1)),
         "inputs": {n: doubles(v[part]) for n, v in r.inputs.items()},
-        "measured": singles(r.measured[part]),
-        "held": spans(r.held_out[part]),
+        "measured": singles(s.measured[part]),
+        "held": spans(s.held_out[part]),
         "center": float(np.mean(residual[fitted])) if fitted.any() else 0.0,
         "deviation": dict(r.deviation),
-        "noise": r.noise,
-        "floor": r.floor or r.noise,
+        "noise": s.noise,
+        "floor": r.floor or s.noise,
         "rest": r.rest,
-        "range": _range(r),
-        "base": r.base,
+        "range": s.span,
+        "base": 0.0 if design else s.judged_rms(s.curves[0]),
         "correction": None if r.correction is None else singles(r.correction[part]),
     }
 
@@ -287,26 +246,20 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
     Each parameter has `unit`, in which a page shows it, with `factor` and `shift`: shown = factor *
     value + shift; and the ends of its slider.
     """
-    shown = output_of(model)
-    outputs = model.output_names
-    s, known = model.structure, determined(model)
+    shown, s, known = output_of(model), model.structure, determined(model)
+    nominals = dict(zip(model.output_names, model.output_nominals(), strict=True))
     return {
         "name": model.name,
         "wasm": packed(module),
         "parameters": [_parameter(model, p, p.name in known) for p in s.parameters],
         "effects": [_effect(model, c) for c in model.effects],
         "inputs": [{"name": i.name, "unit": i.unit, "start": i.start} for i in s.inputs],
-        "outputs": [_variable(o.name, o.unit, o.display_unit, o.description) for o in s.outputs],
-        "states": [
-            {**_variable(q.name, q.unit, q.display_unit, q.description), "start": q.start}
-            for q in s.states
-        ],
+        "outputs": [_variable(o) for o in s.outputs],
+        "states": [{**_variable(q), "start": q.start} for q in s.states],
         "nominals": model.state_nominals().tolist(),
         "error_sizes": model.error_sizes().tolist(),
         "shown": shown,
-        "shown_nominal": (
-            0.0 if shown is None else float(model.output_nominals()[outputs.index(shown)])
-        ),
+        "shown_nominal": 0.0 if shown is None else float(nominals[shown]),
         "starts_itself": model.starts_itself,
         "file": _file(model),
     }
@@ -320,9 +273,9 @@ def _file(model: Model) -> str | None:
         return None
 
 
-def _variable(name: str, unit: str, display: str | None, description: str) -> dict[str, Any]:
-    shown = display or unit
-    return {"name": name, "description": description, "si": unit, **_scale(unit, shown)}
+def _variable(v: State | Output) -> dict[str, Any]:
+    scale = _scale(v.unit, v.display_unit or v.unit)
+    return {"name": v.name, "description": v.description, "si": v.unit, **scale}
 
 
 def _scale(unit: str, display: str) -> dict[str, Any]:

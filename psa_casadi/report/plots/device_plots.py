@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.population.finding import NORMAL_95, Finding, Trace
+from psa_casadi.population.finding import NORMAL_95, Finding
 from psa_casadi.population.population import Difference, Population, Spread, display_unit
 from psa_casadi.population.statistics import mixed_regression
 from psa_casadi.report.plots.panel import BOUND_COLOUR, WEAK_COLOUR, Panel
@@ -47,7 +47,15 @@ def difference_plot(findings: Sequence[Finding], rows: Sequence[Difference]) -> 
     names = [f"{d.estimates.name}{' *' if d.differs else ''}" for d in rows]
     room = 0.7 / max(1, len(findings))
     for k, f in enumerate(findings):
-        points = [(i, *_relative(d, k)) for i, d in enumerate(rows) if k in d.estimates.places]
+        points = []
+        for i, d in enumerate(rows):
+            e = d.estimates
+            if k in e.places:
+                own = e.places.index(k)
+                mean = e.value(float(mixed_regression(e.theta, e.errors).b[0]))
+                ends = e.theta[own] + NORMAL_95 * e.errors[own] * np.array([0.0, -1.0, 1.0])
+                percents = (100.0 * (e.value(float(t)) - mean) / (abs(mean) or 1.0) for t in ends)
+                points.append((i, *percents))
         if not points:
             continue
         place, value, low, high = np.array(points).T
@@ -61,18 +69,6 @@ def difference_plot(findings: Sequence[Finding], rows: Sequence[Difference]) -> 
     rows_axis = {"tickvals": list(range(len(names))), "ticktext": names, "automargin": True,
                  "autorange": "reversed", "showgrid": False}  # fmt: skip
     return plot.axes(y=rows_axis, margin={"l": 20, "r": 10, "t": 46, "b": 46})
-
-
-def _relative(d: Difference, device: int) -> tuple[float, float, float]:
-    """Return value, low and high of a device in percent of the mean's size."""
-    e = d.estimates
-    k = e.places.index(device)
-    mean = float(mixed_regression(e.theta, e.errors).b[0])
-    half = NORMAL_95 * float(e.errors[k])
-    value = [e.value(t) for t in (e.theta[k], e.theta[k] - half, e.theta[k] + half)]
-    size = abs(e.value(mean)) or 1.0
-    first, low, high = (100.0 * (v - e.value(mean)) / size for v in value)
-    return first, low, high
 
 
 def budget_plot(findings: Sequence[Finding]) -> Panel:
@@ -92,30 +88,35 @@ def budget_plot(findings: Sequence[Finding]) -> Panel:
 
 def error_plots(findings: Sequence[Finding]) -> tuple[Panel, Panel, Panel]:
     """Return measured less model over time and over voltage, and the loops, of every device."""
-    traced = [(k, f.device, f.trace) for k, f in enumerate(findings) if f.trace is not None]
-    clock = time_scale(max(t.time[-1] - t.time[0] for _, _, t in traced))
-    largest = max(float(np.nanmax(np.abs(_error(t)))) for _, _, t in traced)
-    span = max(float(np.nanmax(t.measured) - np.nanmin(t.measured)) for _, _, t in traced)
-    small, length = length_scale(largest), handy_scale(span)
+    traced = [
+        (
+            k,
+            f.device,
+            np.array(t.time),
+            np.array(t.voltage),
+            np.array(t.measured),
+            np.array(t.model),
+        )
+        for k, f in enumerate(findings)
+        if (t := f.trace) is not None
+    ]
+    clock = time_scale(max(time[-1] - time[0] for _, _, time, *_ in traced))
+    small = length_scale(max(float(np.nanmax(np.abs(x - y))) for *_, x, y in traced))
+    length = handy_scale(max(float(np.nanmax(x) - np.nanmin(x)) for *_, x, _ in traced))
     error = f"measured less model [{small.unit}]"
     plots = (
         Panel(f"time [{clock.unit}]", error, _HEIGHT),
         Panel("voltage [V]", error, _HEIGHT),
         Panel("voltage [V]", f"measured displacement [{length.unit}]", _HEIGHT),
     )
-    for k, device, t in traced:
-        time = clock.factor * (np.array(t.time) - t.time[0])
-        voltage, residual = np.array(t.voltage), small.factor * _error(t)
-        stroke = length.factor * (np.array(t.measured) - np.nanmin(t.measured))
+    for k, device, time, voltage, x, y in traced:
+        residual, stroke = small.factor * (x - y), length.factor * (x - np.nanmin(x))
         colour, dash, _ = _look(k)
-        shown = ((time, residual), (voltage, residual), (voltage, stroke))
-        for plot, (x, y) in zip(plots, shown, strict=True):
-            plot.line(x, y, device, colour, 1.3, dash).axes(y={"automargin": True})
+        clocked = clock.factor * (time - time[0])
+        shown = ((clocked, residual), (voltage, residual), (voltage, stroke))
+        for plot, (along, up) in zip(plots, shown, strict=True):
+            plot.line(along, up, device, colour, 1.3, dash).axes(y={"automargin": True})
     return plots
-
-
-def _error(t: Trace) -> FloatArray:
-    return np.asarray(np.array(t.measured) - np.array(t.model))
 
 
 def spread_plot(p: Population, s: Spread) -> Panel:

@@ -2,7 +2,7 @@
 
 import os
 import textwrap
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,31 +22,12 @@ from psa_casadi.identification.identify import Identification
 from psa_casadi.posterior.chains import columns_of_records
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.records.record import Record
+from psa_casadi.report.plots import records
 from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
-from psa_casadi.report.plots.records import (
-    loop_plot,
-    measured_plot,
-    residual_plot,
-    samples,
-    zoom_plot,
-)
+from psa_casadi.report.words import phrases
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.own_words import own_fit_series, own_series
-from psa_casadi.report.words.phrases import (
-    added,
-    handy_scale,
-    in_brackets,
-    length_scale,
-    listing,
-    number,
-    percent,
-    plain,
-    prefixed_scale,
-    scale_of,
-    shown_in,
-    with_unit,
-)
 from psa_casadi.report.words.series import (
     BASE_COLOUR,
     EXTENDED_COLOUR,
@@ -116,7 +97,10 @@ def figure_of(result: Plotted) -> Figure:
     if isinstance(result, Diagnosis):
         return diagnosis_figure(result)
     if isinstance(result, Identification):
-        return fit_figure(result)
+        series = series_of_fit(result)
+        figure, grid, shown = _sheet(series, "measured", "model")
+        _draw_residual(figure.add_subplot(grid[1, :]), shown)
+        return figure
     if isinstance(result, Trajectory):
         return response_figure(result.time, result.voltage, result.displacement)
     if isinstance(result, Posterior):
@@ -128,28 +112,14 @@ def figure_of(result: Plotted) -> Figure:
 
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
-    series = series_of(diagnosis)
-    shown = most_telling(series)
-    figure, grid = _sheet(shown, origin)
+    verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
+    figure, grid, shown = _sheet(series_of(diagnosis), origin, "base model", verdict)
     _draw_residual(figure.add_subplot(grid[1, :2]), shown)
     evidence = figure.add_subplot(grid[1, 2])
     count = len(diagnosis.candidates)
     part = f" ({_MOST_BARS} of {count})" if count > _MOST_BARS else ""
     draw(evidence, evidence_plot(diagnosis, _MOST_BARS), f"Evidence, each effect alone{part}")
     evidence.grid(visible=False, axis="y")
-    which = _which(series, shown, origin, "base model")
-    lines = [*textwrap.wrap(verdict_sentence(diagnosis), 125), which]
-    figure.suptitle("\n".join(lines), fontsize=FONT + 3)
-    return figure
-
-
-def fit_figure(found: Identification, *, origin: str = "measured") -> Figure:
-    """Return the picture of an identification: the record it misses most, loop and residual."""
-    series = series_of_fit(found)
-    shown = most_telling(series)
-    figure, grid = _sheet(shown, origin)
-    _draw_residual(figure.add_subplot(grid[1, :]), shown)
-    figure.suptitle(_which(series, shown, origin, "model"), fontsize=FONT + 3)
     return figure
 
 
@@ -157,12 +127,12 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     """Return the picture of one record: measured against model, loop and residual."""
     figure = sheet((12.0, 6.4), 80, layout=None)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
-    shown = samples(s, _MOST_POINTS)
+    shown = records.samples(s, _MOST_POINTS)
     above = figure.add_subplot(grid[0, :2] if s.against else grid[0, :])
-    draw(above, measured_plot(s, origin, shown), s.title, legend=_ABOVE)
+    draw(above, records.measured_plot(s, origin, shown), s.title, legend=_ABOVE)
     above.margins(x=0.01)
     if s.against:
-        draw(figure.add_subplot(grid[0, 2]), loop_plot(s, origin, shown), "Loop")
+        draw(figure.add_subplot(grid[0, 2]), records.loop_plot(s, origin, shown), "Loop")
     _draw_residual(figure.add_subplot(grid[1, :]), s, origin)
     return figure
 
@@ -171,43 +141,46 @@ def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatAr
     """Return the picture of a displacement [m] over time [s] and over the voltage [V]."""
     figure = sheet((SIZE_INCHES[0], 0.5 * SIZE_INCHES[1]), DPI)
     over_time, loop = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
-    scale = length_scale(float(np.ptp(displacement)))
+    scale = phrases.length_scale(float(np.ptp(displacement)))
     y, label = scale.factor * displacement, f"[{scale.unit}]"
     draw(over_time, Panel("time [s]", label).line(time, y), "Displacement")
     draw(loop, Panel("voltage [V]", label).line(voltage, y), "Loop")
     return figure
 
 
-def _sheet(s: Series, origin: str) -> tuple[Figure, GridSpec]:
-    """Return a picture with a record, its telling window and its loop in the upper row."""
+def _sheet(
+    series: tuple[Series, ...], origin: str, model: str, head: Sequence[str] = ()
+) -> tuple[Figure, GridSpec, Series]:
+    """Return a picture with the record that the `model` misses most, and that record.
+
+    In the upper row are the record, its telling window and its loop, above it the lines of `head`.
+    """
+    s = most_telling(series)
     figure = sheet(SIZE_INCHES, DPI)
     ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
     grid = figure.add_gridspec(2, 3, **ratios)
-    shown, window = samples(s, _MOST_POINTS), telling_window(s)
+    shown, window = records.samples(s, _MOST_POINTS), telling_window(s)
     whole, part, loop = (figure.add_subplot(grid[0, k]) for k in range(3))
-    draw(whole, measured_plot(s, origin, shown), f"{s.title} (box: the part on the right)")
+    draw(whole, records.measured_plot(s, origin, shown), f"{s.title} (box: the part on the right)")
     ends = s.time_scale.factor * s.time[window][[0, -1]]
     whole.axvspan(*ends, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
     whole.margins(x=0.01)
     inside = (
         "In the box, where the error falls most" if len(s.curves) > 1 else "The part in the box"
     )
-    draw(part, zoom_plot(s, origin, _MOST_POINTS), inside, legend={})
-    draw(loop, loop_plot(s, origin, shown), "Loop", legend={"loc": "upper left"})
-    return figure, grid
-
-
-def _which(series: tuple[Series, ...], shown: Series, origin: str, model: str) -> str:
-    which = f"{origin} record: {shown.name}"
+    draw(part, records.zoom_plot(s, origin, _MOST_POINTS), inside, legend={})
+    draw(loop, records.loop_plot(s, origin, shown), "Loop", legend={"loc": "upper left"})
+    which = f"{origin} record: {s.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the {model} misses most)"
-    return which
+    figure.suptitle("\n".join([*head, which]), fontsize=FONT + 3)
+    return figure, grid, s
 
 
 def _draw_residual(axes: Axes, s: Series, origin: str = "measured") -> None:
     """Draw what the models leave of a record, with room for the legend above."""
-    shown = samples(s, _MOST_POINTS)
-    draw(axes, residual_plot(s, shown), f"Residual: {origin} minus model", legend=_OVER)
+    shown = records.samples(s, _MOST_POINTS)
+    draw(axes, records.residual_plot(s, shown), f"Residual: {origin} minus model", legend=_OVER)
     axes.margins(x=0.005)
     largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves)
     largest = s.residual_scale.factor * largest or 1.0
@@ -225,7 +198,7 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     window = telling_window(s)
     more = 3 * (window.stop - window.start)
     part = slice(max(0, window.start - more), min(len(s.time), window.stop + more))
-    plot = residual_plot(s, part)
+    plot = records.residual_plot(s, part)
     plot.layout["shapes"] = []  # a shaded band is plainer than dashes
     noise = 2.0 * s.residual_scale.factor * s.noise
     above.axhspan(-noise, noise, color=HELD_OUT_COLOUR, label="noise, 2 sigma")
@@ -236,31 +209,25 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     above.set_ylim(low, high + 0.32 * (high - low))  # for the legend
     above.legend(fontsize=font - 0.5, loc="upper left", ncols=2, columnspacing=0.9,
                  handlelength=1.2, framealpha=0.0)  # fmt: skip
-    _bars(below, diagnosis, font)
-    causes = listing([plain(c.effect) for c in diagnosis.causes])
+    below.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
+    rows = [("base model", BASE_COLOUR, diagnosis.base_errors.holdout_rms_m)]
+    if phrases.added(diagnosis):
+        rows.append(("extended", EXTENDED_COLOUR, diagnosis.extended_errors.holdout_rms_m))
+    rows.append(("noise", NOISE_COLOUR, diagnosis.noise_floor_rms_m))
+    largest = max(rms for *_, rms in rows)
+    scale = phrases.scale_of(diagnosis.experiments, largest)
+    for k, (_, colour, rms) in enumerate(rows):
+        below.barh(k, rms, color=colour, height=0.7)
+        below.annotate(f" {scale.text(rms)}", (rms, k), va="center", fontsize=font)
+    below.axvline(diagnosis.noise_floor_rms_m, color="black", linestyle="--", linewidth=1.0)
+    below.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=font)
+    below.set(xlim=(0.0, 1.3 * largest), xticks=[])
+    below.invert_yaxis()
+    below.spines[["top", "right", "bottom"]].set_visible(False)
+    causes = phrases.listing([phrases.plain(c.effect) for c in diagnosis.causes])
     verdict = VERDICTS[diagnosis.verdict].capitalize()
     figure.suptitle(f"{verdict}: {causes}" if causes else verdict, fontsize=font + 2, wrap=True)
     return figure
-
-
-def _bars(axes: Axes, d: Diagnosis, font: float) -> None:
-    """Draw the held-out errors, with the noise as their floor."""
-    rows = [("base model", BASE_COLOUR, d.base_errors.holdout_rms_m)]
-    if added(d):
-        rows.append(("extended", EXTENDED_COLOUR, d.extended_errors.holdout_rms_m))
-    rows.append(("noise", NOISE_COLOUR, d.noise_floor_rms_m))
-    largest = max(rms for *_, rms in rows)
-    scale = scale_of(d.experiments, largest)
-    for k, (_, colour, rms) in enumerate(rows):
-        axes.barh(k, rms, color=colour, height=0.7)
-        axes.annotate(f" {scale.text(rms)}", (rms, k), va="center", fontsize=font)
-    axes.axvline(d.noise_floor_rms_m, color="black", linestyle="--", linewidth=1.0)
-    axes.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=font)
-    axes.set_xlim(0.0, 1.3 * largest)
-    axes.invert_yaxis()
-    axes.set_xticks([])
-    axes.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
-    axes.spines[["top", "right", "bottom"]].set_visible(False)
 
 
 def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure:
@@ -281,22 +248,20 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         by_name = {f.name: f for f in result.figures}
         _draw_parameter(axes, result, by_name[_chosen(output, by_name, next(iter(by_name)))])
     else:
-        _draw_compared(axes, _series(result), output)
+        series = _series(result)
+        quantities = dict.fromkeys(s.quantity for s in series)
+        name = _chosen(output, [*quantities, "residual"], most_telling(series).quantity)
+        if name == "residual":
+            _draw_residual(axes, most_telling(series))
+        else:
+            shown = most_telling([s for s in series if s.quantity == name])
+            whole = replace(shown, held_out=np.zeros(len(shown.time), dtype=bool))
+            draw(
+                axes, records.measured_plot(whole, "measured", slice(None)), shown.title, legend={}
+            )
+            axes.margins(x=0.01)
     found: Figure | SubFigure = axes.figure
     return found if isinstance(found, Figure) else found.figure
-
-
-def _draw_compared(axes: Axes, series: tuple[Series, ...], output: str | None) -> None:
-    """Draw what was measured beside the models; "residual" is what these leave."""
-    quantities = dict.fromkeys(s.quantity for s in series)
-    name = _chosen(output, [*quantities, "residual"], most_telling(series).quantity)
-    if name == "residual":
-        _draw_residual(axes, most_telling(series))
-        return
-    shown = most_telling([s for s in series if s.quantity == name])
-    whole = replace(shown, held_out=np.zeros(len(shown.time), dtype=bool))
-    draw(axes, measured_plot(whole, "measured", slice(None)), shown.title, legend={})
-    axes.margins(x=0.01)
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
@@ -318,8 +283,8 @@ def _chosen(output: str | None, there: Collection[str], usual: str) -> str:
 def _curve(axes: Axes, time: FloatArray, values: FloatArray, name: str, unit: str) -> None:
     """Draw values in their SI unit over time, in a handy one."""
     size = float(np.nanmax(np.abs(values), initial=0.0))
-    scale = handy_scale(size) if unit == "m" else prefixed_scale(size, unit or "1")
-    label = in_brackets(name, scale.unit)
+    scale = phrases.handy_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
+    label = phrases.in_brackets(name, scale.unit)
     draw(axes, Panel("time [s]", label).line(time, scale.factor * values, name))
 
 
@@ -366,11 +331,10 @@ def _draw_prior(axes: Axes, found: Posterior, record: int) -> None:
         return
     low, high, _ = _band(found, "prior_predictive", record)
     span = float(np.nanmax(y) - np.nanmin(y))
-    scale = length_scale(3.0 * span)
+    scale = phrases.length_scale(3.0 * span)
     band = f"prior, {100.0 * HDI:.0f} %"
-    axes.fill_between(
-        r.time, scale.factor * low, scale.factor * high, color=BASE_COLOUR, alpha=0.3, label=band
-    )
+    ends = (scale.factor * low, scale.factor * high)
+    axes.fill_between(r.time, *ends, color=BASE_COLOUR, alpha=0.3, label=band)
     axes.plot(r.time, scale.factor * y, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
     middle = 0.5 * float(np.nanmax(y) + np.nanmin(y))
     axes.set_ylim(scale.factor * (middle - 1.5 * span), scale.factor * (middle + 1.5 * span))
@@ -382,7 +346,7 @@ def _draw_posterior(axes: Axes, found: Posterior, record: int) -> None:
     r = found.task.experiments[record].record
     low, high, middle = _band(found, "posterior_predictive", record)
     left = measured(r) - middle
-    scale = length_scale(float(np.nanmax(np.abs(left))))
+    scale = phrases.length_scale(float(np.nanmax(np.abs(left))))
     band = f"posterior, {100.0 * HDI:.0f} %"
     axes.plot(r.time, scale.factor * left, color=MEASURED_COLOUR, linewidth=0.8, label="measured")
     axes.fill_between(
@@ -396,7 +360,7 @@ def _draw_posterior(axes: Axes, found: Posterior, record: int) -> None:
 
 def _draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
     """Draw the posterior of a parameter, and its prior."""
-    unit, display = shown_in(found.model, f.name)
+    unit, display = phrases.shown_in(found.model, f.name)
     values, before = (
         np.array([convert(v, unit, display) for v in found.tree[g][f.name].to_numpy().ravel()])
         for g in ("posterior", "prior")
@@ -409,8 +373,8 @@ def _draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
         axes.hist(inside, bins=_BINS // 2, weights=weights, histtype="step", color=BASE_COLOUR)
     for end in (f.low, f.high):
         axes.axvline(convert(end, unit, display), color=NOISE_COLOUR, linestyle="--", linewidth=1.0)
-    title = f"{f.name} = {number(convert(f.mean, unit, display), 4)}"
-    style(axes, title, in_brackets(f.name, display), "")
+    title = f"{f.name} = {phrases.number(convert(f.mean, unit, display), 4)}"
+    style(axes, title, phrases.in_brackets(f.name, display), "")
     axes.set_yticks([])
 
 
@@ -422,7 +386,7 @@ def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[s
     """
     figure = sheet((13.0, 6.2), DPI)
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-    scale = length_scale(float(np.max(np.abs(seen.difference))))
+    scale = phrases.length_scale(float(np.max(np.abs(seen.difference))))
     clock = time_scale(float(seen.time[-1]))
     time = clock.factor * seen.time
     behind = left.twinx()
@@ -436,12 +400,12 @@ def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[s
     draw(left, added_over_time, "What the effect adds, over time")
     left.margins(x=0.01)
     view = seen.telling
-    title = f"{AXES[view.name].title}: explains {percent(view.share)} of it"
+    title = f"{AXES[view.name].title}: explains {phrases.percent(view.share)} of it"
     if view.name == "spectrum":
-        title = f"Spectrum: {percent(view.share)} of it in one peak"
+        title = f"Spectrum: {phrases.percent(view.share)} of it in one peak"
     legend: dict[str, str] | None = None if view.name == "spectrum" else {}
     draw(right, signature_plot(seen), textwrap.fill(title, 48), legend=legend)
-    look = textwrap.fill(f"{plain(effect.name)}: {effect.looks_like}", 120)
+    look = textwrap.fill(f"{phrases.plain(effect.name)}: {effect.looks_like}", 120)
     figure.suptitle(f"{look}\n{size_sentence(seen)}", fontsize=FONT + 1)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI)
@@ -449,9 +413,9 @@ def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[s
 
 def size_sentence(seen: Signature) -> str:
     """Say on what stack the signature is simulated, and how large the effect is."""
-    size = with_unit(number(seen.size), seen.unit)
+    size = phrases.with_unit(phrases.number(seen.size), seen.unit)
     largest = float(np.max(np.abs(seen.difference))) / seen.stroke
     return (
         f"Simulated on the stack {seen.stack} with {seen.gain} = {size}: at most"
-        f" {number(100.0 * largest, 2)} % of the stroke, offset and slope re-fitted."
+        f" {phrases.number(100.0 * largest, 2)} % of the stroke, offset and slope re-fitted."
     )

@@ -14,18 +14,9 @@ from psa_casadi.diagnosis.views import View
 from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.report.plots.panel import BOUND_COLOUR, INK, WEAK_COLOUR, Panel, logarithmic
+from psa_casadi.report.words import phrases
 from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
 from psa_casadi.report.words.misfit_words import AXES
-from psa_casadi.report.words.phrases import (
-    Scale,
-    in_brackets,
-    length_scale,
-    number,
-    percent,
-    plain,
-    prefixed_scale,
-    probability_text,
-)
 from psa_casadi.report.words.series import (
     BASE_COLOUR,
     EXTENDED_COLOUR,
@@ -70,7 +61,7 @@ def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Pan
     rows = order[: None if most is None else max(most, len(causes))][::-1]
     # asinh shows small, large and negative evidence in one picture; the labels give the figures
     values = [float(np.arcsinh(c.evidence / 10.0)) for c in rows]
-    names = [plain(c.effect).replace("independent ", "independent\n") for c in rows]
+    names = [phrases.plain(c.effect).replace("independent ", "independent\n") for c in rows]
     colours = [bar_colour(c, set(causes)) for c in rows]
     plot = Panel("evidence [ln units], compressed", height=110 + 30 * len(rows), showlegend=False)
     plot.bars(values, names, "", colours, hoverinfo="skip")
@@ -91,13 +82,13 @@ def _figure(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
     """Return how sure a named cause is, the probability of others; else the share it explains."""
     named = next((c for c in d.causes if c.effect == candidate.effect), None)
     if named is not None:
-        return f"named, {probability_text(named.confidence)}"
+        return f"named, {phrases.probability_text(named.confidence)}"
     if d.causes:
-        return probability_text(candidate.probability)
+        return phrases.probability_text(candidate.probability)
     share = candidate.explained_share
     if not candidate.fitted and share == 0:
         return "screened"
-    return percent(share) if share >= 0 else "fits worse"
+    return phrases.percent(share) if share >= 0 else "fits worse"
 
 
 def view_named(m: Misfit, name: str) -> View | None:
@@ -108,7 +99,7 @@ def view_named(m: Misfit, name: str) -> View | None:
 
 def view_plot(before: View, after: View | None, *, counts: bool) -> Panel:
     """Binned means of the residual with two standard errors, before and after the extension."""
-    scale = length_scale(float(np.max(np.abs(before.mean))), counts=counts)
+    scale = phrases.length_scale(float(np.max(np.abs(before.mean))), counts=counts)
     rows = [(before, BASE_COLOUR, "base model")]
     rows += [(after, EXTENDED_COLOUR, "extended model")] if after is not None else []
     plot, factor = _view_panel(before, scale, "residual", [v.x for v, _, _ in rows])
@@ -122,7 +113,7 @@ def view_plot(before: View, after: View | None, *, counts: bool) -> Panel:
 
 def spectrum_view_plot(before: Spectrum, after: Spectrum | None, *, counts: bool) -> Panel:
     """Amplitude density of the residual before and after the extension, above the noise's."""
-    scale = length_scale(float(np.max(before.density)), counts=counts)
+    scale = phrases.length_scale(float(np.max(before.density)), counts=counts)
     rows = [(before.density, before.frequency, BASE_COLOUR, "base model", "solid")]
     if after is not None:
         rows.append((after.density, after.frequency, EXTENDED_COLOUR, "extended model", "solid"))
@@ -137,7 +128,7 @@ def spectrum_view_plot(before: Spectrum, after: Spectrum | None, *, counts: bool
 
 def signature_plot(seen: Signature) -> Panel:
     """What an effect adds along its telling coordinate: samples behind their binned means."""
-    view, scale = seen.telling, length_scale(float(np.max(np.abs(seen.difference))))
+    view, scale = seen.telling, phrases.length_scale(float(np.max(np.abs(seen.difference))))
     plot, factor = _view_panel(view, scale, "difference", [view.x])
     mean = scale.factor * view.mean
     look: dict[str, Any] = {"line": {"color": EXTENDED_COLOUR, "width": 1.8}}
@@ -157,7 +148,7 @@ def signature_plot(seen: Signature) -> Panel:
 
 
 def _view_panel(
-    view: View, scale: Scale, what: str, shown: list[FloatArray]
+    view: View, scale: phrases.Scale, what: str, shown: list[FloatArray]
 ) -> tuple[Panel, float]:
     """Return an empty plot of a view, and what its coordinate is multiplied by to be shown."""
     unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
@@ -181,33 +172,34 @@ def patch_plot(d: Diagnosis, patch: Patch) -> tuple[str, Panel]:
     k = max(range(len(patch.added)), key=lambda i: float(np.std(patch.added[i])))
     e, added = d.experiments[k], patch.added[k] - np.mean(patch.added[k])
     counts = e.record.displacement_unit == "counts"
-    scale = length_scale(float(np.max(np.abs(added), initial=1e-12)), counts=counts)
-    x, name, unit = _coordinate(d, patch, k)
-    part = slice(None, None, max(1, len(x) // _SAMPLES))
-    plot = Panel(f"{name} [{unit}]", f"added [{scale.unit}]", 320)
-    if patch.kind in ("curve", "direction", "memory"):
-        return name, plot.marks(x[part], scale.factor * added[part], size=3)
-    return name, plot.line(x[part], scale.factor * added[part], width=1.5)
-
-
-def _coordinate(d: Diagnosis, patch: Patch, k: int) -> tuple[FloatArray, str, str]:
-    record = d.experiments[k].record
+    scale = phrases.length_scale(float(np.max(np.abs(added), initial=1e-12)), counts=counts)
+    curved = patch.kind in ("curve", "direction", "memory")
     if patch.kind == "curve" and patch.port != "drive voltage":
-        size = 1.0 if record.displacement_unit == "counts" else 1e6
-        unit = "counts" if size == 1.0 else "µm"
-        return size * d.extended[k], "predicted displacement", unit
-    if patch.kind in ("curve", "direction", "memory"):
-        return record.voltage, "voltage", "V"
-    return record.time - record.time[0], "time", "s"
+        unit, size = ("counts", 1.0) if counts else ("µm", 1e6)
+        x, name = size * d.extended[k], "predicted displacement"
+    elif curved:
+        x, name, unit = e.record.voltage, "voltage", "V"
+    else:
+        x, name, unit = e.record.time - e.record.time[0], "time", "s"
+    part = slice(None, None, max(1, len(x) // _SAMPLES))
+    plot, shown = (
+        Panel(f"{name} [{unit}]", f"added [{scale.unit}]", 320),
+        scale.factor * added[part],
+    )
+    if curved:
+        return name, plot.marks(x[part], shown, size=3)
+    return name, plot.line(x[part], shown, width=1.5)
 
 
 def free_plot(f: FreeFunction) -> Panel:
     """Plot what a free function of a model's port adds, over the variable that it follows most."""
     part = slice(None, None, max(1, len(f.along) // _SAMPLES))
     x, y = f.along[part], f.added[part]
-    seen = prefixed_scale(float(np.max(np.abs(x), initial=0.0)), f.variable_unit or "1")
-    scale = prefixed_scale(float(np.max(np.abs(y), initial=0.0)), f.unit)
-    plot = Panel(in_brackets(f.variable, seen.unit), in_brackets("added", scale.unit), 320)
+    seen = phrases.prefixed_scale(float(np.max(np.abs(x), initial=0.0)), f.variable_unit or "1")
+    scale = phrases.prefixed_scale(float(np.max(np.abs(y), initial=0.0)), f.unit)
+    plot = Panel(
+        phrases.in_brackets(f.variable, seen.unit), phrases.in_brackets("added", scale.unit), 320
+    )
     return plot.marks(seen.factor * x, scale.factor * y, size=3)
 
 
@@ -243,7 +235,7 @@ def _error_text(grade: Grade) -> str:
         return "fixed"
     if not grade.error <= _LONGEST / 100.0:
         return f"> {_LONGEST:.0f} %"
-    return f"{number(100.0 * grade.error, 2)} %"
+    return f"{phrases.number(100.0 * grade.error, 2)} %"
 
 
 def correlation_plot(found: Identification) -> Panel:

@@ -7,7 +7,6 @@ from html import escape
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -71,8 +70,8 @@ class Panel:
     def __init__(self, x: str = "", y: str = "", height: int = 330, **layout: Any) -> None:
         self.data: list[dict[str, Any]] = []
         axes = {
-            "xaxis": {**_AXIS_LOOK, "title": _title(x)},
-            "yaxis": {**_AXIS_LOOK, "title": _title(y)},
+            f"{which}axis": {**_AXIS_LOOK, "title": {"text": text, "standoff": 8}}
+            for which, text in (("x", x), ("y", y))
         }
         self.layout: dict[str, Any] = {**_LOOK, "height": height, **axes, "shapes": [], **layout}
 
@@ -115,7 +114,7 @@ class Panel:
         """Add lines over the whole width."""
         ends = {"xref": "x domain", "x0": 0, "x1": 1}
         for y in heights:
-            self._shape("line", name, {**ends, "y0": y, "y1": y}, colour, dash, width)
+            self._shape(name, {**ends, "y0": y, "y1": y}, (colour, dash, width))
         return self
 
     def upright(
@@ -124,7 +123,7 @@ class Panel:
         """Add lines over the whole height."""
         ends = {"yref": "y domain", "y0": 0, "y1": 1}
         for x in places:
-            self._shape("line", "", {**ends, "x0": x, "x1": x}, colour, dash, width)
+            self._shape("", {**ends, "x0": x, "x1": x}, (colour, dash, width))
         return self
 
     def bands(self, spans: Iterable[tuple[float, float]], name: str = "") -> "Panel":
@@ -149,11 +148,9 @@ class Panel:
                           "showlegend": bool(name), **more})  # fmt: skip
         return self
 
-    def _shape(
-        self, kind: str, name: str, place: Settings, colour: str, dash: str, width: float
-    ) -> None:
-        look = {"color": colour, "dash": dash, "width": width}
-        self.layout["shapes"].append({"type": kind, "name": name, "line": look, **place})
+    def _shape(self, name: str, place: Settings, look: tuple[str, str, float]) -> None:
+        line = dict(zip(("color", "dash", "width"), look, strict=True))
+        self.layout["shapes"].append({"type": "line", "name": name, "line": line, **place})
 
 
 def stacked(above: Panel, below: Panel, height: int) -> Panel:
@@ -170,10 +167,6 @@ def stacked(above: Panel, below: Panel, height: int) -> Panel:
     both.layout["yaxis2"] = {**below.layout["yaxis"], "domain": [0.0, 0.37]}
     both.layout["xaxis"] = {**below.layout["xaxis"], "anchor": "y2", "mirror": "all"}
     return both
-
-
-def _title(text: str) -> dict[str, Any]:
-    return {"text": text, "standoff": 8}
 
 
 def logarithmic(values: tuple[float, float]) -> dict[str, Any]:
@@ -195,7 +188,11 @@ def plotly_figure(panel: Panel, hold: Callable[[str], Any] = str) -> dict[str, A
 
 def _encoded(value: Any, key: str, hold: Callable[[str], Any]) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        return _array(value, hold)
+        if value.size < _SHORT:
+            return [float(v) if math.isfinite(v) else None for v in value]
+        small = compact(value.astype(np.float64))
+        kept = base64.b64encode(np.ascontiguousarray(small).tobytes()).decode("ascii")
+        return {"dtype": f"f{small.itemsize}", "bdata": hold(kept)}
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -205,14 +202,6 @@ def _encoded(value: Any, key: str, hold: Callable[[str], Any]) -> Any:
     if isinstance(value, str) and key in _WORDS:
         return label(value)
     return float(value) if isinstance(value, np.floating) else value
-
-
-def _array(values: npt.NDArray[Any], hold: Callable[[str], Any]) -> Any:
-    if values.size < _SHORT:
-        return [float(v) if math.isfinite(v) else None for v in values]
-    small = compact(values.astype(np.float64))
-    kept = base64.b64encode(np.ascontiguousarray(small).tobytes()).decode("ascii")
-    return {"dtype": f"f{small.itemsize}", "bdata": hold(kept)}
 
 
 def label(name: str) -> str:

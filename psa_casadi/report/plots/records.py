@@ -3,23 +3,8 @@
 import numpy as np
 
 from psa_casadi.report.plots.panel import INK, Panel, logarithmic, stacked
+from psa_casadi.report.words import series
 from psa_casadi.report.words.phrases import in_brackets
-from psa_casadi.report.words.series import (
-    MEASURED_COLOUR,
-    NOISE_COLOUR,
-    FloatArray,
-    IndexArray,
-    Series,
-    autocorrelation,
-    distribution,
-    kept,
-    noise_density,
-    shown_lines,
-    spans,
-    spectrum,
-    telling_window,
-    white_band,
-)
 
 #: Points of a part of a record, measured samples shown one by one, and of a spectrum.
 _ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
@@ -28,32 +13,32 @@ _FULL = 500
 _FAR = 6.0
 
 
-def samples(s: Series, limit: int) -> IndexArray:
+def samples(s: series.Series, limit: int) -> series.IndexArray:
     """Return the samples of a record that plots over all of it show.
 
     They are the same in all of them: so the page holds each curve once.
     """
-    return kept([s.voltage, s.measured, *(s.residual(c) for c in s.curves)], limit)
+    return series.kept([s.voltage, s.measured, *(s.residual(c) for c in s.curves)], limit)
 
 
-def time_plot(s: Series, origin: str, limit: int) -> Panel:
+def time_plot(s: series.Series, origin: str, limit: int) -> Panel:
     """What was measured over time above the residual over the same time, held-out part shaded."""
     shown = samples(s, limit)
     return stacked(measured_plot(s, origin, shown), residual_plot(s, shown), _FULL)
 
 
-def measured_plot(s: Series, origin: str, shown: slice | IndexArray) -> Panel:
+def measured_plot(s: series.Series, origin: str, shown: slice | series.IndexArray) -> Panel:
     """What was measured over time, and the models."""
     scale, clock = s.scale, s.time_scale
     time = clock.factor * s.time[shown]
     plot = Panel(f"time [{clock.unit}]", s.label)
-    plot.line(time, scale.factor * s.measured[shown], origin, MEASURED_COLOUR, 3.0)
+    plot.line(time, scale.factor * s.measured[shown], origin, series.MEASURED_COLOUR, 3.0)
     for curve in s.curves:
         plot.line(time, scale.factor * curve.values[shown], curve.label, curve.colour)
     return _with_held_out(plot, s)
 
 
-def residual_plot(s: Series, shown: slice | IndexArray) -> Panel:
+def residual_plot(s: series.Series, shown: slice | series.IndexArray) -> Panel:
     """What the models leave over time, with the noise."""
     small, clock = s.residual_scale, s.time_scale
     plot = Panel(f"time [{clock.unit}]", in_brackets("residual", small.unit))
@@ -63,32 +48,32 @@ def residual_plot(s: Series, shown: slice | IndexArray) -> Panel:
     return _with_held_out(_with_noise(plot, s), s)
 
 
-def zoom_plot(s: Series, origin: str, limit: int) -> Panel:
+def zoom_plot(s: series.Series, origin: str, limit: int) -> Panel:
     """What was measured over time in the window where the curves are easiest to tell apart."""
-    window = telling_window(s)
+    window = series.telling_window(s)
     shown = np.arange(len(s.time))[window]
-    shown = shown[kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
+    shown = shown[series.kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
     scale, clock = s.scale, s.time_scale
     time = clock.factor * s.time[shown]
     plot = Panel(f"time [{clock.unit}]", s.label)
-    thin = {"color": NOISE_COLOUR, "width": 0.7}
-    plot.marks(time, scale.factor * s.measured[shown], origin, MEASURED_COLOUR, 4, line=thin)
+    thin = {"color": series.NOISE_COLOUR, "width": 0.7}
+    plot.marks(time, scale.factor * s.measured[shown], origin, series.MEASURED_COLOUR, 4, line=thin)
     for curve in s.curves:
         plot.line(time, scale.factor * curve.values[shown], curve.label, curve.colour, 2.2)
     return plot
 
 
-def loop_plot(s: Series, origin: str, shown: slice | IndexArray) -> Panel:
+def loop_plot(s: series.Series, origin: str, shown: slice | series.IndexArray) -> Panel:
     """What was measured over what drives it, such as displacement over voltage."""
     scale, x = s.scale, s.voltage[shown]
     plot = Panel(s.against, s.label)
-    plot.line(x, scale.factor * s.measured[shown], origin, MEASURED_COLOUR, 3.0)
+    plot.line(x, scale.factor * s.measured[shown], origin, series.MEASURED_COLOUR, 3.0)
     for curve in s.curves:
         plot.line(x, scale.factor * curve.values[shown], curve.label, curve.colour, 1.2)
     return plot
 
 
-def error_loop_plot(s: Series, limit: int) -> Panel:
+def error_loop_plot(s: series.Series, limit: int) -> Panel:
     """Residual over what drives the model: where in the loop the model goes wrong."""
     small, shown = s.residual_scale, samples(s, limit)
     plot = Panel(s.against, in_brackets("residual", small.unit), showlegend=len(s.curves) > 1)
@@ -98,16 +83,16 @@ def error_loop_plot(s: Series, limit: int) -> Panel:
     return _with_noise(plot, s)
 
 
-def spectrum_plot(s: Series, limit: int) -> Panel:
+def spectrum_plot(s: series.Series, limit: int) -> Panel:
     """Amplitude density of every curve's residual, and of white noise of the record's level."""
     small = s.residual_scale
     plot = Panel("frequency [Hz]", f"residual [{small.unit or 1}/√Hz]")
-    floor = small.factor * noise_density(s)
+    floor = small.factor * series.noise_density(s)
     reached, ends = [floor], (0.0, 0.0)
     for curve in s.curves:
-        frequency, density = spectrum(s.time, s.residual(curve))
+        frequency, density = series.spectrum(s.time, s.residual(curve))
         ends = (float(frequency[0]), float(frequency[-1]))
-        shown = shown_lines(frequency, density, min(limit // 2, _SPECTRUM_POINTS))
+        shown = series.shown_lines(frequency, density, min(limit // 2, _SPECTRUM_POINTS))
         values = small.factor * density[shown]
         reached += [float(np.min(values)), float(np.max(values))]
         plot.line(frequency[shown], values, curve.label, curve.colour)
@@ -115,7 +100,7 @@ def spectrum_plot(s: Series, limit: int) -> Panel:
     return plot.axes(logarithmic(ends), logarithmic((min(reached), max(reached))))
 
 
-def autocorrelation_plot(s: Series) -> Panel:
+def autocorrelation_plot(s: series.Series) -> Panel:
     """Autocorrelation of every curve's residual over the lag, and the band of white noise."""
     clock, steps = s.time_scale, np.diff(s.time)
     step = float(np.median(steps))
@@ -124,14 +109,14 @@ def autocorrelation_plot(s: Series) -> Panel:
     plot = Panel(f"lag [{unit}]", "autocorrelation", showlegend=len(s.curves) > 1)
     band = ends = 0.0
     for curve in s.curves:
-        lags, values = autocorrelation(s.residual(curve))
-        band, ends = white_band(s.residual(curve)), float(lags[-1])
+        lags, values = series.autocorrelation(s.residual(curve))
+        band, ends = series.white_band(s.residual(curve)), float(lags[-1])
         plot.line(size * lags.astype(np.float64), values, curve.label, curve.colour, 1.6)
-    zero = {"range": [-1.05, 1.05], "zeroline": True, "zerolinecolor": NOISE_COLOUR}
+    zero = {"range": [-1.05, 1.05], "zeroline": True, "zerolinecolor": series.NOISE_COLOUR}
     return plot.across(-band, band).axes(logarithmic((size, size * ends)), zero)
 
 
-def distribution_plot(s: Series) -> Panel:
+def distribution_plot(s: series.Series) -> Panel:
     """Share of samples over the size of every curve's residual, beside a normal distribution.
 
     Where the others are far off, the axis is that of the last one; their names say how much of
@@ -140,38 +125,34 @@ def distribution_plot(s: Series) -> Panel:
     small = s.residual_scale
     plot = Panel(in_brackets("residual", small.unit), "samples in a bin [%]")
     residuals = [s.residual(c) for c in s.curves]
-    low, high = _readable(residuals)
+    low, high = (np.array([f(r) for r in residuals]) for f in (np.nanmin, np.nanmax))
+    span = float(high[-1] - low[-1])
+    if 0.0 < span * _FAR < float(high.max() - low.min()):
+        low, high = low[-1] - 0.5 * span, high[-1] + 0.5 * span
+    else:
+        low, high = low.min(), high.max()
     for curve, residual in zip(s.curves, residuals, strict=True):
-        d = distribution(residual, low, high)
-        beyond = 100.0 - float(np.sum(d.shares))
+        centres, shares, width = series.distribution(residual, low, high)
+        beyond = 100.0 - float(np.sum(shares))
         said = f" ({beyond:.0f} % outside)" if beyond >= 0.5 else ""
         fill = "tozeroy" if curve is s.curves[-1] else "none"
-        plot.line(
-            small.factor * d.centres, d.shares, f"{curve.label}{said}", curve.colour, fill=fill
-        )
+        plot.line(small.factor * centres, shares, f"{curve.label}{said}", curve.colour, fill=fill)
         plot.data[-1]["line"]["shape"] = "hvh"
     mean, spread = float(np.nanmean(residuals[-1])), float(np.nanstd(residuals[-1]))
     if spread > 0:
         x = np.linspace(low, high, 161)
         normal = np.exp(-0.5 * ((x - mean) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
-        plot.line(small.factor * x, 100.0 * d.width * normal, "normal", INK, dash="dash")
+        plot.line(small.factor * x, 100.0 * width * normal, "normal", INK, dash="dash")
     return plot
 
 
-def _readable(residuals: list[FloatArray]) -> tuple[float, float]:
-    """Return the ends of an axis on which the last residual can be read: all, unless far wider."""
-    low, high = (np.array([f(r) for r in residuals]) for f in (np.nanmin, np.nanmax))
-    span = float(high[-1] - low[-1])
-    if 0.0 < span * _FAR < float(high.max() - low.min()):
-        return float(low[-1] - 0.5 * span), float(high[-1] + 0.5 * span)
-    return float(low.min()), float(high.max())
-
-
-def _with_noise(plot: Panel, s: Series) -> Panel:
+def _with_noise(plot: Panel, s: series.Series) -> Panel:
     edge = 2.0 * s.residual_scale.factor * s.noise
     return plot.across(-edge, edge, name="noise (2 sigma)") if edge > 0.0 else plot
 
 
-def _with_held_out(plot: Panel, s: Series) -> Panel:
+def _with_held_out(plot: Panel, s: series.Series) -> Panel:
     time = s.time_scale.factor * s.time
-    return plot.bands([(time[first], time[last]) for first, last in spans(s.held_out)], "held out")
+    return plot.bands(
+        [(time[first], time[last]) for first, last in series.spans(s.held_out)], "held out"
+    )

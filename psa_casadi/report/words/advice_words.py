@@ -21,12 +21,16 @@ def _quoted(names: Sequence[str]) -> str:
     return ", ".join(f"'{n}'" for n in names)
 
 
-def _change(share: float) -> str:
-    return f"a factor of {share:.2g}" if share > 10.0 else f"{100.0 * share:.0f} %"
+def _branches(missing: Sequence[str]) -> str:
+    if missing:
+        return f"the {' and the '.join(missing)} branches"
+    return "two branches in succession"
 
 
-def _reasons(reasons: Sequence[tuple[str, float]]) -> str:
-    """Return what keeps iterated integrals from converging, of what size each."""
+def _window(
+    name: str, coefficient: str, change: float, reasons: Sequence[tuple[str, float]]
+) -> str:
+    """Say that the linear part moves with its window, and what keeps integrals from converging."""
     words = {
         "truncated": "the window truncates the response, which still moves by {:.1g} of the step"
         " at its end",
@@ -35,13 +39,14 @@ def _reasons(reasons: Sequence[tuple[str, float]]) -> str:
         " response converge only long after the ringing has ended",
         "short": "the window is too short for the higher integrals",
     }
-    return "; ".join(words[code].format(size) for code, size in reasons)
-
-
-def _branches(missing: Sequence[str]) -> str:
-    if missing:
-        return f"the {' and the '.join(missing)} branches"
-    return "two branches in succession"
+    causes = "; ".join(words[code].format(size) for code, size in reasons)
+    by = f"a factor of {change:.2g}" if change > 10.0 else f"{100.0 * change:.0f} %"
+    return (
+        f"The linear part is not to be trusted: without the last tenth of step '{name}',"
+        f" {coefficient} changes by {by}, though it should not depend on where the"
+        f" window ends. Likely cause: {causes}. Use --method prediction-error for these"
+        " records."
+    )
 
 
 _TIP_FOR_STEP = (
@@ -120,12 +125,7 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
     " gamma like these the hysteresis grows without bound, or masses and dampings are out of"
     " proportion), so its loop, lags and masses were set back to ordinary values; use --method"
     " prediction-error.",
-    "window": lambda name, coefficient, change, reasons: (
-        f"The linear part is not to be trusted: without the last tenth of step '{name}',"
-        f" {coefficient} changes by {_change(change)}, though it should not depend on where the"
-        f" window ends. Likely cause: {_reasons(reasons)}. Use --method prediction-error for these"
-        " records."
-    ),
+    "window": _window,
     "signs": lambda names: (
         f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} not larger than zero, which the"
         " paper's eq. (15) demands: the moments did not find a stack's transfer function. A longer,"

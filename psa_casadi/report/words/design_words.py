@@ -1,12 +1,11 @@
 """A designed experiment, mechanism or input in sentences and tables."""
 
 from dataclasses import dataclass
-from typing import TypeGuard
 
 import numpy as np
 
 from psa_casadi.design.experiment.experiment import ASKED, PLAYS, Informative, Separated
-from psa_casadi.design.mechanism.mechanism import MechanismDesign, Reached
+from psa_casadi.design.mechanism.mechanism import MechanismDesign
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import (
@@ -42,73 +41,46 @@ class Titled:
 
 def sentences(design: Separated | Informative, capacitance: float | None) -> tuple[str, ...]:
     """Return what the design promises, and what it asks of the amplifier."""
-    said = chance_sentence(design) if isinstance(design, Separated) else narrower_sentence(design)
-    voltage = voltage_sentence(design, capacitance)
-    return (said, again_sentence(design), voltage) if _unsure(design) else (said, voltage)
+    said = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
+    record = design.record
+    rate = float(np.max(np.abs(np.diff(record.voltage) / np.diff(record.time))))
+    current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
+    voltage = (
+        f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
+        f" {number(design.limits.duration)} s, {number(record.voltage.min())} to"
+        f" {number(record.voltage.max())} V, at most {number(rate)} V/s{current}."
+    )
+    return (*said, voltage)
 
 
-def _unsure(design: Separated | Informative) -> TypeGuard[Separated]:
-    return isinstance(design, Separated) and design.plays != 1
-
-
-def again_sentence(design: Separated) -> str:
-    """Say what would tell where one play of the record is not sure to."""
+def _chances(design: Separated) -> tuple[str, ...]:
+    """Say how surely the record names each effect if it is the cause, and what would be sure."""
+    parts = [f"{plain(n)} with {probability_text(p)}" for n, p in design.chance.items()]
+    usual = [f"{number(design.factor(n), 2)} times what a {n} gives" for n in design.usual_chance]
+    said = (
+        f"It is predicted to name the cause, if that is {listing(parts, 'or')}; the least ln of"
+        f" the Bayes factor between two of them grows by"
+        f" {number(min(p.designed for p in design.pairs))}, {listing(usual)} of the same length"
+        " and amplitude."
+    )
+    if design.plays == 1:
+        return (said,)
     if design.plays is None:
-        return (
+        again = (
             f"No record was found that is predicted to decide with {percent(ASKED)}, not even one"
             f" that is repeated {PLAYS[-1]} times: within these limits the effects look alike."
             " Widen the range of voltages or the band, make the record longer, or lower the"
             " noise of the sensor."
         )
-    return (
-        f"One run may not decide; {design.plays} runs, each from rest and recorded on its"
-        f" own, are predicted to name the cause with {percent(ASKED)} or more."
-    )
+    else:
+        again = (
+            f"One run may not decide; {design.plays} runs, each from rest and recorded on its"
+            f" own, are predicted to name the cause with {percent(ASKED)} or more."
+        )
+    return said, again
 
 
-def design_tables(design: Separated | Informative, model: Model) -> tuple[Titled, ...]:
-    """Return the figures behind the sentences."""
-    if isinstance(design, Informative):
-        note = "The model's values are taken as true; the sensor's offset and the start are free."
-        return (Titled("Predicted intervals", interval_table(design, model), note),)
-    note = (
-        "Each other effect is fitted again, as far as the data at hand let it; the true one is"
-        " taken a standard error weaker than it was fitted."
-    )
-    growth = Titled("Growth of ln of the Bayes factor", pair_table(design), note)
-    return growth, Titled("Probability of being named", chance_table(design))
-
-
-def voltage_sentence(design: Separated | Informative, capacitance: float | None) -> str:
-    """Say what the voltage is, and how much it asks of the amplifier."""
-    record = design.record
-    rate = float(np.max(np.abs(np.diff(record.voltage) / np.diff(record.time))))
-    current = ""
-    if capacitance:
-        current = f", {number(1e3 * capacitance * rate)} mA into the stack"
-    return (
-        f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
-        f" {number(design.limits.duration)} s, {number(record.voltage.min())} to"
-        f" {number(record.voltage.max())} V, at most {number(rate)} V/s{current}."
-    )
-
-
-def chance_sentence(design: Separated) -> str:
-    """Say how surely the record names each of the effects, if it is the cause."""
-    parts = [f"{plain(n)} with {probability_text(p)}" for n, p in design.chance.items()]
-    return (
-        f"It is predicted to name the cause, if that is {listing(parts, 'or')}; the least ln of"
-        f" the Bayes factor between two of them grows by"
-        f" {number(min(p.designed for p in design.pairs))}, {_factors(design)}."
-    )
-
-
-def _factors(design: Separated) -> str:
-    usual = [f"{number(design.factor(n), 2)} times what a {n} gives" for n in design.usual_chance]
-    return f"{listing(usual)} of the same length and amplitude"
-
-
-def narrower_sentence(design: Informative) -> str:
+def _narrower(design: Informative) -> str:
     """Say by how much the intervals are narrower than with the usual voltages."""
     parts = [f"{number(f, 2)} times narrower than with a {n}" for n, f in design.factor.items()]
     kinds = {"D": "volume", "A": "mean square", "E": "worst direction"}
@@ -118,37 +90,41 @@ def narrower_sentence(design: Informative) -> str:
     )
 
 
-def pair_table(design: Separated) -> Table:
-    """Return the growth of ln of the Bayes factor for every truth and other effect."""
+def design_tables(design: Separated | Informative, model: Model) -> tuple[Titled, ...]:
+    """Return the figures behind the sentences."""
+    if isinstance(design, Informative):
+        note = "The model's values are taken as true; the sensor's offset and the start are free."
+        return (Titled("Predicted intervals", _intervals(design, model), note),)
     usual = list(design.usual_chance)
-    rows = [
+    pairs = [
         (plain(p.truth), plain(p.other), number(p.designed), *(number(p.usual[n]) for n in usual))
         for p in design.pairs
     ]
-    head = ("if it is", "over", "designed [ln]", *(f"{n} [ln]" for n in usual))
-    return Table(head, tuple(rows))
-
-
-def chance_table(design: Separated) -> Table:
-    """Return the probability of being named for every effect, with each voltage."""
-    usual = list(design.usual_chance)
-    rows = [
-        (plain(n), probability_text(p), *(probability_text(design.usual_chance[u][n])
-                                          for u in usual))
+    chances = [
+        (plain(n), *map(probability_text, (p, *(design.usual_chance[u][n] for u in usual))))
         for n, p in design.chance.items()
-    ]  # fmt: skip
-    return Table(("if it is", "named after designed", *(f"after {u}" for u in usual)), tuple(rows))
+    ]
+    head = ("if it is", "over", "designed [ln]", *(f"{n} [ln]" for n in usual))
+    named = ("if it is", "named after designed", *(f"after {u}" for u in usual))
+    note = (
+        "Each other effect is fitted again, as far as the data at hand let it; the true one is"
+        " taken a standard error weaker than it was fitted."
+    )
+    return (
+        Titled("Growth of ln of the Bayes factor", Table(head, tuple(pairs)), note),
+        Titled("Probability of being named", Table(named, tuple(chances))),
+    )
 
 
-def interval_table(design: Informative, model: Model) -> Table:
+def _intervals(design: Informative, model: Model) -> Table:
     """Return the predicted 95 % interval of every chosen parameter, before and after."""
     rows = []
     for name, after in design.intervals.items():
         unit, display = shown_in(model, name)
-        cells = []
-        for low, high in (design.before[name], after):
-            ends = (convert(v, unit, display) for v in (low, high))
-            cells.append(interval_text(*ends))
+        cells = (
+            interval_text(*(convert(v, unit, display) for v in ends))
+            for ends in (design.before[name], after)
+        )
         value = number(convert(model.values[name], unit, display), 4)
         half = 0.5 * (after[1] - after[0]) / max(abs(model.values[name]), 1e-300)
         rows.append((name, value, display, *cells, percent(half) if half < 10 else "open"))
@@ -164,21 +140,17 @@ def mechanism_table(d: MechanismDesign) -> Table:
         ("damping", "-", number(m.damping, 4), "N.s/m"),
         ("stiffness", "-", number(1e-6 * m.stiffness, 4), "N/um"),
     ]
-    free, reached = _figures(d.free), _figures(d.reached)
-    for (name, before, unit), (_, after, _) in zip(free, reached, strict=True):
-        rows.append((name, number(before, 4), number(after, 4), unit))
+    for name, figure, factor, unit in (
+        ("least damping ratio of the mechanics", "damping", 1.0, "1"),
+        ("bandwidth of the mechanics", "bandwidth", 1.0, "Hz"),
+        ("bandwidth with lag and amplifier", "whole_bandwidth", 1.0, "Hz"),
+        ("stroke loss", "stroke_loss", 100.0, "%"),
+        ("overshoot in a step of rated voltage", "overshoot", 100.0, "%"),
+        ("peak force in the mechanism in that step", "peak_force", 1.0, "N"),
+    ):
+        free, reached = (number(factor * getattr(r, figure), 4) for r in (d.free, d.reached))
+        rows.append((name, free, reached, unit))
     return Table(("", "free stack", "with the mechanism", "unit"), tuple(rows))
-
-
-def _figures(r: Reached) -> tuple[tuple[str, float, str], ...]:
-    return (
-        ("least damping ratio of the mechanics", r.damping, "1"),
-        ("bandwidth of the mechanics", r.bandwidth, "Hz"),
-        ("bandwidth with lag and amplifier", r.whole_bandwidth, "Hz"),
-        ("stroke loss", 100.0 * r.stroke_loss, "%"),
-        ("overshoot in a step of rated voltage", 100.0 * r.overshoot, "%"),
-        ("peak force in the mechanism in that step", r.peak_force, "N"),
-    )
 
 
 def pole_table(d: MechanismDesign) -> Table:
@@ -208,12 +180,11 @@ def mechanism_sentences(d: MechanismDesign) -> tuple[str, ...]:
         at = f"; the design stands at its limit of {' and '.join(d.binding)}" if d.binding else ""
         first = f"Wanted {wanted}: out of reach{at}. This comes as near as it can."
     corner = -d.lag_pole / (2.0 * np.pi)
-    slower = corner < d.reached.bandwidth
     lag = (
         f"The lag's pole at {number(d.lag_pole, 4)} rad/s ({number(corner, 4)} Hz) stands outside"
         " the loop: no mechanism moves it."
     )
-    if slower:
+    if corner < d.reached.bandwidth:
         lag += " It is slower than the mechanics, so that it sets the bandwidth of the whole."
     sentences = [first, lag]
     if d.acts_on == "tip":

@@ -66,16 +66,16 @@ def determined(model: Model, found: Identification | None = None) -> frozenset[s
     if found is not None:
         known = {g.name for g in grades(found) if g.degree in ("determined", "weak")}
         return frozenset(known | set(found.read_off))
-    return frozenset(n for n in model.provenance.intervals if _is_narrow(model, n))
-
-
-def _is_narrow(model: Model, name: str) -> bool:
-    interval, parameter = model.provenance.intervals[name], model.parameter(name)
-    if parameter.log:
-        width = math.log(interval.high / interval.low) if interval.low > 0.0 else math.inf
-    else:
-        width = (interval.high - interval.low) / (parameter.typical(model.values) or math.inf)
-    return width <= 2.0 * _NORMAL_95 * DETERMINED_WIDTH
+    narrow = set()
+    for name, interval in model.provenance.intervals.items():
+        parameter = model.parameter(name)
+        if parameter.log:
+            width = math.log(interval.high / interval.low) if interval.low > 0.0 else math.inf
+        else:
+            width = (interval.high - interval.low) / (parameter.typical(model.values) or math.inf)
+        if width <= 2.0 * _NORMAL_95 * DETERMINED_WIDTH:
+            narrow.add(name)
+    return frozenset(narrow)
 
 
 def named(graded: tuple[Grade, ...], degree: Degree) -> list[str]:
@@ -158,7 +158,17 @@ def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
 
 def residual_sentence(f: "ResidualFigures", model: str, time: Scale) -> str:
     """Say whether the residual of a model is white and normal, with the figures behind it."""
-    return f"{whiteness_sentence(f, model, time)} {_normality(f)}"
+    figures = f"skewness {_signed(f.skewness)}, excess kurtosis {_signed(f.kurtosis)}"
+    tail = f"{number(100.0 * f.beyond_three, 2)} % of the samples lie beyond three standard"
+    tail += " deviations, 0.27 % in a normal distribution"
+    words = []
+    if abs(f.skewness) > _SHAPE:
+        words.append("longer upwards" if f.skewness > 0 else "longer downwards")
+    if abs(f.kurtosis) > _SHAPE:
+        words.append("heavier in its tails" if f.kurtosis > 0 else "lighter in its tails")
+    normal = f"{listing(words)} than a normal one" if words else "close to normal"
+    white = whiteness_sentence(f, model, time)
+    return f"{white} Its distribution is {normal} ({figures}; {tail})."
 
 
 def whiteness_sentence(f: "ResidualFigures", model: str, time: Scale) -> str:
@@ -171,20 +181,6 @@ def whiteness_sentence(f: "ResidualFigures", model: str, time: Scale) -> str:
         f" {_signed(f.neighbours)}, the autocorrelation first falls to that of noise after"
         f" {time.text(f.lasting, 2)}, and {share}."
     )
-
-
-def _normality(f: "ResidualFigures") -> str:
-    figures = f"skewness {_signed(f.skewness)}, excess kurtosis {_signed(f.kurtosis)}"
-    tail = f"{number(100.0 * f.beyond_three, 2)} % of the samples lie beyond three standard"
-    tail += " deviations, 0.27 % in a normal distribution"
-    words = []
-    if abs(f.skewness) > _SHAPE:
-        words.append("longer upwards" if f.skewness > 0 else "longer downwards")
-    if abs(f.kurtosis) > _SHAPE:
-        words.append("heavier in its tails" if f.kurtosis > 0 else "lighter in its tails")
-    if not words:
-        return f"Its distribution is close to normal ({figures}; {tail})."
-    return f"Its distribution is {listing(words)} than a normal one ({figures}; {tail})."
 
 
 def _signed(value: float) -> str:

@@ -53,67 +53,6 @@ AXES: Mapping[str, AxisWords] = {
 }
 
 
-def _size(
-    record: str,
-    rms: Quantity,
-    noise: Quantity,
-    ratio: float | None,
-    source: str,
-    excess: float,
-    mean: Quantity | None,
-) -> str:
-    said = f"The residual of {record} is {quantity(*rms)} rms, "
-    if ratio is None:
-        said += "without any noise"
-    else:
-        times = "as large as" if 0.95 < ratio < 1.05 else f"{quantity(ratio)} times"
-        said += f"{times} the noise of {quantity(*noise)} (from {source})"
-    said += f": {100.0 * excess:.0f} % of its power is above the noise." if excess > 0 else "."
-    return said if mean is None else f"{said} Its mean, {signed(*mean)}, is left out."
-
-
-def _follows(axis: str, ends: Sequence[tuple[Quantity, Quantity]], share: float) -> str:
-    seen = " and ".join(f"{signed(*value)} at {quantity(*at)}" for value, at in ends)
-    return f"The residual follows {AXES[axis].noun}{f': {seen}' if seen else ''}"
-
-
-def _holds(count: int, moves: Quantity | None, share: float) -> str:
-    after = "a hold" if count == 1 else f"{count} holds"
-    per_decade = (
-        "without a trend in the logarithm of time"
-        if moves is None
-        else f"by {signed(*moves)} per decade of time, counted in the direction of the voltage's"
-        " last change"
-    )
-    return f"In {after} the residual moves {per_decade}"
-
-
-def _lines(lines: Sequence[tuple[float, str, Quantity]], count: int, share: float) -> str:
-    said = ", ".join(
-        f"{frequency:.4g} Hz{f' ({name})' if name else ''} with {quantity(*amplitude)}"
-        for frequency, name, amplitude in lines
-    )
-    word = "a line" if count == 1 else "lines"
-    return f"The residual has {word} whatever the drive does: {said} of amplitude"
-
-
-def _harmonics(
-    periods: int, excited: int, parts: Sequence[tuple[str, float, Quantity]], rest: float
-) -> str:
-    if not parts:
-        return f"Nothing in the residual repeats over {periods} periods of the drive."
-    place = "the excited lines" if excited > 1 else "harmonic 1"
-    names = {"linear": f"linear misfit at {place}"}
-    said = ", ".join(
-        f"{100.0 * share:.0f} % {names.get(part, f'{part} nonlinearity')} ({quantity(*rms)} rms)"
-        for part, share, rms in parts
-    )
-    return (
-        f"Over {periods} periods of the drive the residual's power is {said}, and"
-        f" {100.0 * rest:.0f} % does not repeat."
-    )
-
-
 def weight(m: Misfit) -> float:
     """Return the excess over the noise, by which records are compared."""
     return m.excess * (m.rms / m.floor.level if m.floor.level > 0 else 1.0)
@@ -126,12 +65,56 @@ def strongest(misfits: Sequence[Misfit]) -> Note | None:
 
 
 MISFIT: Mapping[str, Callable[..., str]] = {
-    "residual": _size,
-    "follows": _follows,
-    "holds": _holds,
-    "lines": _lines,
-    "harmonics": _harmonics,
+    "residual": lambda record, rms, noise, ratio, source, excess, mean: (
+        f"The residual of {record} is {quantity(*rms)} rms, {_over_noise(ratio, noise, source)}"
+        f"{f': {100.0 * excess:.0f} % of its power is above the noise' if excess > 0 else ''}."
+        f"{'' if mean is None else f' Its mean, {signed(*mean)}, is left out.'}"
+    ),
+    "follows": lambda axis, ends, share: (
+        f"The residual follows {AXES[axis].noun}{': ' if ends else ''}"
+        + " and ".join(f"{signed(*value)} at {quantity(*at)}" for value, at in ends)
+    ),
+    "holds": lambda count, moves, share: (
+        f"In {'a hold' if count == 1 else f'{count} holds'} the residual moves "
+        + (
+            "without a trend in the logarithm of time"
+            if moves is None
+            else f"by {signed(*moves)} per decade of time, counted in the direction of the"
+            " voltage's last change"
+        )
+    ),
+    "lines": lambda lines, count, share: (
+        f"The residual has {'a line' if count == 1 else 'lines'} whatever the drive does: "
+        + ", ".join(
+            f"{frequency:.4g} Hz{f' ({name})' if name else ''} with {quantity(*amplitude)}"
+            for frequency, name, amplitude in lines
+        )
+        + " of amplitude"
+    ),
+    "harmonics": lambda periods, excited, parts, rest: (
+        f"Over {periods} periods of the drive the residual's power is "
+        + ", ".join(
+            f"{100.0 * share:.0f} % {_part(part, excited)} ({quantity(*rms)} rms)"
+            for part, share, rms in parts
+        )
+        + f", and {100.0 * rest:.0f} % does not repeat."
+        if parts
+        else f"Nothing in the residual repeats over {periods} periods of the drive."
+    ),
 }
+
+
+def _over_noise(ratio: float | None, noise: Quantity, source: str) -> str:
+    if ratio is None:
+        return "without any noise"
+    times = "as large as" if 0.95 < ratio < 1.05 else f"{quantity(ratio)} times"
+    return f"{times} the noise of {quantity(*noise)} (from {source})"
+
+
+def _part(part: str, excited: int) -> str:
+    if part != "linear":
+        return f"{part} nonlinearity"
+    return f"linear misfit at {'the excited lines' if excited > 1 else 'harmonic 1'}"
 
 
 def _view_explains(share: float) -> str:

@@ -8,7 +8,7 @@ from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
 from psa_casadi.report.words.own_words import OWN_MODELS
-from psa_casadi.report.words.phrases import quantity, raised, with_unit
+from psa_casadi.report.words.phrases import are, listing, quantity, raised, with_unit
 
 Probable = Sequence[tuple[str, float]]
 
@@ -50,34 +50,6 @@ def correction(kind: str, port: str) -> str:
     return CORRECTIONS.get(kind) or CORRECTIONS.get(f"{kind} at {port}", kind)
 
 
-def _structure(seen: str, output: str, excess: float) -> str:
-    of = f"Of {output}: in" if output else "In"
-    return (
-        f"{of} the residual {_SEEN[seen]}. {100.0 * excess:.0f} % of its power is above the noise."
-    )
-
-
-def _noise(
-    record: str,
-    level: tuple[float, str],
-    how: Note,
-    samples: int,
-    coloured: bool,
-    quantum: tuple[float, str] | None,
-    rounding: tuple[float, str],
-) -> str:
-    colour = "correlated from sample to sample" if coloured else "white"
-    said = (
-        f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples), and {colour}."
-    )
-    if quantum is None:
-        return said
-    return (
-        f"{said} The sensor counts in steps of {quantity(*quantum)}, which alone give"
-        f" {quantity(*rounding)} rms."
-    )
-
-
 def _withdrawn(names: Sequence[str], evidence: float, share: float, kept: bool, why: Note) -> str:
     remove = "would remove"
     if kept:
@@ -91,46 +63,24 @@ def _withdrawn(names: Sequence[str], evidence: float, share: float, kept: bool, 
     )
 
 
-def _better_unnamed(each: Sequence[tuple[str, str, str, bool]]) -> str:
-    better = "; ".join(
-        f"{correction(kind, port)}, {'freer in form than' if freer else 'instead of'} {name}"
-        for kind, port, name, freer in each
-    )
-    return f"beside the model without it, an unnamed correction explains more ({better})"
-
-
-def _beaten(by: str, port: str, evidence: float, share: float) -> str:
-    return (
-        f"an unnamed correction explains more: {correction(by, port)}, with {evidence:.0f} and"
-        f" {100 * share:.0f} %"
-    )
-
-
-def _lacking(what: Sequence[str]) -> str:
-    *before, last = (_LACKING[w] for w in what)
-    joined = f"{'; '.join(before)}; and {last}" if before else last
-    return f"Record what these records lack: {joined}."
-
-
 def _before(then: Probable) -> str:
     return ", ".join(f"{name} {100 * p:.0f} %" for name, p in then)
 
 
-def _rules_out(
-    column: str, places: Sequence[str], effects: Sequence[str], now: Sequence[str], before: Probable
-) -> str:
-    ruled = [PLACES[p] for p in places] or effects
-    verb = "is" if len(ruled) == 1 else "are"
+def _steps(quantum: tuple[float, str], rounding: tuple[float, str]) -> str:
     return (
-        f"With {column} {' and '.join(ruled)} {verb} ruled out: what is left is"
-        f" {' or '.join(now)} (without it: {_before(before)})."
+        f" The sensor counts in steps of {quantity(*quantum)}, which alone give"
+        f" {quantity(*rounding)} rms."
     )
 
 
 DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
     # what remains
     "noise_only": "What remains cannot be distinguished from noise.",
-    "structure": _structure,
+    "structure": lambda seen, output, excess: (
+        f"{f'Of {output}: in' if output else 'In'} the residual {_SEEN[seen]}."
+        f" {100.0 * excess:.0f} % of its power is above the noise."
+    ),
     "held_out_error": (
         "The held-out samples' error is {factor:.2f} times what the fitted ones let expect:"
         " something matters there that these do not show."
@@ -149,7 +99,11 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " is driven by the curve, and a simulation of such a record needs more samples for each"
         " period."
     ),
-    "noise": _noise,
+    "noise": lambda record, level, how, samples, coloured, quantum, rounding: (
+        f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples), and"
+        f" {'correlated from sample to sample' if coloured else 'white'}."
+        f"{_steps(quantum, rounding) if quantum is not None else ''}"
+    ),
     "noise_fast": "from the fast part of what the model leaves",
     "noise_repeats": "from what differs when the same voltage returns after {apart}",
     "noise_holds": lambda count: (
@@ -210,8 +164,18 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
     ),
     "withdrawn": _withdrawn,
     "vague": "{names}: in the extended model and not named: {why}.",
-    "better_unnamed": _better_unnamed,
-    "beaten": _beaten,
+    "better_unnamed": lambda each: (
+        "beside the model without it, an unnamed correction explains more ("
+        + "; ".join(
+            f"{correction(kind, port)}, {'freer in form than' if freer else 'instead of'} {name}"
+            for kind, port, name, freer in each
+        )
+        + ")"
+    ),
+    "beaten": lambda by, port, evidence, share: (
+        f"an unnamed correction explains more: {correction(by, port)}, with {evidence:.0f} and"
+        f" {100 * share:.0f} %"
+    ),
     "little": "that is less than {least:.0p} % and much remains",
     "correction": correction,
     "blind_spot": (
@@ -238,14 +202,19 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
     "column_clears": lambda column, before: (
         f"With {column} nothing is named; without it {_before(before)}."
     ),
-    "column_rules_out": _rules_out,
+    "column_rules_out": lambda column, places, effects, now, before: (
+        f"With {column} {are([PLACES[p] for p in places] or effects, ' and ')} ruled out: what is"
+        f" left is {' or '.join(now)} (without it: {_before(before)})."
+    ),
     # what to do next
     "record_again": (
         "Correct the record, or record again, so that what the verdict says of it no longer holds."
     ),
     "correct_columns": "Correct the record as the notes say, and diagnose it again.",
     "no_next": "None is needed for this verdict.",
-    "lacking": _lacking,
+    "lacking": lambda what: (
+        f"Record what these records lack: {listing([_LACKING[w] for w in what], '; and', ';')}."
+    ),
     "other_conditions": (
         "These records hold what usually separates causes: a hold, several rates and amplitudes,"
         " repeats. Record the same voltage with another load, mean voltage or sensor, or a further"

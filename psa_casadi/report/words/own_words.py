@@ -10,11 +10,12 @@ from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note
+from psa_casadi.report.words import verdict_words
 from psa_casadi.report.words.phrases import (
     added,
     either,
     in_brackets,
+    labelled,
     listing,
     number,
     percent,
@@ -25,14 +26,6 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, FloatArray, Series
 from psa_casadi.report.words.tables import Table
-from psa_casadi.report.words.verdict_words import (
-    VERDICTS,
-    cause_size,
-    named_cause,
-    naming_sentence,
-    share_row,
-    within,
-)
 
 #: Outputs that a sentence names one by one.
 _NAMED = 4
@@ -43,71 +36,70 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
     if d.verdict == "adequate":
         return f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}."
     if d.verdict == "unexplained" or not d.causes:
-        free = d.correction
-        words = ""
+        free, words = d.correction, ""
         if free is not None:
-            share = percent(within(free.share))
             words = (
-                f"a free function of {free.of} in {free.port} would remove {share} of the error"
-                " above the noise; "
+                f"a free function of {free.of} in {free.port} would remove"
+                f" {percent(verdict_words.within(free.share))} of the error above the noise; "
             )
         return (
             "Something is missing, and no effect in the table explains it: no cause is named;"
             f" {words}{_base_errors(d)}."
         )
-    named = [named_cause(c, c.port) for c in d.causes]
-    return naming_sentence(d, named)
+    named = [verdict_words.named_cause(c, c.port) for c in d.causes]
+    return verdict_words.naming_sentence(d, named)
 
 
 def _base_errors(d: OdeDiagnosis) -> str:
-    spans = _spans(d)
-    each = [f"{number(100.0 * e.base / spans[e.output], 2)} %" for e in d.errors]
+    """Say the base model's error in every output, over its range in all records."""
+    whole = np.vstack([r.outputs for r in d.runs])
+    spans = np.nanmax(whole, axis=0) - np.nanmin(whole, axis=0)
+    ranges = dict(zip(d.model.output_names, map(float, spans), strict=True))
+    shares = {e.output: 100.0 * e.base / ranges[e.output] for e in d.errors}
+    each = [f"{number(share, 2)} %" for share in shares.values()]
     if len(each) == 1:
         return f"the base model's held-out error is {each[0]} of the range"
     if len(each) > _NAMED:
-        shares = [100.0 * e.base / spans[e.output] for e in d.errors]
-        low, high = number(min(shares), 2), number(max(shares), 2)
+        low, high = (number(f(shares.values()), 2) for f in (min, max))
         return f"the base model's held-out errors are {low} to {high} % of the ranges"
-    pairs = [f"{share} of {e.output}" for e, share in zip(d.errors, each, strict=True)]
+    pairs = [f"{share} of {output}" for output, share in zip(shares, each, strict=True)]
     return f"the base model's held-out errors are {listing(pairs)}, over their ranges"
-
-
-def _spans(d: OdeDiagnosis) -> dict[str, float]:
-    """Return the range of every output over all records."""
-    whole = np.vstack([r.outputs for r in d.runs])
-    spans = np.nanmax(whole, axis=0) - np.nanmin(whole, axis=0)
-    return dict(zip(d.model.output_names, map(float, spans), strict=True))
 
 
 def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
     """Return the lines of a terminal's story: a label and what is told."""
-    lines = [("verdict", f"{VERDICTS[d.verdict]}. {own_verdict_sentence(d)}")]
+    lines = [("verdict", f"{verdict_words.VERDICTS[d.verdict]}. {own_verdict_sentence(d)}")]
     lines += [("records", listing([f"{r.name} ({len(r.time)} samples)" for r in d.runs]))]
     for e in d.errors:
         shown = [with_its_unit(v, e.unit) for v in (e.base, e.extended, e.noise)]
         extended = f", {shown[1]} of the extended model" if added(d) else ""
         text = f"{e.output}: held-out rms {shown[0]} of the base{extended}; noise {shown[2]}"
         lines.append(("error", text))
-    for c in d.causes:
+    for c, share in zip(d.causes, d.budget.causes, strict=True):
         told = f"{plain(c.effect)} ({c.port}, confidence {percent(c.confidence)})"
-        lines.append(("cause", f"{told}: {cause_size(d, c)}"))
+        removes = f"it removes {share.text} of the held-out error above the noise"
+        lines.append(("cause", f"{told}: {verdict_words.cause_size(d, c)}; {removes}"))
         if c.cannot_be_told_from:
             rivals = either(c.cannot_be_told_from)
             lines.append(("rivals", f"these data cannot distinguish it from {rivals}"))
-    return [*lines, ("remains", rest_sentence(d)), *(("note", n) for n in d.notes)]
+    lines += [("moved", m) for m in d.moved]
+    rest = [("note", n) for n in (*d.notes, d.unnamed) if n]
+    return [*lines, ("remains", rest_sentence(d)), *rest]
 
 
 def own_budget_table(d: OdeDiagnosis) -> Table:
     """Return the shares of the base model's held-out error above the noise, with intervals."""
     b = d.budget
-    rows = [share_row(plain(s.what), s) for s in b.causes]
+    rows = [verdict_words.share_row(plain(s.what), s) for s in b.causes]
     if len(rows) > 1:
-        rows.append(share_row("all causes together", b.together))
+        rows.append(verdict_words.share_row("all causes together", b.together))
     if b.unnamed is not None:
-        rows.append(share_row(f"unnamed: a free function of {b.unnamed.what}", b.unnamed))
+        rows.append(
+            verdict_words.share_row(f"unnamed: a free function of {b.unnamed.what}", b.unnamed)
+        )
     low, high = b.together.interval
     left = Share("left", 1.0 - b.together.share, (1.0 - high, 1.0 - low))
-    rows.append(share_row("remains above the noise", left))
+    rows.append(verdict_words.share_row("remains above the noise", left))
     return Table(("what", "removes", "95 % interval"), tuple(rows))
 
 
@@ -121,7 +113,7 @@ def own_record_table(d: OdeDiagnosis, series: Sequence[Series]) -> Table:
     """Return the same of every record; rms over its used samples where none is held out."""
     rows = []
     for s in series:
-        rms = [_judged_rms(s, s.residual(c)) for c in s.curves]
+        rms = [s.judged_rms(c) for c in s.curves]
         rows.append(_errors(s.name, s.unit, s.noise, rms[0], rms[-1], d))
     return _error_table("record", rows, d)
 
@@ -139,11 +131,6 @@ def _error_table(what: str, rows: Sequence[tuple[str, ...]], d: OdeDiagnosis) ->
     head = (what, "unit", "noise rms", "base, held-out rms")
     more = ("extended, held-out rms", "falls by") if d.causes else ()
     return Table((*head, *more), tuple(rows))
-
-
-def _judged_rms(s: Series, residual: FloatArray) -> float:
-    counted = s.held_out if s.held_out.any() else np.isfinite(residual)
-    return float(np.sqrt(np.nanmean(residual[counted] ** 2)))
 
 
 def own_fit_table(found: OdeIdentification, series: Sequence[Series]) -> Table:
@@ -231,45 +218,6 @@ def _series(
             )
 
 
-_VERDICTS = {
-    "adequate": "what the model leaves cannot be distinguished from noise",
-    "cause_named": "{} named, and nothing else is left",
-    "partly_explained": "{} named, and more is left",
-    "ambiguous": "a cause is found that these records cannot tell from others",
-    "unexplained": "something is missing that no effect of the table explains",
-}
-
-
-def _diagnosis(d: OdeDiagnosis) -> str:
-    """Return the verdict, the causes with their sizes, the errors and what remains, in lines."""
-    several = len(d.causes) > 1
-    named = f"{len(d.causes)} causes are" if several else "a cause is"
-    lines = [f"{d.verdict}: {_VERDICTS[d.verdict].format(named)}"]
-    for c, removed in zip(d.causes, d.budget.causes, strict=True):
-        lines.append(
-            f"  {c.effect} ({c.confidence:.0%} sure), {c.description}; it removes"
-            f" {removed.text} of the held-out error above the noise"
-        )
-        lines += [
-            f"    {n} = {with_unit(_estimate(e.value, *e.interval), e.unit)}"
-            for n, e in c.parameters.items()
-        ]
-        if c.cannot_be_told_from:
-            lines.append(f"    may as well be {', '.join(c.cannot_be_told_from)}")
-    if several:
-        lines.append(f"  together they remove {d.budget.together.text} of it")
-    for o in d.errors:
-        base, extended, noise = (
-            with_unit(f"{v:.3g}", o.unit) for v in (o.base, o.extended, o.noise)
-        )
-        lines.append(
-            f"  {o.output}: held-out rms {base} of the base, {extended} of the extended model,"
-            f" noise {noise}"
-        )
-    rest = (*d.moved, d.remaining.where, *d.notes, d.unnamed)
-    return "\n".join([*lines, *(f"  {line}" for line in rest if line)])
-
-
 def _identification(found: OdeIdentification) -> str:
     """Return the parameters with their standard errors, and what is left of the outputs."""
     model = found.model
@@ -282,13 +230,6 @@ def _identification(found: OdeIdentification) -> str:
     return "\n".join([f"identified '{model.name}':", *rows, *left, *said])
 
 
-def _moved(
-    name: str, estimate: tuple[float, float, float], without: float, unit: str, causes: int
-) -> str:
-    value = with_unit(_estimate(*estimate), unit)
-    return f"{name} = {value}, without the cause{'s' * (causes > 1)} {without:.4g}"
-
-
 def _estimate(value: float, low: float, high: float) -> str:
     """Return a value with its interval, in as many digits as tell them apart, four at least."""
     half = max(high - value, value - low)
@@ -298,18 +239,13 @@ def _estimate(value: float, low: float, high: float) -> str:
     return f"{value:.{digits}g} ({low:.{digits}g} to {high:.{digits}g})"
 
 
-def _withdrawn(names: Sequence[str], share: float, output: str, why: Note) -> str:
-    of = f" of {output}" if output else ""
-    return (
-        f"{' and '.join(names)} would remove {share:.0%} of the held-out error above the noise{of};"
-        f" not named, because {why}."
-    )
-
-
 OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
-    "own_diagnosis": _diagnosis,
+    "own_diagnosis": lambda d: labelled(own_lines(d), 100),
     "own_identification": _identification,
-    "moved": _moved,
+    "moved": lambda name, estimate, without, unit, causes: (
+        f"{name} = {with_unit(_estimate(*estimate), unit)}, without the cause{'s' * (causes > 1)}"
+        f" {without:.4g}"
+    ),
     # the records
     "stairs": (
         "The input '{input}' stands still between jumps in {records}, and each jump is read as a"
@@ -348,7 +284,10 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         "A free function of {of} in {port} would remove {share:.0%} of what is left above the"
         " noise."
     ),
-    "own_withdrawn": _withdrawn,
+    "own_withdrawn": lambda names, share, output, why: (
+        f"{' and '.join(names)} would remove {share:.0%} of the held-out error above the noise"
+        f"{f' of {output}' if output else ''}; not named, because {why}."
+    ),
     "free_beats": "a free function of {of} in {port} explains more ({share:.0%})",
     "own_little": "that is less than {least:.0%} and much remains",
     "slight": (

@@ -1,6 +1,7 @@
 """Numbers and findings in words: the sentences that every report shares."""
 
 import math
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -131,6 +132,26 @@ def signed(value: float, unit: str) -> str:
     return f"{'+' if value > 0 else ''}{quantity(value, unit)}"
 
 
+#: Width of the labels of a terminal's lines.
+_LABEL = 10
+
+
+def labelled(rows: Iterable[tuple[str, str]], width: int) -> str:
+    """Return texts beside their labels, in lines of the given width."""
+    return "\n".join(
+        # a percent sign stays with its number
+        textwrap.fill(
+            text.replace(" %", "\u00a0%"),
+            max(width, 40),
+            initial_indent=f"{label:<{_LABEL}} ",
+            subsequent_indent=" " * (_LABEL + 1),
+            break_long_words=False,
+            break_on_hyphens=False,
+        ).replace("\u00a0", " ")
+        for label, text in rows
+    )
+
+
 def raised(text: str) -> str:
     """Return a text that begins with a capital."""
     return f"{text[:1].upper()}{text[1:]}"
@@ -167,21 +188,18 @@ def share_text(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
 
     Of one of several named causes also what it removes beside the others.
     """
-    alone = _alone(candidate)
+    if not candidate.fitted and candidate.explained_share == 0:
+        alone = "screened"
+    elif candidate.explained_share < 0:
+        alone = "fits worse"
+    else:
+        screened = "" if candidate.fitted else " (screened)"
+        alone = f"{percent(candidate.explained_share)}{screened}"
     if not isinstance(d, Diagnosis) or d.budget is None or len(d.causes) < 2:
         return alone
     named = {c.effect for c in d.causes}
     own = next((c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None)
     return alone if own is None else f"{alone}; with others {own.percents[0]} %"
-
-
-def _alone(candidate: Candidate) -> str:
-    if not candidate.fitted and candidate.explained_share == 0:
-        return "screened"
-    if candidate.explained_share < 0:
-        return "fits worse"
-    share = percent(candidate.explained_share)
-    return share if candidate.fitted else f"{share} (screened)"
 
 
 def rest_sentence(d: "Diagnosis | OdeDiagnosis") -> str:
@@ -199,13 +217,20 @@ def plain(name: str) -> str:
 MOST_NAMES = 5
 
 
-def listing(words: Sequence[str], joint: str = "and", *, most: int | None = None) -> str:
+def listing(
+    words: Sequence[str], joint: str = "and", between: str = ",", *, most: int | None = None
+) -> str:
     """Return "a, b and c", or "a, b and 7 more" of more words than `most`."""
     if most is not None and len(words) > most:
         return f"{', '.join(words[:most])} {joint} {len(words) - most} more"
     if len(words) < 2:
         return "".join(words)
-    return f"{', '.join(words[:-1])} {joint} {words[-1]}"
+    return f"{f'{between} '.join(words[:-1])}{'' if joint[0] == ';' else ' '}{joint} {words[-1]}"
+
+
+def are(names: Sequence[str], between: str = ", ") -> str:
+    """Return names with "is" or "are" behind them."""
+    return f"{between.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def either(effects: Sequence[str]) -> str:

@@ -122,85 +122,51 @@ def size_text(sizes: Sequence[Size], length: Length) -> str:
     """Return what the tests of one effect give, as a sentence without its full stop."""
     if not sizes:
         return ""
-    largest = max(abs(s.value) for s in sizes)
-    return _TEXTS[sizes[0].test](sizes, lambda _: length(largest))  # one unit in a sentence
+    first, scale = sizes[0], length(max(abs(s.value) for s in sizes))  # one unit in a sentence
+    low, high = first.voltages or (0.0, 0.0)
+    voltages = f"{low:.3g} to {high:.3g} V"
+    each = [_amount(s, scale) for s in sizes]
+    if first.test == "hold":
+        way = "falls back" if first.value < 0 else "goes on"
+        times = [f"{s.at:g} s" if s.at < 60.0 else f"{s.at / 60.0:g} min" for s in sizes]
+        by = listing([f"{text} in {time}" for text, time in zip(each, times, strict=True)])
+        text = f"after a step to {high:.3g} V the displacement {way} by {by}"
+        if beyond := [time for s, time in zip(sizes, times, strict=True) if s.beyond_records]:
+            verb = "lies" if len(beyond) == 1 else "lie"
+            text += f"; {listing(beyond)} {verb} beyond these records"
+    elif first.test == "reversal":
+        text = f"in loops of {voltages} it sets the ways up and down apart by up to {each[0]}"
+    elif first.test == "range":
+        way = "adds" if sizes[1].value > 0 else "takes"
+        text = (
+            f"over {voltages} it {way} {each[1]} at the top, and bends the curve by"
+            f" up to {each[0]} beside zero and sensitivity"
+        )
+    elif first.test == "slew":
+        rate = prefixed_scale(first.at, "V").text(first.at)
+        text = f"at the fastest slew, {rate}/s, it amounts to {each[0]}"
+    elif first.test == "resonance":
+        where = listing([number(s.at) for s in sizes])
+        text = f"at {where} Hz it makes the displacement {listing(each)} times as large"
+    else:
+        seen = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
+        moves = [
+            f"the {plain(o)} by up to {a}" for (test, o), a in seen.items() if test == "record"
+        ]
+        rms = "".join(f", {a} rms" for (test, _), a in seen.items() if test == "rms")
+        text = f"within a record of {number(first.at)} s it moves {listing(moves)}{rms}"
+    return text
 
 
-def _amount(size: Size, length: Length) -> str:
+def _amount(size: Size, length: Scale) -> str:
     """Return a figure with its interval, without its sign."""
     value = abs(size.value)
     in_metres = size.unit == "m" and size.output == "displacement"
-    scale = (
-        length(value) if in_metres or size.unit == "counts" else prefixed_scale(value, size.unit)
-    )
+    scale = length if in_metres or size.unit == "counts" else prefixed_scale(value, size.unit)
     if size.interval is None:
         return scale.text(value)
     ends = sorted(scale.factor * abs(v) for v in size.interval)
     return f"{scale.text(value)} ({interval_text(*ends)})"
-
-
-def _voltages(size: Size) -> str:
-    low, high = size.voltages or (0.0, 0.0)
-    return f"{low:.3g} to {high:.3g} V"
-
-
-def _hold(sizes: Sequence[Size], length: Length) -> str:
-    _, high = sizes[0].voltages or (0.0, 0.0)
-    way = "falls back" if sizes[0].value < 0 else "goes on"
-    each = [f"{_amount(s, length)} in {_time(s.at)}" for s in sizes]
-    text = f"after a step to {high:.3g} V the displacement {way} by {listing(each)}"
-    beyond = [_time(s.at) for s in sizes if s.beyond_records]
-    if not beyond:
-        return text
-    return f"{text}; {listing(beyond)} {'lies' if len(beyond) == 1 else 'lie'} beyond these records"
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:g} s" if seconds < 60.0 else f"{seconds / 60.0:g} min"
-
-
-def _reversal(sizes: Sequence[Size], length: Length) -> str:
-    return (
-        f"in loops of {_voltages(sizes[0])} it sets the ways up and down apart by up to"
-        f" {_amount(sizes[0], length)}"
-    )
-
-
-def _range(sizes: Sequence[Size], length: Length) -> str:
-    bent, top = sizes
-    way = "adds" if top.value > 0 else "takes"
-    return (
-        f"over {_voltages(bent)} it {way} {_amount(top, length)} at the top, and bends the curve by"
-        f" up to {_amount(bent, length)} beside zero and sensitivity"
-    )
-
-
-def _slew(sizes: Sequence[Size], length: Length) -> str:
-    rate = prefixed_scale(sizes[0].at, "V").text(sizes[0].at)
-    return f"at the fastest slew, {rate}/s, it amounts to {_amount(sizes[0], length)}"
-
-
-def _resonance(sizes: Sequence[Size], length: Length) -> str:
-    where = listing([number(s.at) for s in sizes])
-    times = listing([_amount(s, length) for s in sizes])
-    return f"at {where} Hz it makes the displacement {times} times as large"
-
-
-def _record(sizes: Sequence[Size], length: Length) -> str:
-    rows = {s.output: _amount(s, length) for s in sizes if s.test == "record"}
-    rms = next((f", {_amount(s, length)} rms" for s in sizes if s.test == "rms"), "")
-    each = listing([f"the {plain(name)} by up to {text}" for name, text in rows.items()])
-    return f"within a record of {number(sizes[0].at)} s it moves {each}{rms}"
-
-
-_TEXTS: dict[str, Callable[[Sequence[Size], Length], str]] = {
-    "hold": _hold,
-    "reversal": _reversal,
-    "range": _range,
-    "slew": _slew,
-    "resonance": _resonance,
-    "record": _record,
-}
 
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.
@@ -240,30 +206,23 @@ def what_now(d: Diagnosis | OdeDiagnosis, model_file: str | None = None) -> Advi
         )
         return Advice((said,), beside, commands)
     if not d.causes:
-        return _unexplained(d, error, beside, commands)
+        said = (
+            f"Do not correct the device by a name: none is certain. Take {error} rms as the model's"
+            " error, and measure the next record."
+        )
+        if d.patch is not None and d.budget is not None and d.budget.unnamed is not None:
+            patched = (
+                "To predict without a name, --patch patched.json writes the model with the unnamed"
+                f" correction, which removes {percent(within(d.budget.unnamed.share))} of the error"
+                " above the noise."
+            )
+            beside = (patched, *beside)
+        return Advice((said,), beside, commands)
     if d.verdict == "partly_explained" and d.budget is not None:
         left = scale_of(d.experiments, d.budget.remains_rms_m).text(d.budget.remains_rms_m)
         beside = (f"Without an explanation stays {left} rms above the noise.", *beside)
     lines = tuple(_of_cause(c, lambda v: scale_of(d.experiments, v)) for c in d.causes[:_CAUSES])
     return Advice(lines, (*_rivals(d.causes), *beside), commands)
-
-
-def _unexplained(
-    d: Diagnosis, error: str, beside: tuple[str, ...], commands: tuple[str, ...]
-) -> Advice:
-    """Return what to do without a name."""
-    said = (
-        f"Do not correct the device by a name: none is certain. Take {error} rms as the model's"
-        " error, and measure the next record."
-    )
-    if d.patch is None or d.budget is None or d.budget.unnamed is None:
-        return Advice((said,), beside, commands)
-    share = percent(within(d.budget.unnamed.share))
-    patched = (
-        "To predict without a name, --patch patched.json writes the model with the unnamed"
-        f" correction, which removes {share} of the error above the noise."
-    )
-    return Advice((said,), (patched, *beside), commands)
 
 
 def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -272,7 +231,7 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
     fmu = shlex.quote(str(PurePath(file).with_suffix(".fmu")))
     model = f"--model {shlex.quote(file)}"
     commands = [f"psa export fmu {model} -o {fmu}"]
-    outside = [c for c in d.causes if not _in_plant(c)]
+    outside = [c for c in d.causes if c.belongs_to in ("sensor", "environment")]
     if d.verdict in ("adequate", "cause_named", "partly_explained") and len(outside) < max(
         len(d.causes), 1
     ):
@@ -294,10 +253,6 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
             f' psa.save_model(result.model, "{file}").'
         )
     return tuple(commands), tuple(said)
-
-
-def _in_plant(cause: Cause) -> bool:
-    return cause.belongs_to not in ("sensor", "environment")
 
 
 def _of_cause(cause: Cause | PortCause, length: Length) -> str:

@@ -12,14 +12,7 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.phrases import (
-    Scale,
-    added,
-    handy_scale,
-    in_brackets,
-    length_scale,
-    prefixed_scale,
-)
+from psa_casadi.report.words import phrases
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
@@ -63,13 +56,28 @@ class Series:
         """Return measured minus predicted [m]."""
         return self.measured - curve.values
 
+    def miss(self, curve: int) -> float:
+        """Return the rms error of a curve, by its place, over the spread of what was measured."""
+        spread = float(np.nanstd(self.measured)) or 1.0
+        return float(np.sqrt(np.nanmean(self.residual(self.curves[curve]) ** 2))) / spread
+
+    def judged_rms(self, curve: Curve) -> float:
+        """Return the rms error of a curve over the samples held out, or all if none is [m]."""
+        residual = self.residual(curve)
+        counted = self.held_out if self.held_out.any() else np.isfinite(residual)
+        return float(np.sqrt(np.nanmean(residual[counted] ** 2)))
+
     @property
-    def scale(self) -> Scale:
+    def span(self) -> float:
+        """The range of what was measured [m]."""
+        return float(np.nanmax(self.measured) - np.nanmin(self.measured))
+
+    @property
+    def scale(self) -> phrases.Scale:
         """The unit to show what was measured in."""
-        span = float(np.nanmax(self.measured) - np.nanmin(self.measured))
         if self.unit:
-            return prefixed_scale(span, self.unit)
-        return handy_scale(span, counts=self.counts)
+            return phrases.prefixed_scale(self.span, self.unit)
+        return phrases.handy_scale(self.span, counts=self.counts)
 
     @property
     def title(self) -> str:
@@ -79,27 +87,27 @@ class Series:
     @property
     def label(self) -> str:
         """What an axis of the measured quantity says."""
-        return in_brackets(self.quantity, self.scale.unit)
+        return phrases.in_brackets(self.quantity, self.scale.unit)
 
     @property
-    def time_scale(self) -> Scale:
+    def time_scale(self) -> phrases.Scale:
         """The unit to show times in: `shown = factor * seconds`."""
         return time_scale(float(self.time[-1] - self.time[0]))
 
     @property
-    def residual_scale(self) -> Scale:
+    def residual_scale(self) -> phrases.Scale:
         """The unit to show residuals in."""
         largest = max(float(np.nanmax(np.abs(self.residual(c)))) for c in self.curves)
         if self.unit:
-            return prefixed_scale(largest, self.unit)
-        return length_scale(largest, counts=self.counts)
+            return phrases.prefixed_scale(largest, self.unit)
+        return phrases.length_scale(largest, counts=self.counts)
 
 
-def time_scale(span: float) -> Scale:
+def time_scale(span: float) -> phrases.Scale:
     """Return the unit to show times of a span [s] in: `shown = factor * seconds`."""
     if span >= 1.0:
-        return Scale("s", 1.0)
-    return Scale("ms", 1e3) if span >= 1e-3 else Scale("µs", 1e6)
+        return phrases.Scale("s", 1.0)
+    return phrases.Scale("ms", 1e3) if span >= 1e-3 else phrases.Scale("µs", 1e6)
 
 
 def series_of(d: Diagnosis) -> tuple[Series, ...]:
@@ -108,7 +116,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     levels = [n.level for n in d.noise] or [d.noise_floor_rms_m] * len(d.experiments)
     for e, base, extended, noise in zip(d.experiments, d.base, d.extended, levels, strict=True):
         curves = [Curve("base model", BASE_COLOUR, base)]
-        if added(d):
+        if phrases.added(d):
             curves.append(Curve("extended model", EXTENDED_COLOUR, extended))
         rows.append(_series(e, curves, noise))
     return tuple(rows)
@@ -161,12 +169,7 @@ def spans(marked: BoolArray) -> list[tuple[int, int]]:
 
 def most_telling(series: Sequence[Series]) -> Series:
     """Return the record whose first curve misses the measurement by the largest share of range."""
-
-    def miss(s: Series) -> float:
-        spread = float(np.nanstd(s.measured)) or 1.0
-        return float(np.sqrt(np.nanmean(s.residual(s.curves[0]) ** 2))) / spread
-
-    return max(series, key=miss)
+    return max(series, key=lambda s: s.miss(0))
 
 
 def telling_window(s: Series) -> slice:
@@ -234,15 +237,6 @@ _NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class Distribution:
-    """Shares of a residual's samples [%] in bins of equal width; centres and width in [m]."""
-
-    centres: FloatArray
-    shares: FloatArray
-    width: float
-
-
-@dataclass(frozen=True)
 class ResidualFigures:
     """Size and character of one record's residual; lengths in [m].
 
@@ -276,13 +270,12 @@ def residual_figures(s: Series, curve: Curve) -> ResidualFigures:
     last = lags[below[0]] if below.size else lags[-1]
     spread = float(np.std(valid))
     z = (valid - np.mean(valid)) / (spread if spread > 0 else 1.0)
-    span = float(np.nanmax(s.measured) - np.nanmin(s.measured))
     rms = float(np.sqrt(np.mean(valid**2)))
     return ResidualFigures(
         rms=rms,
         mean=float(np.mean(valid)),
         largest=float(np.max(np.abs(valid))),
-        range_share=rms / span if span > 0 else float("nan"),
+        range_share=rms / s.span if s.span > 0 else float("nan"),
         noise=s.noise,
         neighbours=float(correlations[0]),
         outside=float(np.mean(~calm)),
@@ -302,18 +295,15 @@ def autocorrelation(residual: FloatArray) -> tuple[IndexArray, FloatArray]:
     n = len(residual)
     there = np.isfinite(residual)
     centred = np.where(there, residual - np.mean(residual[there]), 0.0)
-    products, pairs = (_correlate(v) for v in (centred, there.astype(np.float64)))
+    # sums over the lags, by the fast Fourier transform
+    products, pairs = (
+        np.fft.irfft(np.abs(np.fft.rfft(v, 2 * n)) ** 2, 2 * n)[:n]
+        for v in (centred, there.astype(np.float64))
+    )
     power = products[0] / max(pairs[0], 1.0)
     lags = np.unique(np.geomspace(1, max(2, n // 4), _LAGS).round().astype(np.int64))
     means = products[lags] / np.maximum(pairs[lags], 1.0)
     return lags, means / power if power > 0 else np.zeros(len(lags))
-
-
-def _correlate(values: FloatArray) -> FloatArray:
-    """Return sum_i v_i v_(i+k) for every lag k, by the fast Fourier transform."""
-    n = len(values)
-    transformed = np.fft.rfft(values, 2 * n)
-    return np.fft.irfft(np.abs(transformed) ** 2, 2 * n)[:n]
 
 
 def white_band(residual: FloatArray) -> float:
@@ -321,13 +311,18 @@ def white_band(residual: FloatArray) -> float:
     return _NORMAL_95 / float(np.sqrt(np.count_nonzero(np.isfinite(residual))))
 
 
-def distribution(residual: FloatArray, low: float, high: float) -> Distribution:
-    """Return the distribution of a residual between two values [m], in 15 to 61 bins."""
+def distribution(
+    residual: FloatArray, low: float, high: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the distribution of a residual between two values [m], in 15 to 61 bins.
+
+    That is the bins' centres [m], the shares of the samples in each [%], and their width [m].
+    """
     valid = residual[np.isfinite(residual)]
     bins = int(np.clip(2.0 * len(valid) ** (1.0 / 3.0), 15, 61)) | 1
     counts, edges = np.histogram(valid, bins=bins, range=(low, high))
     width = float(edges[1] - edges[0])
-    return Distribution(edges[:-1] + 0.5 * width, 100.0 * counts / len(valid), width)
+    return edges[:-1] + 0.5 * width, 100.0 * counts / len(valid), width
 
 
 def spectrum(time: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -21,6 +21,7 @@ from psa_casadi.report.words.phrases import (
     added,
     interval_text,
     number,
+    percent,
     plain,
     probability_text,
     share_text,
@@ -34,7 +35,7 @@ from psa_casadi.units import convert
 if TYPE_CHECKING:
     from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.any_model.runs import Run
-    from psa_casadi.export.check.check import CheckReport, CheckRow
+    from psa_casadi.export.check.check import CheckReport
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,9 @@ def candidate_table(d: "Diagnosis | OdeDiagnosis") -> Table:
     return _table(head, rows)
 
 
-def error_table(d: Diagnosis, unit: str, factor: float) -> Table:
+def error_table(d: Diagnosis, scale: Scale) -> Table:
     """Return the errors of base and extended model beside the noise, in a unit of length."""
+    unit, factor = scale.unit, scale.factor
     rows = []
     models = [("base", d.base_errors), ("extended", d.extended_errors)]
     for name, e in models if added(d) else models[:1]:
@@ -237,15 +239,10 @@ def effect_parameter_table(effect: Component) -> Table:
 
 def stacks_table(stacks: Iterable[Stack]) -> Table:
     """Return the named stacks with rated voltage and how many of their figures are assumed."""
-    rows = [
-        (
-            s.name,
-            number(s.values["u_rated"].value),
-            f"{len(s.assumed)} of {len(s.values)}",
-            s.description,
-        )
-        for s in stacks
-    ]
+    rows = []
+    for s in stacks:
+        assumed = f"{len(s.assumed)} of {len(s.values)}"
+        rows.append((s.name, number(s.values["u_rated"].value), assumed, s.description))
     return _table(("stack", "rated voltage [V]", "assumed figures", "what it is"), rows)
 
 
@@ -263,16 +260,13 @@ def stack_table(stack: Stack) -> Table:
 
 def check_table(report: "CheckReport") -> Table:
     """Return the checks of an FMU with figure, limit and result."""
-    rows = [
-        (r.name, _found(r), number(r.limit), "pass" if r.passed else "FAIL", r.remark)
-        for r in report.rows
-    ]
+    rows = []
+    for r in report.rows:
+        # where none is allowed it counts problems
+        counted = r.limit == 0 and r.figure >= 0
+        found = str(int(r.figure)) if counted else number(r.figure)
+        rows.append((r.name, found, number(r.limit), "pass" if r.passed else "FAIL", r.remark))
     return _table(("check", "found", "allowed", "result", "remark"), rows)
-
-
-def _found(row: "CheckRow") -> str:
-    """Return the figure of a check; where none is allowed it counts problems."""
-    return str(int(row.figure)) if row.limit == 0 and row.figure >= 0 else number(row.figure)
 
 
 def timings_table(stages: Sequence[Stage]) -> Table:
@@ -280,19 +274,12 @@ def timings_table(stages: Sequence[Stage]) -> Table:
 
     Behind the simulations stands how many of them were with sensitivities.
     """
-    total = Stage(
-        "total",
-        sum(s.wall for s in stages),
-        sum(s.processor for s in stages),
-        sum(s.runs for s in stages),
-        sum(s.differentiated for s in stages),
-    )
-    rows = [_row(s, total.processor) for s in (*stages, total)]
+    figures = ((s.wall, s.processor, s.runs, s.differentiated) for s in stages)
+    total = Stage("total", *map(sum, zip(*figures, strict=True)))
+    rows = []
+    for s in (*stages, total):
+        share = percent(s.processor / total.processor) if total.processor > 0 else ""
+        runs = (str(s.runs), str(s.differentiated)) if s.runs else ("", "")
+        rows.append((s.name, f"{s.wall:.2f} s", f"{s.processor:.2f} s", share, *runs))
     head = ("stage", "time", "processor", "share", "simulations", "with sensitivities")
-    return Table(head, tuple(rows))
-
-
-def _row(s: Stage, total: float) -> tuple[str, ...]:
-    share = f"{100.0 * s.processor / total:.0f} %" if total > 0 else ""
-    runs = (str(s.runs), str(s.differentiated)) if s.runs else ("", "")
-    return (s.name, f"{s.wall:.2f} s", f"{s.processor:.2f} s", share, *runs)
+    return _table(head, rows)

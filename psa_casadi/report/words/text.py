@@ -1,6 +1,5 @@
 """The results as plain text for a terminal."""
 
-import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
+from psa_casadi.report.words import verdict_words
 from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.own_words import own_lines
@@ -23,6 +23,7 @@ from psa_casadi.report.words.phrases import (
     MOST_NAMES,
     Scale,
     added,
+    labelled,
     listing,
     number,
     percent,
@@ -34,21 +35,12 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
-from psa_casadi.report.words.verdict_words import (
-    VERDICTS,
-    alternative_sentence,
-    budget_sentence,
-    cause_size,
-    column_sentence,
-    verdict_sentence,
-)
 from psa_casadi.units import convert
 
 if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport
 
-
-_LABEL = 10
+Lines = Sequence[tuple[str, str]]
 
 
 def story(
@@ -75,46 +67,40 @@ def story(
     now = [("what now", text) for text in advice.causes]
     now += [("then", command) for command in advice.commands[:1]]
     lines[1:1] = now
-    return "\n".join(labelled(label, text, width) for label, text in lines)
+    return labelled(lines, width)
 
 
 def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
-    lines = [("verdict", f"{VERDICTS[d.verdict]}. {verdict_sentence(d)}")]
+    lines = [
+        ("verdict", f"{verdict_words.VERDICTS[d.verdict]}. {verdict_words.verdict_sentence(d)}")
+    ]
     wrong = strongest(d.misfit)
     lines += [("wrong", brief_text(wrong))] if wrong else []
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
     lines += [
-        ("records", records_text(d.experiments, origin)),
+        ("records", _records_text(d.experiments, origin)),
         ("noise", f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"),
         ("base", _errors(d.base_errors, scale)),
     ]
     if added(d):
         lines.append(("extended", _errors(d.extended_errors, scale)))
-    for cause in d.causes:
-        lines.append(("cause", _cause(d, cause)))
-        lines.append(("rivals", _rivals(d, cause)))
-    lines.extend(("column", column_sentence(d, c)) for c in d.columns)
-    lines.extend(("export", f"{alternative_sentence(d, a)}.") for a in d.alternatives)
-    spent = budget_sentence(d, scale)
+    for c in d.causes:
+        sure = f"{c.belongs_to}, {percent(c.confidence)}"
+        lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
+        lines.append(("rivals", _rivals(d, c)))
+    lines.extend(("column", verdict_words.column_sentence(d, c)) for c in d.columns)
+    lines.extend(("export", f"{verdict_words.alternative_sentence(d, a)}.") for a in d.alternatives)
+    spent = verdict_words.budget_sentence(d, scale)
     if spent and d.verdict not in ("adequate", "not_driven"):
         lines.append(("budget", f"{spent}."))
     lines.append(("remains", rest_sentence(d)))
-    lines.append(("blind to", _blind(d)))
+    blind = [plain(b.effect) for b in blindest(d)] or ["no effect of ordinary size in the table"]
+    lines.append(("blind to", listing(blind, most=MOST_NAMES)))
     lines.append(("next", d.next_experiment.why))
-    lines.extend(("note", _first_sentence(note)) for note in d.notes)
+    firsts = (note.partition(". ") for note in d.notes)
+    lines.extend(("note", f"{first}{dot.rstrip()}") for first, dot, _ in firsts)
     return lines
-
-
-def _first_sentence(text: str) -> str:
-    head, dot, _ = text.partition(". ")
-    return f"{head}{dot.rstrip()}"
-
-
-def _cause(d: Diagnosis, cause: Cause) -> str:
-    """Return a cause with place, confidence and parameters."""
-    sure = f"{cause.belongs_to}, {percent(cause.confidence)}"
-    return f"{plain(cause.effect)} ({sure}): {cause_size(d, cause)}"
 
 
 def _rivals(d: Diagnosis, cause: Cause) -> str:
@@ -137,14 +123,6 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
     return f"none left open; the next is {plain(name)} ({probability_text(probability)})"
 
 
-def _blind(d: Diagnosis) -> str:
-    """Name the effects that the records could not have shown, those furthest out of sight first."""
-    names = [plain(b.effect) for b in blindest(d)]
-    if not names:
-        return "no effect of ordinary size in the table"
-    return listing(names, most=MOST_NAMES)
-
-
 def identification_text(
     found: Identification, *, origin: str = "measured", width: int = 100
 ) -> str:
@@ -153,17 +131,14 @@ def identification_text(
     span = max(e.record.range_m for e in found.experiments)
     share = number(100.0 * found.fit.rms / span, 2)
     head = [
-        ("records", records_text(found.experiments, origin)),
+        ("records", _records_text(found.experiments, origin)),
         ("error", f"{scale.text(found.fit.rms)} rms, {share} % of the largest range"),
     ]
     tail = [("warning", w) for w in found.warnings]
     tail += [("open", c.sentence) for c in found.combinations]
     tail += [("next", a.sentence) for a in found.advice]
     tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
-    blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
-    blocks.append(parameter_table(found.model, found).fitted(width))
-    blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
-    return "\n\n".join(blocks)
+    return _around(head, parameter_table(found.model, found), tail, width)
 
 
 def effect_page(
@@ -182,8 +157,7 @@ def effect_page(
     ]
     lines += [("how large", effect_size(effect, *seen))] if seen is not None else []
     lines += zip(("what now", "record"), effect_advice(effect), strict=True)
-    body = "\n".join(labelled(label, text, width) for label, text in lines)
-    return f"{effect.name}\n\n{body}\n\n{effect_parameter_table(effect).fitted(width)}"
+    return f"{effect.name}\n\n{_around(lines, effect_parameter_table(effect), (), width)}"
 
 
 def check_sentence(report: "CheckReport") -> str:
@@ -200,20 +174,7 @@ def check_sentence(report: "CheckReport") -> str:
     return f"{Path(report.path).name} did not pass: {failed}.{against}"
 
 
-def labelled(label: str, text: str, width: int) -> str:
-    """Return a text beside its label, in lines of the given width."""
-    # a percent sign stays with its number
-    return textwrap.fill(
-        text.replace(" %", "\u00a0%"),
-        max(width, 40),
-        initial_indent=f"{label:<{_LABEL}} ",
-        subsequent_indent=" " * (_LABEL + 1),
-        break_long_words=False,
-        break_on_hyphens=False,
-    ).replace("\u00a0", " ")
-
-
-def records_text(experiments: Iterable[Experiment], origin: str) -> str:
+def _records_text(experiments: Iterable[Experiment], origin: str) -> str:
     """Return the records with their samples, duration and what they are."""
     parts = []
     for e in experiments:
@@ -233,25 +194,17 @@ def _errors(e: Errors, scale: Scale) -> str:
     )
 
 
-def posterior_table(found: Posterior) -> Table:
+def _posterior_table(found: Posterior) -> Table:
     """Return every parameter with mean, sd, 94 % interval, effective draws and r-hat."""
     rows = []
     for f in found.figures:
         unit, display = shown_in(found.model, f.name)
         mean, low, high = (convert(x, unit, display) for x in (f.mean, f.low, f.high))
         spread = convert(f.mean + f.sd, unit, display) - mean
-        rows.append(
-            (
-                f.name,
-                number(mean, 4),
-                number(spread),
-                f"{number(low, 4)} to {number(high, 4)}",
-                display,
-                f"{f.ess:.0f}",
-                f"{f.r_hat:.3f}",
-                found.model.parameter(f.name).description,
-            )
-        )
+        interval = f"{number(low, 4)} to {number(high, 4)}"
+        told = (display, f"{f.ess:.0f}", f"{f.r_hat:.3f}")
+        meaning = found.model.parameter(f.name).description
+        rows.append((f.name, number(mean, 4), number(spread), interval, *told, meaning))
     head = ("parameter", "mean", "sd", "94 % interval", "unit", "ess", "r-hat", "meaning")
     return Table(head, tuple(rows))
 
@@ -259,9 +212,12 @@ def posterior_table(found: Posterior) -> Table:
 def posterior_text(found: Posterior, *, origin: str = "measured", width: int = 100) -> str:
     """Return a posterior: records, chains, the parameters, warnings."""
     drawn = f"{found.chains} chains of {found.draws} draws, {found.divergences} divergent"
-    head = [("records", records_text(found.task.experiments, origin)), ("drawn", drawn)]
+    head = [("records", _records_text(found.task.experiments, origin)), ("drawn", drawn)]
     tail = [("warning", w) for w in found.warnings] + [("note", n) for n in found.sentences]
-    blocks = ["\n".join(labelled(label, text, width) for label, text in head)]
-    blocks.append(posterior_table(found).fitted(width))
-    blocks += ["\n".join(labelled(label, text, width) for label, text in tail)] if tail else []
-    return "\n\n".join(blocks)
+    return _around(head, _posterior_table(found), tail, width)
+
+
+def _around(head: Lines, table: Table, tail: Lines, width: int) -> str:
+    """Return a table between labelled lines."""
+    blocks = (labelled(head, width), table.fitted(width), labelled(tail, width))
+    return "\n\n".join(b for b in blocks if b)

@@ -57,39 +57,32 @@ def gain_sentence(d: Diagnosis) -> str:
     return f"the held-out error falls by {told[0]} % (95 % interval {told[1]} to {told[2]} %)"
 
 
-_ADEQUATE = "Nothing beyond the noise is missing from the base model"
-_FLIPPED = (
-    "The displacement falls while the voltage rises: correct the sign of one of them. Nothing was"
-    " diagnosed"
-)
-_NOT_DRIVEN = "The displacement does not follow the voltage: nothing can be diagnosed"
-
-
 def verdict_sentence(d: Diagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
-    if d.doubt:
-        seen = (
-            "Nothing beyond the noise is seen to be missing"
-            if d.verdict == "adequate"
-            else "Something is missing, and no cause is named"
-        )
-        return f"{seen}; {d.doubt}."
     error = (
         f"the base model's held-out error is {number(d.base_errors.holdout_nrmse_percent, 2)} %"
         " of the range"
     )
+    if d.doubt and d.verdict == "adequate":
+        return f"Nothing beyond the noise is seen to be missing; {d.doubt}."
+    if d.doubt:
+        return f"Something is missing, and no cause is named; {d.doubt}."
     if d.verdict == "adequate":
-        return f"{_ADEQUATE}; {error}."
+        return f"Nothing beyond the noise is missing from the base model; {error}."
     if d.verdict == "not_driven":
-        flipped = doubtful_sign([e.record for e in d.experiments])
-        return f"{_FLIPPED if flipped else _NOT_DRIVEN}; {error}."
+        seen = (
+            "The displacement falls while the voltage rises: correct the sign of one of them."
+            " Nothing was diagnosed"
+            if doubtful_sign([e.record for e in d.experiments])
+            else "The displacement does not follow the voltage: nothing can be diagnosed"
+        )
+        return f"{seen}; {error}."
     if d.verdict == "unexplained" or not d.causes:
         return (
             "Something is missing, and no effect in the table explains it: no cause is named; "
-            f"{_kept(d)}{_unnamed(d)}{error}."
+            f"{_without_name(d)}{error}."
         )
-    named = [named_cause(c, c.belongs_to) for c in d.causes]
-    return naming_sentence(d, named)
+    return naming_sentence(d, [named_cause(c, c.belongs_to) for c in d.causes])
 
 
 def naming_sentence(d: "Diagnosis | OdeDiagnosis", causes: Sequence[str]) -> str:
@@ -97,8 +90,14 @@ def naming_sentence(d: "Diagnosis | OdeDiagnosis", causes: Sequence[str]) -> str
 
     Without a budget it says how far the error falls, noise included.
     """
-    gain = gain_sentence(d) if isinstance(d, Diagnosis) and d.budget is None else ""
-    removal = "" if d.budget is None else _removal(d, d.budget.together)
+    if d.budget is not None:
+        share = f"{d.budget.together.percents[0]} %"
+        if d.verdict == "partly_explained" and share.startswith("100"):
+            share = "nearly all"  # something remains
+        verb = "removes" if len(d.causes) == 1 else "remove"
+        # the noise is the floor
+        removal = f"{verb} {share} of the base model's held-out error above the noise (in power)"
+    gain = "" if d.budget is not None else gain_sentence(d)
     if d.verdict == "ambiguous":
         first = d.causes[0]
         rivals = either((first.effect, *first.cannot_be_told_from))
@@ -113,40 +112,27 @@ def naming_sentence(d: "Diagnosis | OdeDiagnosis", causes: Sequence[str]) -> str
     return f"The {are}: {gone}."
 
 
-def _removal(d: "Diagnosis | OdeDiagnosis", together: Share) -> str:
-    """Say what the causes take off the base model's error above the noise, which is the floor."""
-    share = f"{together.percents[0]} %"
-    if d.verdict == "partly_explained" and share.startswith("100"):
-        share = "nearly all"  # something remains
-    verb = "removes" if len(d.causes) == 1 else "remove"
-    return f"{verb} {share} of the base model's held-out error above the noise (in power)"
-
-
 def within(share: float) -> float:
     """Return a share as it is shown, from 0 to 1."""
     return max(0.0, min(1.0, share))
 
 
-def _kept(d: Diagnosis) -> str:
-    """Say what the extended model of a diagnosis without a cause holds, "" where nothing."""
-    if d.budget is None or not d.kept:
-        return ""
-    share = percent(within(d.budget.together.share))
-    effects = listing([plain(name) for name in d.kept])
-    if len(d.kept) == 1:
-        said = f"{effects} removes {share} of the error above the noise and is kept in the"
-        return f"{said} extended model without being a cause; "
-    said = f"{effects} remove {share} of the error above the noise and are kept in the"
-    return f"{said} extended model without being causes; "
-
-
-def _unnamed(d: Diagnosis) -> str:
-    """Say what the unnamed correction would remove, "" without one."""
-    if d.patch is None or d.budget is None or d.budget.unnamed is None:
-        return ""
-    share = percent(within(d.budget.unnamed.share))
-    more = "a further " if added(d) else ""
-    return f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
+def _without_name(d: Diagnosis) -> str:
+    """Say what an extended model without a cause holds and would take, "" where nothing."""
+    said, b = "", d.budget
+    if b is not None and d.kept:
+        one = len(d.kept) == 1
+        said = (
+            f"{listing([plain(name) for name in d.kept])} {'removes' if one else 'remove'}"
+            f" {percent(within(b.together.share))} of the error above the noise and"
+            f" {'is' if one else 'are'} kept in the extended model without being"
+            f" {'a cause' if one else 'causes'}; "
+        )
+    if b is not None and d.patch is not None and b.unnamed is not None:
+        more = "a further " if added(d) else ""
+        share = percent(within(b.unnamed.share))
+        said += f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
+    return said
 
 
 def named_cause(cause: "Cause | PortCause", where: str) -> str:
@@ -202,20 +188,10 @@ def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str
     return ", ".join(texts)
 
 
-#: Ports that these records cannot distinguish.
-_OPEN = "; these data cannot distinguish it from {}"
-
-
-def share_percent(share: float) -> str:
-    """Return a share as a percentage that is never 0 where it is not."""
-    if 0.0 < share < 0.005:
-        return "under 1 %"
-    return f"{100.0 * share:.0f} %"
-
-
 def patch_text(patch: Patch) -> str:
     """Say what the unnamed correction is, and what else it may be."""
-    rest = _OPEN.format(listing(patch.open_to, "or")) if patch.open_to else ""
+    others = listing(patch.open_to, "or")
+    rest = f"; these data cannot distinguish it from {others}" if others else ""
     return f"{patch.sentence}, at the {patch.port}{rest}"
 
 
@@ -263,7 +239,8 @@ def budget_table(d: Diagnosis, scale: Scale) -> Table:
         rows.append(share_row(f"unnamed: {d.patch.name}", b.unnamed))
     remains = number(scale.factor * b.remains_rms_m)
     share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
-    rows.append(("remains above the noise", f"{share_percent(share)}, {remains} {scale.unit}", ""))
+    shown = "under 1 %" if 0.0 < share < 0.005 else percent(share)
+    rows.append(("remains above the noise", f"{shown}, {remains} {scale.unit}", ""))
     return Table(("what", "removes", "95 % interval"), tuple(rows))
 
 
