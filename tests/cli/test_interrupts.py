@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from psa_casadi.cli import design_input_runs
 from psa_casadi.cli.app import app
 from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.effects import EFFECTS
+from psa_casadi.export.importer import masters
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import identify
 from psa_casadi.interruption import interruptible_work
@@ -198,7 +198,7 @@ def test_a_designed_voltage_is_kept_without_its_check(
     def cut(*given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(design_input_runs, "_on_fmu", cut)
+    monkeypatch.setattr(masters, "played_on_fmu", cut)
     time = np.arange(40) * 1e-3
     path = {"time [s]": time, "displacement [um]": 5.0 - 5.0 * np.cos(150.0 * time)}
     write_record(tmp_path / "path.csv", path)
