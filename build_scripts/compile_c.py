@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,12 +25,13 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.export.fmu.sources import STRICT, write_sources
 from psa_casadi.export.web import WEB_FLAGS, module_texts
-from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.compose import compose
 from psa_casadi.simulation.compiler import generate_c
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import SOURCES
 
+SOURCE = ROOT / "fmu_src"
 FLAGS = ("-std=c99", *STRICT)
 OPTIMISATION = "-O2"
 EXACT_FLAGS = ("-std=gnu99", "-fno-math-errno", *STRICT, "-Wno-pedantic")
@@ -61,47 +63,14 @@ def compile_strictly(work: Work) -> list[str]:
     return [f"{work.name}:\n{done.stdout}{done.stderr}"] if done.returncode != 0 else []
 
 
-def write_library(model: Model, directory: Path) -> None:
-    """Write the sources of the library that integrates a model with its sensitivities."""
+def write(directory: Path, texts: Mapping[str, str], copied: Iterable[str] = ()) -> Path:
+    """Write texts, and files of `fmu_src/`, to a new directory; return it."""
     directory.mkdir(parents=True)
-    for name, text in generate_c(model.structure, sensitivities=True).items():
+    for name, text in texts.items():
         (directory / name).write_text(text, encoding="utf-8")
-    for source in (*SOURCES, *(path.name for path in (ROOT / "fmu_src").glob("*.h"))):
-        shutil.copy(ROOT / "fmu_src" / source, directory)
-
-
-def write_exact(model: Model, directory: Path) -> Path:
-    """Write the sources of a model's exact steps; return the file to compile."""
-    split = split_of(model.structure)
-    if isinstance(split, str):
-        raise PsaError(f"The model does not split: {split}.")
-    directory.mkdir(parents=True, exist_ok=True)
-    text = generate(split, "measured_displacement")
-    (directory / "exact_model.h").write_text(text, encoding="utf-8")
-    for source in (ROOT / "fmu_src").glob("exact*"):
-        shutil.copy(source, directory)
-    return directory / "exact.c"
-
-
-def write_imported(directory: Path) -> Path:
-    """Write the sources of what calls an imported FMU; return the file to compile."""
-    directory.mkdir(parents=True)
-    sizes = "".join(f"#define PSA_N{k} {n}\n" for k, n in zip("XUPY", (2, 1, 3, 1), strict=True))
-    text = f"#define PSA_IMPORTED_NAME fmu_f\n{sizes}"
-    (directory / "imported_config.h").write_text(text, encoding="utf-8")
-    for name in ("imported.c", "imported.h"):
-        shutil.copy(ROOT / "fmu_src" / name, directory)
-    return directory / "imported.c"
-
-
-def page_work(model: Model, directory: Path) -> Work:
-    """Write what is generated of a model in a page; return what is to be compiled."""
-    directory.mkdir(parents=True)
-    for name, text in module_texts(model.structure).items():
-        (directory / name).write_text(text, encoding="utf-8")
-    here = ROOT / "fmu_src"
-    flags = (*WEB_FLAGS, *STRICT, "-Wno-pedantic")
-    return Work(tuple(sorted(here.glob("page/*.c"))), (directory, here / "page", here), flags)
+    for name in copied:
+        shutil.copy(SOURCE / name, directory)
+    return directory
 
 
 def write_all(sources: Path) -> list[Work]:
@@ -115,18 +84,28 @@ def write_all(sources: Path) -> list[Work]:
     every_effect = compose((*BASE, *EFFECTS.values()))
     write_sources(compose(BASE), sources / "fmi2", fmi=2)
     write_sources(every_effect, sources / "fmi3", name="psa", fmi=3)
-    write_library(every_effect, sources / "library")
-    write_imported(sources / "imported")
+    library = generate_c(every_effect.structure, sensitivities=True)
+    write(sources / "library", library, (*SOURCES, *(p.name for p in SOURCE.glob("*.h"))))
+    sizes = "".join(f"#define PSA_N{k} {n}\n" for k, n in zip("XUPY", (2, 1, 3, 1), strict=True))
+    config = {"imported_config.h": f"#define PSA_IMPORTED_NAME fmu_f\n{sizes}"}
+    write(sources / "imported", config, ("imported.c", "imported.h"))
     work = [
         Work(tuple(sorted(folder.glob("*.c"))), (folder, headers))
         for folder in sorted(sources.iterdir())
     ]
     for k, model in enumerate((compose(BASE), compose((*BASE, EFFECTS["load_stiffness"])))):
-        exact = write_exact(model, sources / f"exact{k}")
+        split = split_of(model.structure)
+        if isinstance(split, str):
+            raise PsaError(f"The model does not split: {split}.")
+        text = {"exact_model.h": generate(split, "measured_displacement")}
+        exact = write(sources / f"exact{k}", text, (p.name for p in SOURCE.glob("exact*")))
         for lanes in LANES:
             flags = (*EXACT_FLAGS, f"-DPSA_LANES={lanes}")
-            work.append(Work((exact,), (exact.parent,), flags))
-    return [*work, page_work(every_effect, sources / "web")]
+            work.append(Work((exact / "exact.c",), (exact,), flags))
+    page = write(sources / "web", module_texts(every_effect.structure))
+    folders = (page, SOURCE / "page", SOURCE)
+    strict = (*WEB_FLAGS, *STRICT, "-Wno-pedantic")
+    return [*work, Work(tuple(sorted(SOURCE.glob("page/*.c"))), folders, strict)]
 
 
 def main() -> int:
@@ -135,7 +114,7 @@ def main() -> int:
         os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str(Path(tempfile.gettempdir()) / "zig"))
         work = write_all(Path(scratch))
         files = [path for item in work for path in item.sources]
-        missing = {path.name for path in (ROOT / "fmu_src").glob("*.c")} - {f.name for f in files}
+        missing = {path.name for path in SOURCE.glob("*.c")} - {f.name for f in files}
         complaints = [f"{name}: not among the written sources." for name in sorted(missing)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             complaints += [c for found in pool.map(compile_strictly, work) for c in found]

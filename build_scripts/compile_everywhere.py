@@ -6,26 +6,13 @@ highest one that pyproject.toml allows. It takes some twenty minutes on two proc
 
 import os
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
+from build_scripts.compile_cuda import models
 from psa_casadi.errors import MachineError
 from psa_casadi.export.fmu.platforms import PLATFORMS, Platform, compile_library
 from psa_casadi.export.fmu.sources import exported_texts
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS
-
-
-def models() -> Iterator[tuple[str, Model]]:
-    """Yield every stack, the base with each effect, and with all of them."""
-    for name, stack in STACKS.items():
-        yield name, compose(BASE, {k: figure.value for k, figure in stack.values.items()})
-    for name, effect in EFFECTS.items():
-        yield name, compose((*BASE, effect))
-    yield "every effect", compose((*BASE, *EFFECTS.values()))
 
 
 def complaint(name: str, texts: dict[str, str], target: Platform) -> str:

@@ -36,6 +36,7 @@ AT_ONCE = 2
 
 _FENCE = re.compile(r"^```(?P<language>\w*)\s*$")
 _NOTE = re.compile(r"^<!--\s*(?P<kind>run|before):\s*(?P<text>.+?)\s*-->\s*$")
+_COMMAND = re.compile(r"^\$ (.*(?:(?<=\\)\n.*)*)", re.MULTILINE)
 #: How the text of a block in a language runs.
 _PROGRAMS = {
     "python": "python - <<'END_OF_PROGRAM'\n{}\nEND_OF_PROGRAM",
@@ -103,25 +104,14 @@ def _mark(line: int, text: str) -> str:
 
 
 def commands_of(language: str, lines: Sequence[str]) -> tuple[str, ...]:
-    """Return what runs a block, nothing where its language is none that runs."""
-    if language == "console":
-        return find_commands(lines)
-    return (_PROGRAMS[language].format("\n".join(lines)),) if language in _PROGRAMS else ()
+    """Return what runs a block, nothing where its language is none that runs.
 
-
-def find_commands(lines: Sequence[str]) -> tuple[str, ...]:
-    """Return the commands after `$ `, each with the lines it continues in."""
-    commands: list[str] = []
-    open_command = False
-    for line in lines:
-        if open_command:
-            commands[-1] += "\n" + line
-        elif line.startswith("$ "):
-            commands.append(line[2:])
-        else:
-            continue
-        open_command = line.endswith("\\")
-    return tuple(commands)
+    Of a console these are the commands after `$ `, each with the lines it continues in.
+    """
+    if language in _PROGRAMS:
+        return (_PROGRAMS[language].format("\n".join(lines)),)
+    text = "\n".join(lines) if language == "console" else ""
+    return tuple(_COMMAND.findall(text))
 
 
 def run_block(block: Block, directory: Path) -> str | None:
@@ -161,19 +151,6 @@ def _tell(command: str, said: bytes | None, end: str) -> None:
     print(f"$ {command.partition(chr(10))[0]}\n{text}  [{end}]\n", end="", flush=True)
 
 
-def chains_of(blocks: Sequence[Block]) -> list[list[Block]]:
-    """Return the blocks to run, those together that share a directory."""
-    chains: list[list[Block]] = []
-    for block in blocks:
-        if block.marks & {"skip", "in-tests"} or not block.commands:
-            continue
-        if "continue" in block.marks and chains:
-            chains[-1].append(block)
-        else:
-            chains.append([block])
-    return chains
-
-
 def run_chain(chain: Sequence[Block]) -> list[str]:
     """Run blocks one after the other in a new directory; return a sentence for each that failed."""
     failures: list[str] = []
@@ -190,10 +167,17 @@ def run_chain(chain: Sequence[Block]) -> list[str]:
 
 
 def run_blocks(blocks: Sequence[Block]) -> list[str]:
-    """Run blocks, chains of them side by side; return one sentence for each that failed."""
+    """Run blocks, side by side but for those that share a directory; say which failed."""
+    chains: list[list[Block]] = []
+    for block in blocks:
+        if block.marks & {"skip", "in-tests"}:
+            continue
+        if "continue" in block.marks and chains:
+            chains[-1].append(block)
+        else:
+            chains.append([block])
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        chains = pool.map(run_chain, chains_of(blocks))
-        return [failure for failures in chains for failure in failures]
+        return [failure for failures in pool.map(run_chain, chains) for failure in failures]
 
 
 def pages() -> list[Path]:

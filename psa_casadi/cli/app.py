@@ -23,6 +23,7 @@ from psa_casadi.cli.export import c, fmu, modelica
 from psa_casadi.cli.export_ssp import ssp
 from psa_casadi.cli.failures import guarded, prepare
 from psa_casadi.cli.identify import identify
+from psa_casadi.cli.options import command
 from psa_casadi.cli.sample import sample
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.stacks import stacks
@@ -71,16 +72,16 @@ def _main(
 
 def _add(
     group: typer.Typer,
-    command: Callable[..., None],
+    function: Callable[..., None],
     example: str,
     name: str | None = None,
     **settings: bool,
 ) -> None:
     """Add a command; its first sentence stands whole in the list, its example on one line."""
-    first = (inspect.getdoc(command) or "").partition("\n\n")[0]
+    first = (inspect.getdoc(function) or "").partition("\n\n")[0]
     group.command(
         name, short_help=first, epilog=f"\b\nExample: {example}", context_settings=settings
-    )(guarded(command))
+    )(command(function))
 
 
 _add(app, demo, "psa demo my_demo")

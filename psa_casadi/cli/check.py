@@ -6,56 +6,28 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.expected import JunitOption, judge
-from psa_casadi.cli.screen import (
-    ColumnsOption,
-    EffectsOption,
-    ModelOption,
-    Quiet,
-    StackOption,
-    show,
-    show_table,
-    tell_written,
-    working,
-)
+import psa_casadi as psa
+from psa_casadi.cli.expected import judge
+from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.options import Columns, Junit, ModelFile, Reading, StackName
+from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.files import atomic_write
 
 
 def check(
-    fmu: Annotated[Path, typer.Argument(help="FMU to check.", show_default=False)],
-    model: ModelOption = None,
-    stack: StackOption = None,
-    evidence: Annotated[
-        bool,
-        typer.Option(
-            "--evidence", help="Play the run that the FMU carries as evidence, and compare it."
-        ),
-    ] = False,
-    record: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Record that the model comes from (may be repeated): is its error as stated?"
-        ),
-    ] = None,
-    columns: ColumnsOption = None,
-    portable: Annotated[
-        bool,
-        typer.Option(
-            "--portable", help="Its binary for Linux must load on old systems too: GNU libc 2.17."
-        ),
-    ] = False,
-    json: Annotated[Path | None, typer.Option(help="JSON file of all checks to write.")] = None,
-    junit: JunitOption = None,
-    effects: EffectsOption = None,
-    timeout: Annotated[
-        float, typer.Option(help="Seconds that the whole check may take.", min=0.1, max=1e6)
-    ] = 600.0,
-    memory: Annotated[
-        int,
-        typer.Option(
-            help="Memory that the FMU's code may take [MiB]; limited on Linux only.", min=64
-        ),
-    ] = 4096,
-    quiet: Quiet = False,
+    fmu: Path,
+    *,
+    model: ModelFile = None,
+    stack: StackName = None,
+    evidence: bool = False,
+    record: list[Path] | None = None,
+    columns: Columns = None,
+    portable: bool = False,
+    json: Path | None = None,
+    junit: Junit = None,
+    timeout: Annotated[float, typer.Option(min=0.1, max=1e6)] = 600.0,
+    memory: Annotated[int, typer.Option(min=64)] = 4096,
+    given: Given,
 ) -> None:
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
 
@@ -65,38 +37,38 @@ def check(
     of its own, with limits of time and memory, keeps its faults from the table.
     It is no sandbox: the code can read and write your files and use the
     network. Check an FMU that you do not trust in a container.
+
+    Options:
+        fmu: FMU to check.
+        evidence: Play the run that the FMU carries as evidence, and compare it.
+        record: Record that the model comes from (may be repeated): is its error as stated?
+        portable: Its binary for Linux must load on old systems too: GNU libc 2.17.
+        json: JSON file of all checks to write.
+        timeout: Seconds that the whole check may take.
+        memory: Memory that the FMU's code may take [MiB]; limited on Linux only.
     """
-    from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.check.check import check_fmu
-    from psa_casadi.files import atomic_write
     from psa_casadi.report.documents.files import check_file
     from psa_casadi.report.documents.junit import check_cases
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
     from psa_casadi.strict_json import json_text
 
-    given, began = Given(effects), time.perf_counter()
+    began = time.perf_counter()
     given.outputs({"--json": json, "--junit": junit}, [fmu, model])
     if not fmu.is_file():
         what = "is a directory" if fmu.is_dir() else "there is no such file"
         given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
     chosen = given.model_or_stack(model, stack, any_model=True, needed=False)
-    records = given.records(record, columns=columns) if record else ()
+    records = given.records(record, Reading(columns=columns)) if record else ()
     given.check()
-    with working("checking", quiet):
-        report = check_fmu(
-            fmu,
-            chosen,
-            effects=given.effects,
-            timeout=timeout,
-            memory=memory << 20,
-            evidence=evidence,
-            records=records,
-            portable=portable,
-        )
-    show_table(check_table(report), quiet)
-    show(f"\n{check_sentence(report)}", quiet)
+    with working("checking", given.quiet):
+        report = psa.check_fmu(
+            fmu, chosen, effects=given.own, timeout=timeout, memory=memory << 20,
+            evidence=evidence, records=records, portable=portable,
+        )  # fmt: skip
+    show_table(check_table(report), given.quiet)
+    show(f"\n{check_sentence(report)}", given.quiet)
     if json is not None:
         atomic_write(json, json_text(check_file(report)))
-        tell_written(json, quiet=quiet)
+        tell_written(json, quiet=given.quiet)
     judge("check", fmu.name, check_cases(report), junit, began)

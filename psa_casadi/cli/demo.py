@@ -1,19 +1,18 @@
 """`psa demo`: the whole story on a synthetic record that ships with the package."""
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+import psa_casadi as psa
+from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.screen import Quiet, show, show_table, width, working
 from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY
-
-if TYPE_CHECKING:
-    from psa_casadi.model.compose import Model
-    from psa_casadi.records.record import Record
+from psa_casadi.errors import InputError
+from psa_casadi.files import atomic_write, make_folder
 
 RECORD = "synthetic_record.csv"
 FILES = {
@@ -45,53 +44,52 @@ Where a column cannot be told, the message ends with the option to type. Without
 
 
 def demo(
-    directory: Annotated[
-        Path | None,
-        typer.Argument(help="Where to leave the files; it is created.", show_default="psa_demo"),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="The same as DIRECTORY.")
-    ] = None,
+    directory: Annotated[Path | None, typer.Argument(show_default="psa_demo")] = None,
+    *,
+    output: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
-    """Identify, diagnose, extend, export and check a stack, on a synthetic record."""
+    """Identify, diagnose, extend, export and check a stack, on a synthetic record.
+
+    Options:
+        directory: Where to leave the files; it is created.
+        output: The same as DIRECTORY.
+    """
     from psa_casadi.diagnosis.diagnose import diagnose
-    from psa_casadi.export.check.check import check_fmu
-    from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.fmu.platforms import make_compiler_ready
-    from psa_casadi.files import atomic_write
     from psa_casadi.identification.identify import identify
-    from psa_casadi.model.model_file import save_model
-    from psa_casadi.records import read_record
-    from psa_casadi.report.page.results import write_report
-    from psa_casadi.report.plots.figures import save_figure
+    from psa_casadi.identification.start.ordinary import starting_model
     from psa_casadi.report.words.tables import check_table
-    from psa_casadi.report.words.text import check_sentence, story
+    from psa_casadi.report.words.text import check_sentence
     from psa_casadi.simulation.side_by_side import compiled_ahead
     from psa_casadi.simulation.stepper import make_ready
 
     directory, paths = _prepared(directory, output)
-    record = read_record(paths[RECORD], need_excitation=True)
+    record = psa.read_record(paths[RECORD], need_excitation=True)
     show("A synthetic record, made by a simulated stack with one effect hidden in it.", quiet)
+    start = starting_model([record])
+    searched = (  # the last ones first, see `diagnose`
+        start.with_effect(e) for e in reversed(psa.EFFECTS.values()) if not e.needs_column
+    )
     with (
         working("identifying", quiet, IDENTIFY) as progress,
-        compiled_ahead(_searched(record), first=[make_compiler_ready]),
+        compiled_ahead(searched, first=[make_compiler_ready]),
     ):
-        save_model(identify([record], progress=progress).model, paths["model.json"])
+        psa.save_model(identify([record], progress=progress).model, paths["model.json"])
     with ThreadPoolExecutor(1) as beside, working("diagnosing", quiet, DIAGNOSE) as progress:
         d = diagnose([record], progress=progress)
-        exported = beside.submit(export_fmu, d.model, paths["extended.fmu"])
+        exported = beside.submit(psa.export_fmu, d.model, paths["extended.fmu"])
         beside.submit(make_ready, d.model.plant())  # the check simulates with it
-        save_model(d.model, paths["extended.json"])
+        psa.save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
         extended = str(paths["extended.json"])
-        write_report(d, paths["report.html"], origin=_ORIGIN, model_file=extended)
-        save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
-    told = story(d, origin=_ORIGIN, width=width(), model_file=extended)
+        psa.write_report(d, paths["report.html"], origin=_ORIGIN, model_file=extended)
+        psa.save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
+    told = psa.story(d, origin=_ORIGIN, width=width(), model_file=extended)
     show(f"\n{told}\n\n{HIDDEN}\n", quiet)
     with working("exporting and checking the FMU", quiet):
         exported.result()
-        checked = check_fmu(paths["extended.fmu"], d.model)
+        checked = psa.check_fmu(paths["extended.fmu"], d.model)
     show_table(check_table(checked), quiet)
     files = "\n".join(f"  {name:<20}  {meaning}" for name, meaning in FILES.items())
     show(f"\n{check_sentence(checked)}\n\nleft in {directory}:\n{files}", quiet)
@@ -100,27 +98,13 @@ def demo(
     show(NEXT.format(report=paths["report.html"]), quiet)
 
 
-def _searched(record: "Record") -> "Iterator[Model]":
-    """Yield the models that the diagnosis will try, the last ones first (see `diagnose`)."""
-    from psa_casadi.effects import EFFECTS
-    from psa_casadi.identification.start.ordinary import starting_model
-
-    start = starting_model([record])
-    return (start.with_effect(e) for e in reversed(EFFECTS.values()) if not e.needs_column)
-
-
 def _prepared(named: Path | None, output: Path | None) -> tuple[Path, dict[str, Path]]:
     """Create the directory, check that every file can be written, copy the record to it."""
-    from psa_casadi.cli.inputs import Given
-    from psa_casadi.errors import InputError
-    from psa_casadi.files import atomic_write, make_folder
-
     if named is not None and output is not None:
         raise InputError(f"{named} and -o {output} name two directories; leave one of them out.")
     directory = named or output or Path("psa_demo")
     make_folder(directory)
-    paths = {name: directory / name for name in FILES}
-    given = Given()
+    paths, given = {name: directory / name for name in FILES}, Given()
     given.outputs(paths, [])
     given.check()
     packaged = resources.files("psa_casadi").joinpath("data", "demo.csv")

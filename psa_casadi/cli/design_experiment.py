@@ -1,186 +1,111 @@
 """`psa design experiment`: the next record to measure, for parameters or to tell effects apart."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from psa_casadi.cli.completion import names
-from psa_casadi.cli.screen import (
-    ColumnsOption,
-    EffectsOption,
-    ModelOption,
-    Quiet,
-    SampleTimeOption,
-    StackOption,
-    StillOption,
-    show,
-    show_table,
-    tell_written,
-    working,
-)
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from psa_casadi.design.experiment.criteria import Rival
-    from psa_casadi.design.experiment.experiment import Informative, Separated
-    from psa_casadi.model.compose import Model
-
-
-class Family(StrEnum):
-    """Families of voltages."""
-
-    ANY = "any"
-    FREE = "free"
-    TRIANGLES = "triangles"
-    STEPS = "steps"
-    MULTISINE = "multisine"
-
-
-class Optimality(StrEnum):
-    """What is made small of the parameters' confidence region."""
-
-    D = "D"
-    E = "E"
-    A = "A"
+import psa_casadi as psa
+from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.options import ModelFile, Reading, StackName, Still, names
+from psa_casadi.cli.screen import show, show_table, tell_written, working
 
 
 def experiment(
     more: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Further effects to separate.",
-            show_default=False,
-            metavar="EFFECT",
-            autocompletion=names("effects"),
-        ),
+        typer.Argument(show_default=False, metavar="EFFECT", autocompletion=names("effects")),
     ] = None,
-    model: ModelOption = None,
-    stack: StackOption = None,
-    record: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--record",
-            help="Record already measured (repeat for several); the rivals are fitted"
-            " to it, and the design has its voltages and length.",
-        ),
-    ] = None,
-    separate: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--separate",
-            help="Effect to separate from the others that are named.",
-            autocompletion=names("effects"),
-        ),
-    ] = None,
-    parameter: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--parameter",
-            help="Parameter to determine (repeat for several); all that"
-            " records of loops determine where none is named.",
-        ),
-    ] = None,
-    optimality: Annotated[
-        Optimality, typer.Option(help="Volume, worst direction or mean square of the intervals.")
-    ] = Optimality.D,
-    family: Annotated[Family, typer.Option(help="Family of voltages.")] = Family.ANY,
-    low: Annotated[float | None, typer.Option(help="Lowest voltage [V].")] = None,
-    high: Annotated[float | None, typer.Option(help="Highest voltage [V].")] = None,
-    duration: Annotated[float | None, typer.Option(help="Length of the record [s].")] = None,
-    samples: Annotated[int | None, typer.Option(help="Number of samples.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Largest rate [V/s].")] = None,
-    current: Annotated[float | None, typer.Option(help="Largest current [A].")] = None,
-    bandwidth: Annotated[float | None, typer.Option(help="Bandwidth [Hz].")] = None,
-    noise: Annotated[
-        float | None, typer.Option(help="Noise of the sensor, rms [nm]; 0.1 % of the stroke.")
-    ] = None,
-    correlation: Annotated[
-        float, typer.Option(help="Correlation of the noise in neighbouring samples.")
-    ] = 0.0,
-    starts: Annotated[int, typer.Option(help="Voltages that are improved, at most.")] = 2,
-    seed: Annotated[int, typer.Option(help="Seed of the drawn voltages.")] = 1,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="CSV with the voltage to apply.")
-    ] = None,
-    report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
-    still: StillOption = False,
-    columns: ColumnsOption = None,
-    sample_time: SampleTimeOption = None,
-    own: EffectsOption = None,
-    quiet: Quiet = False,
+    *,
+    model: ModelFile = None,
+    stack: StackName = None,
+    record: list[Path] | None = None,
+    separate: Annotated[list[str] | None, typer.Option(autocompletion=names("effects"))] = None,
+    parameter: list[str] | None = None,
+    optimality: Literal["D", "E", "A"] = "D",
+    family: Literal["any", "free", "triangles", "steps", "multisine"] = "any",
+    low: float | None = None,
+    high: float | None = None,
+    duration: float | None = None,
+    samples: int | None = None,
+    rate: float | None = None,
+    current: float | None = None,
+    bandwidth: float | None = None,
+    noise: float | None = None,
+    correlation: float = 0.0,
+    starts: int = 2,
+    seed: int = 1,
+    output: Path | None = None,
+    report: Path | None = None,
+    still: Still = False,
+    reading: Reading,
+    given: Given,
 ) -> None:
     """Design the record to measure next: best for parameters, or to separate effects.
 
     With --separate the rivals are fitted to the records given, else they have ordinary sizes.
-    """
-    from psa_casadi.cli import design_given
-    from psa_casadi.cli.inputs import Given
-    from psa_casadi.design.experiment.search import Effort
 
-    given = Given(own, quiet=quiet)
+    Options:
+        more: Further effects to separate.
+        record: Record already measured (repeat for several); the rivals are fitted to it, and the
+            design has its voltages and length.
+        separate: Effect to separate from the others that are named.
+        parameter: Parameter to determine (repeat for several); all that records of loops determine
+            where none is named.
+        optimality: Volume, worst direction or mean square of the intervals.
+        family: Family of voltages.
+        low: Lowest voltage [V].
+        high: Highest voltage [V].
+        duration: Length of the record [s].
+        samples: Number of samples.
+        rate: Largest rate [V/s].
+        current: Largest current [A].
+        bandwidth: Bandwidth [Hz].
+        noise: Noise of the sensor, rms [nm]; 0.1 % of the stroke.
+        correlation: Correlation of the noise in neighbouring samples.
+        starts: Voltages that are improved, at most.
+        seed: Seed of the drawn voltages.
+        output: CSV with the voltage to apply.
+        report: HTML page to write.
+    """
+    from psa_casadi.cli import design_experiment_runs as runs
+    from psa_casadi.design.experiment.search import Effort
+    from psa_casadi.report.words.design_words import design_tables, sentences
+
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
-    effects = design_given.effects(given, [*(separate or []), *(more or [])], parameter or [])
+    effects = runs.effects_of(given, [*(separate or []), *(more or [])], parameter or [])
     chosen = given.model_or_stack(model, stack)
-    records = given.records(record, columns=columns, sample_time=sample_time) if record else []
-    design_given.check_noise(given, noise, correlation, starts)
+    records = given.records(record, reading) if record else []
+    if noise is not None and not noise > 0.0:
+        given.add(f"--noise is {noise:g} nm; give the positive rms of the sensor's noise.")
+    if not 0.0 <= correlation < 1.0:
+        given.add(f"--correlation is {correlation:g}; give a number from 0 to below 1.")
+    if starts < 1:
+        given.add(f"--starts is {starts}; give 1 or more.")
     wanted = {
         "low": low, "high": high, "duration": duration, "samples": samples,
         "rate": rate, "current": current, "bandwidth": bandwidth,
     }  # fmt: skip
     limits = None
     if records or not record:
-        limits = given.attempt(lambda: design_given.limits(records, chosen, wanted))
+        limits = given.attempt(lambda: runs.limits_given(records, chosen, wanted))
     given.check()
     if chosen is None or limits is None:
         return
-    level = design_given.noise(chosen, limits, noise, correlation)
-    plan = design_given.Plan(limits, level, family.value, Effort(starts=starts, seed=seed))
-    design: Informative | Separated
-    with working("designing an experiment", quiet) as progress:
-        if effects:
-            design, rivals = design_given.separating(chosen, effects, records, plan, progress)
-        else:
-            design, rivals = design_given.informative(
-                chosen, parameter or [], optimality.value, plan, progress
-            )
-        _write(design, chosen, rivals, output, (report, still))
-    _tell(design, chosen, quiet)
-    tell_written(output, report, quiet=quiet)
-
-
-def _write(
-    design: "Informative | Separated",
-    model: "Model",
-    rivals: "Sequence[Rival]",
-    output: Path | None,
-    page: tuple[Path | None, bool],
-) -> None:
-    from psa_casadi.records import write_record
-    from psa_casadi.report.page.designs import write_experiment_page
-    from psa_casadi.report.page.live import live_design
-    from psa_casadi.simulation.simulate import simulate
-
-    time, voltage = design.record.time, design.record.voltage
-    if output is not None:
-        write_record(output, {"time [s]": time, "voltage [V]": voltage})
-    report, still = page
-    if report is None:
-        return
-    live = None
-    if not still:
-        live = live_design(model, (time, voltage, simulate(model, time, voltage).displacement))
-    responses = {r.name: r.predict(design.record, r.truth) for r in rivals}
-    write_experiment_page(report, design, model, responses, live)
-
-
-def _tell(design: "Informative | Separated", model: "Model", quiet: bool) -> None:
-    from psa_casadi.report.words.design_words import design_tables, sentences
-
-    for sentence in sentences(design, model.values.get("C_p")):
-        show(sentence, quiet)
-    for shown in design_tables(design, model):
-        show(f"\n{shown.title}\n", quiet)
-        show_table(shown.table, quiet)
+    with working("designing an experiment", given.quiet) as progress:
+        design, rivals = runs.designed(
+            chosen, effects, records, parameters=parameter or [], optimality=optimality,
+            limits=limits, noise=runs.noise_of(chosen, limits, noise, correlation),
+            family=family, effort=Effort(starts=starts, seed=seed), progress=progress,
+        )  # fmt: skip
+        if output is not None:
+            columns = {"time [s]": design.record.time, "voltage [V]": design.record.voltage}
+            psa.write_record(output, columns)
+        if report is not None:
+            runs.write_page(report, design, chosen, rivals, still)
+    for sentence in sentences(design, chosen.values.get("C_p")):
+        show(sentence, given.quiet)
+    for shown in design_tables(design, chosen):
+        show(f"\n{shown.title}\n", given.quiet)
+        show_table(shown.table, given.quiet)
+    tell_written(output, report, quiet=given.quiet)

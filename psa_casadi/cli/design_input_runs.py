@@ -1,18 +1,18 @@
 """What `psa design input` does once its input is checked: design, write, show."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
-from psa_casadi.design.tracking.minimum_time import QuickMove, quickest_move
+from psa_casadi.design.tracking.minimum_time import quickest_move
 from psa_casadi.design.tracking.targets import (
     AmplifierLimits,
     Response,
@@ -22,23 +22,14 @@ from psa_casadi.design.tracking.targets import (
     error_of,
     uncompensated,
 )
-from psa_casadi.design.tracking.tracking import TrackedInput
 from psa_casadi.design.tracking.tracking import track as tracked
-from psa_casadi.model.compose import Model
-from psa_casadi.records import Record, write_record
-from psa_casadi.report.page.designs import (
-    inversion_pictures,
-    move_pictures,
-    tracking_pictures,
-    trial_pictures,
-    write_design_page,
-)
-from psa_casadi.report.page.live import LiveModel, live_design
+from psa_casadi.export.importer import masters
+from psa_casadi.report.page import designs
+from psa_casadi.report.page.document import Picture
+from psa_casadi.report.page.live import live_design
 from psa_casadi.report.words.design_words import Titled, error_table, limits_table
 from psa_casadi.report.words.phrases import number
-
-if TYPE_CHECKING:
-    from psa_casadi.report.page.document import Picture
+from psa_casadi.units import FloatArray
 
 _Rows = list[tuple[str, TrackingError]]
 
@@ -47,7 +38,7 @@ _Rows = list[tuple[str, TrackingError]]
 class Task:
     """A stack, the limits, the files to write, and how to judge."""
 
-    plant: Model
+    plant: "psa.Model"
     limits: AmplifierLimits
     output: Path
     report: Path | None
@@ -62,40 +53,32 @@ def track(task: Task, path: Target, minimax: bool) -> None:
         found = tracked(task.plant, path, task.limits, minimax=minimax, progress=progress)
         plain = uncompensated(task.plant, path).displacement
         rows: _Rows = [("designed, full simulator", found.error)]
-        if task.check_fmu:
-            progress("exported FMU")
-            with _keeping(task, found.response):
-                rows.append(("designed, exported FMU", _on_fmu(task, path, found.voltage)))
+        for reached in _on_fmu(task, found.response, progress):
+            rows.append(("designed, exported FMU", error_of(path, reached)))
+    said = f"{len(path.time)} samples in {number(found.seconds)} s"
     if found.by_program:
         rows.append(("designed, the program itself", error_of(path, found.predicted)))
+        how = [
+            f"{said}, {found.iterations} iterations of IPOPT.",
+            f"Kinks at reversals were rounded over {number(found.width)} V/s in the program only.",
+        ]
+        if not found.converged:
+            how.append("IPOPT ran out of iterations: a better voltage within limits may exist.")
+    else:
+        how = [
+            f"{said}.",
+            "The program (IPOPT) found no better voltage within the limits, so this is the"
+            " inversion cut by them and corrected by trials on the simulator. A better one may"
+            " exist.",
+        ]
     rows += [
         ("inversion without limits, full simulator", found.inverse.error),
         ("uncompensated, full simulator", error_of(path, plain)),
     ]
-    summary = [_follows(found.error), *binding(found.response, task.limits), *_how(found)]
-    tables = (error_table(rows), limits_table(found.response, task.limits))
+    summary = [_follows(found.error), *binding(found.response, task.limits), *how]
     badge = "least largest error" if minimax else "least squares"
-    _finish(task, "Designed input", summary, tables, tracking_pictures(found, plain),
-            found.response, badge, path=path)  # fmt: skip
-
-
-def _how(found: TrackedInput) -> list[str]:
-    """Return sentences on how a design came about and what it is worth."""
-    said = [f"{len(found.target.time)} samples in {number(found.seconds)} s."]
-    if not found.by_program:
-        said.append(
-            "The program (IPOPT) found no better voltage within the limits, so this is the"
-            " inversion cut by them and corrected by trials on the simulator. A better one may"
-            " exist."
-        )
-        return said
-    said[0] = f"{said[0][:-1]}, {found.iterations} iterations of IPOPT."
-    said.append(
-        f"Kinks at reversals were rounded over {number(found.width)} V/s in the program only."
-    )
-    if not found.converged:
-        said.append("IPOPT ran out of iterations: a better voltage within limits may exist.")
-    return said
+    pictures = designs.tracking_pictures(found, plain)
+    _finish(task, "Designed input", summary, rows, pictures, found.response, badge, path=path)
 
 
 def invert(task: Task, path: Target) -> None:
@@ -103,21 +86,15 @@ def invert(task: Task, path: Target) -> None:
     with working("inverting", task.quiet) as progress:
         found = inverted(task.plant, path, task.limits)
         rows: _Rows = [("inversion, full simulator", found.error)]
-        if task.check_fmu:
-            progress("exported FMU")
-            with _keeping(task, found.response):
-                error = _on_fmu(task, path, found.response.voltage)
-            rows.append(("inversion, exported FMU", error))
+        for reached in _on_fmu(task, found.response, progress):
+            rows.append(("inversion, exported FMU", error_of(path, reached)))
     summary = [_follows(found.error), *binding(found.response, task.limits)]
     summary.append(f"{len(found.trials)} trials on the simulator.")
-    tables = (error_table(rows), limits_table(found.response, task.limits))
-    pictures = inversion_pictures(found, task.limits)
-    _finish(
-        task, "Inverted input", summary, tables, pictures, found.response, "inversion", path=path
-    )
+    pictures = designs.inversion_pictures(found, task.limits)
+    _finish(task, "Inverted input", summary, rows, pictures, found.response, "inversion", path=path)
 
 
-def correct(task: Task, path: Target, trial: Record) -> None:
+def correct(task: Task, path: Target, trial: "psa.Record") -> None:
     """Correct the voltage of a trial by what it showed."""
     with working("correcting", task.quiet):
         found = corrected(task.plant, path, trial, task.limits)
@@ -129,12 +106,10 @@ def correct(task: Task, path: Target, trial: Record) -> None:
         " is worth.",
         *binding(found.response, task.limits),
     ]
-    tables = (
-        error_table([("the trial, measured", found.error)]),
-        limits_table(found.response, task.limits),
+    rows, pictures = [("the trial, measured", found.error)], designs.trial_pictures(found)
+    _finish(
+        task, "Corrected input", summary, rows, pictures, found.response, "one trial", path=path
     )
-    _finish(task, "Corrected input", summary, tables, trial_pictures(found), found.response,
-            "one trial", path=path)  # fmt: skip
 
 
 def move(task: Task, ends: tuple[float, float]) -> None:
@@ -142,28 +117,19 @@ def move(task: Task, ends: tuple[float, float]) -> None:
     with working("designing", task.quiet) as progress:
         begin, end = (1e-6 * position for position in ends)
         found = quickest_move(task.plant, begin, end, task.limits, progress=progress)
-        summary = _moves(found)
-        if task.check_fmu:
-            progress("exported FMU")
-            response = found.response
-            with _keeping(task, response):
-                shown = _played(task, response.time, response.voltage)
-            worst = np.max(np.abs(shown - response.displacement)) / abs(end - begin)
+        summary = [
+            f"The move takes {number(1e6 * found.move_time)} us; the linear part alone would take"
+            f" {number(1e6 * found.linear_time)} us.",
+            f"Behind it the displacement swings by {number(100.0 * found.residual, 2)} % of the"
+            f" move at most, {number(100.0 * found.offset, 2)} % off its end, by the simulator.",
+        ]
+        for reached in _on_fmu(task, found.response, progress):
+            worst = np.max(np.abs(reached - found.response.displacement)) / abs(end - begin)
             summary.append(
                 f"The exported FMU differs from the simulator by {number(100.0 * worst, 2)} % of"
                 " the move at most."
             )
-    tables = (limits_table(found.response, task.limits),)
-    _finish(task, "Quickest move", summary, tables, move_pictures(found), found.response)
-
-
-def _moves(found: QuickMove) -> list[str]:
-    return [
-        f"The move takes {number(1e6 * found.move_time)} us; the linear part alone would take"
-        f" {number(1e6 * found.linear_time)} us.",
-        f"Behind it the displacement swings by {number(100.0 * found.residual, 2)} % of the"
-        f" move at most, {number(100.0 * found.offset, 2)} % off its end, by the simulator.",
-    ]
+    _finish(task, "Quickest move", summary, [], designs.move_pictures(found), found.response)
 
 
 def _follows(error: TrackingError) -> str:
@@ -190,39 +156,38 @@ def _write(task: Task, response: Response) -> None:
         "voltage [V]": response.voltage,
         "displacement [um]": 1e6 * response.displacement,
     }
-    write_record(task.output, columns)
+    psa.write_record(task.output, columns)
 
 
-def _on_fmu(task: Task, path: Target, voltage: np.ndarray) -> TrackingError:
-    return error_of(path, _played(task, path.time, voltage))
-
-
-def _played(task: Task, time: np.ndarray, voltage: np.ndarray) -> np.ndarray:
-    from psa_casadi.export.importer.masters import played_on_fmu
-
-    return played_on_fmu(task.plant, time, voltage)
-
-
-def _live(task: Task, response: Response, path: Target | None) -> LiveModel | None:
-    """Begin what lets the stack run in the page, unless that is to be still."""
-    if task.still:
-        return None
-    played = (response.time, response.voltage, response.displacement)
-    wanted = None if path is None else path.displacement
-    return live_design(task.plant, played, wanted, rest=True)
+def _on_fmu(
+    task: Task, response: Response, progress: Callable[[str], None]
+) -> Iterator[FloatArray]:
+    """Yield the displacement (n,) [m] of the exported FMU, unless it is not to be checked."""
+    if task.check_fmu:
+        progress("exported FMU")
+        with _keeping(task, response):
+            reached = masters.played_on_fmu(task.plant, response.time, response.voltage)
+        yield reached
 
 
 def _finish(
-    task: Task, title: str, summary: Sequence[str], tables: Sequence[Titled],
-    pictures: "Sequence[Picture]", response: Response, *badges: str, path: Target | None = None,
+    task: Task, title: str, summary: Sequence[str], rows: _Rows,
+    pictures: Sequence[Picture], response: Response, *badges: str, path: Target | None = None,
 ) -> None:  # fmt: skip
     """Write CSV and page, show sentences and tables."""
+    tables: list[Titled] = [error_table(rows)] if rows else []
+    tables.append(limits_table(response, task.limits))
     with _keeping(task, response):
         _write(task, response)
         if task.report is not None:
-            write_design_page(
+            live = None
+            if not task.still:
+                played = (response.time, response.voltage, response.displacement)
+                wanted = None if path is None else path.displacement
+                live = live_design(task.plant, played, wanted, rest=True)
+            designs.write_design_page(
                 task.report, title=title, summary=summary, tables=tables, figures=pictures,
-                badges=badges, live=_live(task, response, path),
+                badges=badges, live=live,
             )  # fmt: skip
     for sentence in summary:
         show(sentence, task.quiet)

@@ -1,90 +1,63 @@
 """`psa design mechanism`: mass, damping and stiffness of a prestress mechanism."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Literal
 
-import typer
-
-from psa_casadi.cli.screen import (
-    EffectsOption,
-    ModelOption,
-    Quiet,
-    StackOption,
-    StillOption,
-    show,
-    show_table,
-    tell_written,
-    working,
-)
-
-if TYPE_CHECKING:
-    from psa_casadi.design.mechanism.mechanism import MechanismDesign
-
-
-class ActsOn(StrEnum):
-    """Where the mechanism's force acts."""
-
-    WAFERS = "wafers"
-    TIP = "tip"
+import psa_casadi as psa
+from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.options import ModelFile, StackName, Still
+from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.errors import InputError
 
 
 def mechanism(
-    output: Annotated[Path, typer.Option("-o", "--output", help="MECHANISM.json to write.")],
-    model: ModelOption = None,
-    stack: StackOption = None,
-    damping: Annotated[
-        float | None, typer.Option(help="Least damping ratio of all mechanical poles.")
-    ] = None,
-    bandwidth: Annotated[
-        float | None, typer.Option(help="Least bandwidth of the mechanics [Hz].")
-    ] = None,
-    poles: Annotated[
-        str | None,
-        typer.Option(help="One or two pairs of poles [rad/s]: -4e4+4e4j,-4e4-4e4j"),
-    ] = None,
-    max_stroke_loss: Annotated[
-        str, typer.Option(help="Share of the stroke that the stiffness may take.")
-    ] = "10%",
-    max_force: Annotated[
-        float | None,
-        typer.Option(help="Largest force in the mechanism in a step of rated voltage [N]."),
-    ] = None,
-    min_mass: Annotated[float, typer.Option(help="Least mass [kg].")] = 0.0,
-    max_mass: Annotated[float, typer.Option(help="Largest mass [kg].")] = 1.0,
-    max_damping: Annotated[float, typer.Option(help="Largest damping [N.s/m].")] = 1e5,
-    acts_on: Annotated[
-        ActsOn,
-        typer.Option(
-            help="Where it acts: on all of the mechanics as in the paper, or on the output mass."
-        ),
-    ] = ActsOn.WAFERS,
-    starts: Annotated[int, typer.Option(help="Starts of the search.")] = 6,
-    port: Annotated[
-        Path | None,
-        typer.Option(help="Also write the stack with the port that the mechanism couples to."),
-    ] = None,
-    report: Annotated[Path | None, typer.Option(help="HTML page to write.")] = None,
-    still: StillOption = False,
-    effects: EffectsOption = None,
-    quiet: Quiet = False,
+    *,
+    output: Path,
+    model: ModelFile = None,
+    stack: StackName = None,
+    damping: float | None = None,
+    bandwidth: float | None = None,
+    poles: str | None = None,
+    max_stroke_loss: str = "10%",
+    max_force: float | None = None,
+    min_mass: float = 0.0,
+    max_mass: float = 1.0,
+    max_damping: float = 1e5,
+    acts_on: Literal["wafers", "tip"] = "wafers",
+    starts: int = 6,
+    port: Path | None = None,
+    report: Path | None = None,
+    still: Still = False,
+    given: Given,
 ) -> None:
     """Design a prestress mechanism for a wanted damping, bandwidth or poles, within limits.
 
     MECHANISM.json is a model: `psa export fmu --model MECHANISM.json` makes an FMU of it.
-    """
-    from psa_casadi.cli.inputs import Given
-    from psa_casadi.design.mechanism.mechanism import (
-        check_goals,
-        design_mechanism,
-        mechanism_model,
-        port_model,
-    )
-    from psa_casadi.design.mechanism.search import Limits
-    from psa_casadi.model.model_file import save_model
-    from psa_casadi.report.page.designs import write_mechanism_page
 
-    given = Given(effects)
+    Options:
+        output: MECHANISM.json to write.
+        damping: Least damping ratio of all mechanical poles.
+        bandwidth: Least bandwidth of the mechanics [Hz].
+        poles: One or two pairs of poles [rad/s]: -4e4+4e4j,-4e4-4e4j
+        max_stroke_loss: Share of the stroke that the stiffness may take.
+        max_force: Largest force in the mechanism in a step of rated voltage [N].
+        min_mass: Least mass [kg].
+        max_mass: Largest mass [kg].
+        max_damping: Largest damping [N.s/m].
+        acts_on: Where it acts: on all of the mechanics as in the paper, or on the output mass.
+        starts: Starts of the search.
+        port: Also write the stack with the port that the mechanism couples to.
+        report: HTML page to write.
+    """
+    from psa_casadi.design.mechanism.mechanism import check_goals
+    from psa_casadi.design.mechanism.search import Limits
+    from psa_casadi.report.page.designs import write_mechanism_page
+    from psa_casadi.report.words.design_words import (
+        mechanism_sentences,
+        mechanism_table,
+        pole_table,
+    )
+
     given.outputs({"--output": output, "--port": port, "--report": report}, [model])
     chosen = given.model_or_stack(model, stack)
     wanted = given.attempt(lambda: _poles(poles))
@@ -95,39 +68,27 @@ def mechanism(
     given.check()
     if chosen is None or wanted is None:
         return
-    with working("designing", quiet) as progress:
+    with working("designing", given.quiet) as progress:
         progress(f"{starts} starts")
-        design = design_mechanism(
+        design = psa.design_mechanism(
             chosen, damping=damping, bandwidth=bandwidth, poles=wanted, limits=limits,
-            acts_on=acts_on.value, starts=starts,
+            acts_on=acts_on, starts=starts,
         )  # fmt: skip
-    save_model(mechanism_model(design), output)
+    psa.save_model(psa.mechanism_model(design), output)
     if port is not None:
-        save_model(port_model(chosen), port)
+        psa.save_model(psa.port_model(chosen), port)
     if report is not None:
         write_mechanism_page(design, report, chosen, still=still)
-    _tell(design, quiet)
-    tell_written(output, port, report, quiet=quiet)
-
-
-def _tell(design: "MechanismDesign", quiet: bool) -> None:
-    from psa_casadi.report.words.design_words import (
-        mechanism_sentences,
-        mechanism_table,
-        pole_table,
-    )
-
     for sentence in mechanism_sentences(design):
-        show(sentence, quiet)
+        show(sentence, given.quiet)
     for table in (mechanism_table(design), pole_table(design)):
-        show("", quiet)
-        show_table(table, quiet)
+        show("", given.quiet)
+        show_table(table, given.quiet)
+    tell_written(output, port, report, quiet=given.quiet)
 
 
 def _poles(text: str | None) -> tuple[complex, ...]:
     """Read poles in rad/s, such as -4e4+4e4j,-4e4-4e4j."""
-    from psa_casadi.errors import InputError
-
     found = []
     for part in (text or "").split(","):
         if not part.strip():
@@ -143,8 +104,6 @@ def _poles(text: str | None) -> tuple[complex, ...]:
 
 def _share(text: str) -> float:
     """Read a share: 10% or 0.1."""
-    from psa_casadi.errors import InputError
-
     percent = text.strip().endswith("%")
     try:
         value = float(text.strip().removesuffix("%"))

@@ -1,16 +1,27 @@
 """The files of `psa diagnose`: what was asked for, and what an interrupt leaves of it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import psa_casadi as psa
 from psa_casadi.cli.failures import kept
+from psa_casadi.design.experiment import experiment
+from psa_casadi.diagnosis.result import (
+    Alternative,
+    Diagnosis,
+    DiagnosisInterrupted,
+    NextExperiment,
+)
+from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.errors import PsaError
+from psa_casadi.files import atomic_write
+from psa_casadi.records import write_record
+from psa_casadi.report.words.design_words import sentences
+from psa_casadi.report.words.phrases import added
 
-if TYPE_CHECKING:
-    from psa_casadi.diagnosis.result import Alternative, Diagnosis, DiagnosisInterrupted
 
-
-def alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative, Path]]":
+def alternatives(d: Diagnosis, output: Path | None) -> list[tuple[Alternative, Path]]:
     """Return the models with another cause, each with its file beside the extended model's."""
     if output is None:
         return []
@@ -20,20 +31,16 @@ def alternatives(d: "Diagnosis", output: Path | None) -> "list[tuple[Alternative
     ]
 
 
-def noted(d: "Diagnosis", left_out: Sequence[str]) -> "Diagnosis":
+def noted(d: Diagnosis, left_out: Sequence[str]) -> Diagnosis:
     """Say in the remarks which effects were not looked for."""
-    from dataclasses import replace
-
     if not left_out:
         return d
     names = ", ".join(dict.fromkeys(left_out))
     return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
 
 
-def models(d: "Diagnosis", output: Path | None) -> list[str]:
+def models(d: Diagnosis, output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
-    from psa_casadi.report.words.phrases import added
-
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"
         for a, path in alternatives(d, output)
@@ -43,20 +50,16 @@ def models(d: "Diagnosis", output: Path | None) -> list[str]:
     return lines
 
 
-def keep_unfinished(stop: "DiagnosisInterrupted", outputs: Mapping[str, Path | None]) -> str:
+def keep_unfinished(stop: DiagnosisInterrupted, outputs: Mapping[str, Path | None]) -> str:
     """Write the best model so far, and say that."""
-    from psa_casadi.model.model_file import save_model
-
     output = outputs["--output"]
     if output is not None:
-        save_model(stop.model, output)
+        psa.save_model(stop.model, output)
     missing = [p for o, p in outputs.items() if o != "--output"]
     return kept(f"there is no verdict; {stop}", [output], missing, " (marked as interrupted)")
 
 
-def keep(
-    d: "Diagnosis", outputs: Mapping[str, Path | None], origin: str, written: list[Path]
-) -> str:
+def keep(d: Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]) -> str:
     """Write what takes no time of a finished diagnosis, and say which files there are."""
     quick = ("--output", "--json")
     write(d, {o: p if o in quick else None for o, p in outputs.items()}, origin, written)
@@ -65,7 +68,7 @@ def keep(
 
 
 def write(
-    d: "Diagnosis",
+    d: Diagnosis,
     outputs: Mapping[str, Path | None],
     origin: str,
     written: list[Path],
@@ -73,9 +76,6 @@ def write(
     still: bool = False,
 ) -> None:
     """Write what was asked for, each file whole or not at all, and add it to what is `written`."""
-    import psa_casadi as psa
-    from psa_casadi.files import atomic_write
-
     extended = None if outputs["--output"] is None else str(outputs["--output"])
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
@@ -94,25 +94,16 @@ def write(
         written.append(path)
 
 
-def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> "Diagnosis":
+def with_next(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) -> Diagnosis:
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or d.verdict != "ambiguous":
         return d
-    from dataclasses import replace
-
-    from psa_casadi.design.experiment.experiment import resolving_experiment
-    from psa_casadi.diagnosis.result import NextExperiment
-    from psa_casadi.diagnosis.search.steps import one_of_each
-    from psa_casadi.errors import PsaError
-    from psa_casadi.records import write_record
-    from psa_casadi.report.words.design_words import sentences
-
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
         return d
     before = d.next_experiment
     try:
-        design = resolving_experiment(d, progress=progress)
+        design = experiment.resolving_experiment(d, progress=progress)
     except PsaError as error:
         reasons = (*before.reasons, f"No record could be designed: {error}")
         return replace(d, next_experiment=replace(before, reasons=reasons))
@@ -127,13 +118,10 @@ def with_next(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]
     return replace(d, next_experiment=following)
 
 
-def write_patch(d: "Diagnosis", path: Path | None, progress: Callable[[str], None]) -> str:
+def write_patch(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
     """Write the model with the unnamed correction; say why where there is none to write."""
     if path is None:
         return ""
-    import psa_casadi as psa
-    from psa_casadi.errors import PsaError
-
     progress("fitting the unnamed correction")
     try:
         psa.save_model(psa.patched_model(d), path)

@@ -4,288 +4,197 @@ import json
 import math
 import zipfile
 from collections.abc import Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from psa_casadi.cli.screen import (
-    AuthorOption,
-    CopyrightOption,
-    EffectsOption,
-    HistoryOption,
-    LicenseOption,
-    ModelOption,
-    ModelVersionOption,
-    PartOption,
-    Quiet,
-    RestOption,
-    StackOption,
-    StartVoltageOption,
-    SweepOption,
-    show,
-    show_inside,
-    show_table,
-    tell_written,
-    working,
+import psa_casadi as psa
+from psa_casadi.cli.inputs import Given, step_seconds
+from psa_casadi.cli.options import (
+    IncludeSensor,
+    ModelFile,
+    PartName,
+    Platforms,
+    Published,
+    StackName,
+    Start,
 )
-
-if TYPE_CHECKING:
-    from psa_casadi.model.compose import Model
-    from psa_casadi.report.words.tables import Table
-
-
-SensorOption = Annotated[
-    bool, typer.Option("--include-sensor", help="Keep effects of sensor and environment.")
-]
-
-
-class PrecisionName(StrEnum):
-    """Precisions of the numbers."""
-
-    DOUBLE = "double"
-    SINGLE = "single"
-
-
-class Hold(StrEnum):
-    """What inputs do over a step."""
-
-    LINEAR = "linear"
-    ZERO = "zero"
+from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.files import atomic_write, make_folder
 
 
 def c(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the two files.")],
-    step: Annotated[str, typer.Option(help="Time of a step with its unit, such as 10us.")],
-    model: Annotated[Path | None, typer.Option(help="MODEL.json to export.")] = None,
-    stack: StackOption = None,
-    part: Annotated[
-        str | None,
-        typer.Option(
-            help="Part to export, tuned to the stack of --stack or --model where one is given:"
-            " position_controller, hysteresis_compensator, hysteresis_observer, feed_forward,"
-            " adaptive_feed_forward, online_identification. Others have their default values:"
-            " flexure_stage, voltage_amplifier, charge_amplifier, prestress_mechanism."
-        ),
-    ] = None,
-    precision: Annotated[
-        PrecisionName, typer.Option(help="Precision of all numbers.")
-    ] = PrecisionName.DOUBLE,
-    hold: Annotated[
-        Hold, typer.Option(help="Inputs reached at a step's end on a line, or held over it.")
-    ] = Hold.LINEAR,
-    substeps: Annotated[
-        int | None,
-        typer.Option(help="Equal parts of a step; by default as few as err by less than 0.1 %."),
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of files and functions; by default the model's name.")
-    ] = None,
-    include_sensor: SensorOption = False,
-    start_voltage: StartVoltageOption = None,
-    history: HistoryOption = None,
-    sweep: SweepOption = 1.0,
-    rest: RestOption = 0.0,
-    author: AuthorOption = None,
-    version: ModelVersionOption = None,
-    copyright_: CopyrightOption = None,
-    license_: LicenseOption = None,
-    effects: EffectsOption = None,
-    quiet: Quiet = False,
+    *,
+    output: Path,
+    step: str,
+    model: Path | None = None,
+    stack: StackName = None,
+    part: str | None = None,
+    precision: Literal["double", "single"] = "double",
+    hold: Literal["linear", "zero"] = "linear",
+    substeps: int | None = None,
+    name: str | None = None,
+    include_sensor: IncludeSensor = False,
+    start: Start,
+    published: Published,
+    given: Given,
 ) -> None:
-    """Write a model as C99 for a controller: a step of fixed length and constant cost."""
-    from psa_casadi.cli.inputs import Given, step_seconds
-    from psa_casadi.export.fixed_step.code import limit_words
-    from psa_casadi.export.fixed_step.export import export_c
-    from psa_casadi.online import part_for
+    """Write a model as C99 for a controller: a step of fixed length and constant cost.
 
-    given = Given(effects)
+    Options:
+        output: Folder of the two files.
+        step: Time of a step with its unit, such as 10us.
+        model: MODEL.json to export.
+        part: Part to export, tuned to the stack of --stack or --model where one is given:
+            position_controller, hysteresis_compensator, hysteresis_observer, feed_forward,
+            adaptive_feed_forward, online_identification. Others have their default values:
+            flexure_stage, voltage_amplifier, charge_amplifier, prestress_mechanism.
+        precision: Precision of all numbers.
+        hold: Inputs reached at a step's end on a line, or held over it.
+        substeps: Equal parts of a step; by default as few as err by less than 0.1 %.
+        name: Name of files and functions; by default the model's name.
+    """
     seconds = given.attempt(lambda: step_seconds(step))
     base = chosen = None
     if part is None or model or stack:
         base = chosen = given.model_or_stack(model, stack, any_model=True)
     if part is not None and seconds is not None and bool(model or stack) == (base is not None):
-        chosen = given.attempt(lambda: part_for(part, base, period=seconds))
-    chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
-    chosen = given.published(
-        chosen, author=author, version=version, copyright=copyright_, license=license_
-    )
+        chosen = given.attempt(lambda: psa.part_for(part, base, period=seconds))
+    chosen = given.published(given.started(chosen, start), published)
     given.check()
     if chosen is None or seconds is None:
         return
-    with working("generating", quiet) as progress:
+    with working("generating", given.quiet) as progress:
         progress("compiling and comparing")
-        found = export_c(
-            chosen, output, step=seconds, precision=precision.value, name=name,
-            include_sensor=include_sensor, hold=hold.value, substeps=substeps,
+        found = psa.export_c(
+            chosen, output, step=seconds, precision=precision, name=name,
+            include_sensor=include_sensor, hold=hold, substeps=substeps,
         )  # fmt: skip
-    show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
+    _show_inside(chosen, include_sensor, given.quiet)
     for note in chosen.provenance.notes if part else ():
-        show(note, quiet)
-    show(step_words(seconds, found.substeps, precision.value), quiet)
-    show_table(error_table({e.voltage: e.error for e in found.errors}), quiet)
-    show(limit_words(found.limit), quiet)
-    tell_written(found.header, found.source, quiet=quiet)
+        show(note, given.quiet)
+    errors = {e.voltage: e.error for e in found.errors}
+    _show_step(f"{seconds:g} s", found.substeps, precision, errors, found.limit, given.quiet)
+    tell_written(found.header, found.source, quiet=given.quiet)
 
 
-def step_words(step: float, substeps: int, precision: str) -> str:
-    """Say what a fixed step is."""
-    each = "1 substep" if substeps == 1 else f"{substeps} substeps"
-    return f"step: {step:g} s, {each}, {precision} precision"
+def _show_inside(model: "psa.Model", include_sensor: bool, quiet: bool) -> "psa.Model":
+    """Print which components an export holds, and which it leaves out; return what it holds."""
+    kept = model if include_sensor else model.plant()
+    show(f"inside: {', '.join(c.name for c in kept.components)}", quiet)
+    left_out = [c.name for c in model.components if c not in kept.components]
+    if left_out:
+        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+    return kept
 
 
-def error_table(errors: Mapping[str, float]) -> "Table":
-    """Return a table of the errors of a fixed step by reference voltage."""
+def _show_step(
+    step: str, substeps: int, precision: str, errors: Mapping[str, float], limit: float, quiet: bool
+) -> None:
+    """Print what a fixed step is, its error by reference voltage, and up to where it holds."""
+    from psa_casadi.export.fixed_step.code import limit_words
     from psa_casadi.report.words.tables import Table
 
+    each = "1 substep" if substeps == 1 else f"{substeps} substeps"
+    show(f"step: {step}, {each}, {precision} precision", quiet)
     rows = tuple((voltage, f"{error:.1e}") for voltage, error in errors.items())
-    return Table(("voltage", "largest error over the range"), rows)
-
-
-class FmiVersion(StrEnum):
-    """Versions of the standard."""
-
-    TWO = "2"
-    THREE = "3"
-
-
-class Solver(StrEnum):
-    """Ways through a communication step."""
-
-    ADAPTIVE = "adaptive"
-    FIXED = "fixed"
+    show_table(Table(("voltage", "largest error over the range"), rows), quiet)
+    show(limit_words(limit), quiet)
 
 
 def fmu(
-    output: Annotated[Path, typer.Option("-o", "--output", help="FMU to write.")],
-    model: ModelOption = None,
-    stack: StackOption = None,
-    part: PartOption = None,
-    fmi: Annotated[FmiVersion, typer.Option(help="Version of the standard.")] = FmiVersion.TWO,
-    platforms: Annotated[
-        str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
-    ] = "host",
-    solver: Annotated[
-        Solver, typer.Option(help="adaptive: to a tolerance; fixed: steps of constant cost.")
-    ] = Solver.ADAPTIVE,
-    step: Annotated[
-        str | None, typer.Option(help="Time of a fixed step with its unit, such as 10us.")
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Model identifier, a C name; by default the model's name.")
-    ] = None,
-    include_sensor: SensorOption = False,
-    start_voltage: StartVoltageOption = None,
-    parameter_sets: Annotated[
-        int,
-        typer.Option(
-            help="Random parameter sets within the uncertainty to put inside, beside their mean and"
-            " sigma points; 0 leaves all of them out.",
-            min=0,
-            max=999,
-        ),
-    ] = 20,
-    sets_to: Annotated[
-        Path | None,
-        typer.Option("--sets-to", help="Folder to write the parameter sets to as well."),
-    ] = None,
-    validity_output: Annotated[
-        bool,
-        typer.Option(
-            "--validity-output",
-            help="Add the output outside_validity: how far a run has left what the records show.",
-        ),
-    ] = False,
-    history: HistoryOption = None,
-    sweep: SweepOption = 1.0,
-    rest: RestOption = 0.0,
-    author: AuthorOption = None,
-    version: ModelVersionOption = None,
-    copyright_: CopyrightOption = None,
-    license_: LicenseOption = None,
-    effects: EffectsOption = None,
-    quiet: Quiet = False,
+    *,
+    output: Path,
+    model: ModelFile = None,
+    stack: StackName = None,
+    part: PartName = None,
+    fmi: Literal["2", "3"] = "2",
+    platforms: Platforms = "host",
+    solver: Literal["adaptive", "fixed"] = "adaptive",
+    step: str | None = None,
+    name: str | None = None,
+    include_sensor: IncludeSensor = False,
+    parameter_sets: Annotated[int, typer.Option(min=0, max=999)] = 20,
+    sets_to: Path | None = None,
+    validity_output: bool = False,
+    start: Start,
+    published: Published,
+    given: Given,
 ) -> None:
-    """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive."""
-    from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.fixed_step.code import limit_words
-    from psa_casadi.export.fmu.archive import export_fmu
+    """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive.
+
+    Options:
+        output: FMU to write.
+        fmi: Version of the standard.
+        solver: adaptive: to a tolerance; fixed: steps of constant cost.
+        step: Time of a fixed step with its unit, such as 10us.
+        name: Model identifier, a C name; by default the model's name.
+        parameter_sets: Random parameter sets within the uncertainty to put inside, beside their
+            mean and sigma points; 0 leaves all of them out.
+        sets_to: Folder to write the parameter sets to as well.
+        validity_output: Add the output outside_validity: how far a run has left what the records
+            show.
+    """
+    from psa_casadi.export.fmu.evidence import set_files
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.export.fmu.sources import FIXED_ENTRY
     from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
-    given = Given(effects)
     given.outputs({"--output": output}, [model])
     if sets_to is not None and sets_to.exists() and not sets_to.is_dir():
         given.add(f"{sets_to}: is a file; name a folder for the parameter sets.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     targets = given.attempt(lambda: chosen_platforms(wanted))
-    seconds = given.fixed_step(step, wanted=solver is Solver.FIXED)
-    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
-    chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
-    chosen = given.published(
-        chosen, author=author, version=version, copyright=copyright_, license=license_
+    if (solver == "fixed") != (step is not None):
+        given.add("--solver fixed and --step belong together; give both or neither.")
+    seconds = (
+        given.attempt(lambda: step_seconds(step))
+        if step is not None and solver == "fixed"
+        else None
     )
+    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = given.published(given.started(chosen, start), published)
     given.check()
     if chosen is None or targets is None:
         return
-    with working("compiling", quiet) as progress:
+    with working("compiling", given.quiet) as progress:
         progress(", ".join(t.name for t in targets))
-        export_fmu(
-            chosen,
-            output,
-            name=name,
-            include_sensor=include_sensor,
-            platforms=wanted,
-            fmi=int(fmi),
-            parameter_sets=parameter_sets,
-            validity_output=validity_output,
+        psa.export_fmu(
+            chosen, output, name=name, include_sensor=include_sensor, platforms=wanted,
+            fmi=int(fmi), parameter_sets=parameter_sets, validity_output=validity_output,
             step=seconds,
-        )
-    kept = show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
-    sets = write_sets(kept, parameter_sets, sets_to)
-    show(f"platforms: {', '.join(t.name for t in targets)}", quiet)
-    show(f"start: {start_words(kept)}", quiet)
+        )  # fmt: skip
+    kept = _show_inside(chosen, include_sensor, given.quiet)
+    sets = set_files(kept, parameter_sets)
+    if sets_to is not None and sets:
+        make_folder(sets_to)
+        for place, text in sets.items():
+            atomic_write(sets_to / place.rpartition("/")[2], text)
+    show(f"platforms: {', '.join(t.name for t in targets)}", given.quiet)
+    show(f"start: {_start_words(kept)}", given.quiet)
     if seconds is None:
-        show(f"evidence: {evidence_words(kept, sets)}", quiet)
+        held = "none; a MODEL.json of `psa identify` or `psa diagnose` has it"
+        if kept.evidence is not None:
+            of = ", ".join(r.record for r in kept.evidence.runs)
+            held = f"documentation/evidence.html (records: {of}), {len(sets)} parameter sets"
+        show(f"evidence: {held}", given.quiet)
     else:
-        with zipfile.ZipFile(output) as archive:
-            fixed = json.loads(archive.read(FIXED_ENTRY))
-        show(step_words(seconds, fixed["substeps"], "double"), quiet)
-        show_table(error_table(fixed["errors"]), quiet)
-        show(limit_words(fixed.get("voltage_limit", math.inf)), quiet)
+        fixed = json.loads(zipfile.Path(output, FIXED_ENTRY).read_bytes())
+        limit = fixed.get("voltage_limit", math.inf)
+        _show_step(
+            f"{seconds:g} s", fixed["substeps"], "double", fixed["errors"], limit, given.quiet
+        )
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"
             f" `{INSTALL_ZIG}` it loads on older ones too.",
-            quiet,
+            given.quiet,
         )
-    tell_written(output, quiet=quiet)
+    tell_written(output, quiet=given.quiet)
 
 
-def write_sets(model: "Model", samples: int, folder: Path | None) -> int:
-    """Write the parameter sets to a folder, if one is named, and return how many there are."""
-    from psa_casadi.export.fmu.evidence import set_files
-    from psa_casadi.files import atomic_write, make_folder
-
-    texts = set_files(model, samples)
-    if folder is not None and texts:
-        make_folder(folder)
-        for place, text in texts.items():
-            atomic_write(folder / place.rpartition("/")[2], text)
-    return len(texts)
-
-
-def evidence_words(model: "Model", sets: int) -> str:
-    """Say what the FMU holds of what stands behind its values."""
-    if model.evidence is None:
-        return "none; a MODEL.json of `psa identify` or `psa diagnose` has it"
-    of = ", ".join(r.record for r in model.evidence.runs)
-    return f"documentation/evidence.html (records: {of}), {sets} parameter sets"
-
-
-def start_words(model: "Model") -> str:
+def _start_words(model: "psa.Model") -> str:
     """Say where an exported model starts."""
     voltage = next((i.start for i in model.structure.inputs if i.name == "voltage"), None)
     held = "" if voltage is None else f" at {voltage:.4g} V"
@@ -296,38 +205,32 @@ def start_words(model: "Model") -> str:
 
 
 def modelica(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Modelica file to write.")],
-    model: ModelOption = None,
-    stack: StackOption = None,
-    part: PartOption = None,
-    name: Annotated[str, typer.Option(help="Name of the package.")] = "PiezoStack",
-    include_sensor: SensorOption = False,
-    start_voltage: StartVoltageOption = None,
-    history: HistoryOption = None,
-    sweep: SweepOption = 1.0,
-    rest: RestOption = 0.0,
-    author: AuthorOption = None,
-    version: ModelVersionOption = None,
-    copyright_: CopyrightOption = None,
-    license_: LicenseOption = None,
-    effects: EffectsOption = None,
-    quiet: Quiet = False,
+    *,
+    output: Path,
+    model: ModelFile = None,
+    stack: StackName = None,
+    part: PartName = None,
+    name: str = "PiezoStack",
+    include_sensor: IncludeSensor = False,
+    start: Start,
+    published: Published,
+    given: Given,
 ) -> None:
-    """Write a model as a Modelica package: signals, connectors, examples in one file."""
-    from psa_casadi.cli.inputs import Given
-    from psa_casadi.export.modelica.package import class_names, export_modelica
+    """Write a model as a Modelica package: signals, connectors, examples in one file.
 
-    given = Given(effects)
+    Options:
+        output: Modelica file to write.
+        name: Name of the package.
+    """
+    from psa_casadi.export.modelica.package import class_names
+
     given.outputs({"--output": output}, [model])
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
-    chosen = given.started(chosen, start_voltage, history, sweep=sweep, rest=rest)
-    chosen = given.published(
-        chosen, author=author, version=version, copyright=copyright_, license=license_
-    )
+    chosen = given.published(given.started(chosen, start), published)
     given.check()
     if chosen is None:
         return
-    export_modelica(chosen, output, name=name, include_sensor=include_sensor)
-    kept = show_inside(chosen, include_sensor=include_sensor, quiet=quiet)
-    show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", quiet)
-    tell_written(output, quiet=quiet)
+    psa.export_modelica(chosen, output, name=name, include_sensor=include_sensor)
+    kept = _show_inside(chosen, include_sensor, given.quiet)
+    show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", given.quiet)
+    tell_written(output, quiet=given.quiet)

@@ -1,148 +1,114 @@
 """`psa identify`: the parameters of a stack, with intervals."""
 
 from collections.abc import Callable, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Literal
 
-import typer
-
-from psa_casadi.cli.screen import (
-    ColumnsOption,
-    EffectsOption,
-    Form,
-    HysteresisOption,
+import psa_casadi as psa
+from psa_casadi.cli.failures import kept
+from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.options import (
+    Hysteresis,
     Origin,
-    OriginOption,
-    Quiet,
-    SampleTimeOption,
-    StackOption,
-    StartModelOption,
-    StillOption,
-    show,
-    tell_written,
-    width,
-    working,
+    Reading,
+    Records,
+    StackName,
+    StartModel,
+    Stiffness,
+    Still,
 )
+from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.cli.steps import IDENTIFY
+from psa_casadi.files import atomic_write
 
 if TYPE_CHECKING:
-    from psa_casadi.identification.identify import Identification
     from psa_casadi.identification.profile import Profile
 
 
-class Method(StrEnum):
-    """How the parameters are found."""
-
-    PREDICTION_ERROR = "prediction-error"
-    PAPER = "paper"
-
-
 def identify(
-    records: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
-        ),
-    ],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="MODEL.json to write.")
-    ] = None,
-    model: StartModelOption = None,
-    stack: StackOption = None,
-    stiffness: Annotated[
-        float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
-    ] = None,
-    hysteresis: HysteresisOption = None,
-    method: Annotated[
-        Method, typer.Option(help="How the parameters are found.")
-    ] = Method.PREDICTION_ERROR,
-    profile: Annotated[
-        list[str] | None,
-        typer.Option(help="Parameter whose profile likelihood is wanted; may be repeated."),
-    ] = None,
-    json: Annotated[
-        Path | None, typer.Option(help="JSON file of parameters and records to write.")
-    ] = None,
-    report: Annotated[Path | None, typer.Option(help="HTML page of the fit to write.")] = None,
-    still: StillOption = False,
-    columns: ColumnsOption = None,
-    sample_time: SampleTimeOption = None,
-    origin: OriginOption = Origin.MEASURED,
-    effects: EffectsOption = None,
-    quiet: Quiet = False,
+    records: Records,
+    *,
+    output: Path | None = None,
+    model: StartModel = None,
+    stack: StackName = None,
+    stiffness: Stiffness = None,
+    hysteresis: Hysteresis = None,
+    method: Literal["prediction-error", "paper"] = "prediction-error",
+    profile: list[str] | None = None,
+    json: Path | None = None,
+    report: Path | None = None,
+    still: Still = False,
+    reading: Reading,
+    origin: Origin = "measured",
+    given: Given,
 ) -> None:
-    """Fit the model of a stack to records; show which parameters the data determine."""
-    from psa_casadi.cli.inputs import Given
+    """Fit the model of a stack to records; show which parameters the data determine.
+
+    Options:
+        output: MODEL.json to write.
+        method: How the parameters are found.
+        profile: Parameter whose profile likelihood is wanted; may be repeated.
+        json: JSON file of parameters and records to write.
+        report: HTML page of the fit to write.
+    """
     from psa_casadi.identification.identify import identify as run
     from psa_casadi.identification.paper import identify_by_paper as by_paper
     from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
-    given = Given(effects, quiet=quiet)
-    if method is Method.PAPER and profile:
+    if method == "paper" and profile:
         given.add("--method paper has no likelihood; leave --profile or --method out.")
-    if method is Method.PAPER and (model, stack) != (None, None):
+    if method == "paper" and (model, stack) != (None, None):
         given.add("--method paper starts from no model; leave --model, --stack or --method out.")
-    if method is Method.PAPER and hysteresis not in (None, Form.BOUC_WEN):
+    if method == "paper" and hysteresis not in (None, "bouc-wen"):
         given.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
     given.stiffness(stiffness)
-    given.outputs({"--output": output, "--json": json, "--report": report}, [*records, model])
-    measured = given.records(records, columns=columns, sample_time=sample_time)
+    outputs = {"--output": output, "--json": json, "--report": report}
+    given.outputs(outputs, [*records, model])
+    measured = given.records(records, reading)
     start = given.model_or_stack(model, stack, needed=False)
     given.check()
-    with working("identifying", quiet, IDENTIFY) as progress:
-        if method is Method.PAPER:
+    with working("identifying", given.quiet, IDENTIFY) as progress:
+        if method == "paper":
             found = by_paper(measured, stiffness=stiffness, progress=progress)
         else:
             found = run(
-                measured,
-                model=start,
-                stiffness=stiffness,
-                hysteresis=hysteresis.value if hysteresis else None,
+                measured, model=start, stiffness=stiffness, hysteresis=hysteresis,
                 progress=progress,
-            )
-        profiles = _finish(
-            found, output, (json, report, still), profile or (), origin.value, progress
-        )
-    show(identification_text(found, origin=origin.value, width=width()), quiet)
+            )  # fmt: skip
+        profiles = _finish(found, outputs, profile or (), (origin, still), progress)
+    show(identification_text(found, origin=origin, width=width()), given.quiet)
     for found_profile in profiles:
-        show("\n" + "\n".join(profile_sentences(found_profile)), quiet)
-    left_out = [n for n in profile or () if n not in found.determinacy.names]
-    if left_out:
+        show("\n" + "\n".join(profile_sentences(found_profile)), given.quiet)
+    if left_out := [n for n in profile or () if n not in found.determinacy.names]:
         show(
             f"\nNo profile of {', '.join(left_out)}: not searched in this fit; the parameters"
             f" searched are {', '.join(found.determinacy.names)}.",
-            quiet,
+            given.quiet,
         )
-    tell_written(output, json, report, quiet=quiet)
+    tell_written(*outputs.values(), quiet=given.quiet)
 
 
 def _finish(
-    found: "Identification",
-    output: Path | None,
-    more: tuple[Path | None, Path | None, bool],
+    found: "psa.Identification",
+    outputs: dict[str, Path | None],
     wanted: Sequence[str],
-    origin: str,
+    page: tuple[str, bool],
     progress: Callable[[str], None],
 ) -> "list[Profile]":
     """Write the files and return the profiles; at an interrupt the model is kept, which it says.
 
-    `more` are the JSON file, the page, and whether that is still.
+    `page` says what the page calls the records, and whether it is still.
     """
-    from psa_casadi.cli.failures import kept
-    from psa_casadi.files import atomic_write
     from psa_casadi.identification.profile import profile
-    from psa_casadi.model.model_file import save_model
     from psa_casadi.report.documents.files import identification_file
-    from psa_casadi.report.page.results import write_fit_report
     from psa_casadi.strict_json import json_text
 
-    json, report, still = more
+    output, json, report = outputs.values()
     done: list[Path] = []
     try:
         if output is not None:
-            save_model(found.model, output)
+            psa.save_model(found.model, output)
             done.append(output)
         names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
         profiles = [profile(found.fit, found.experiments, n, progress=progress) for n in names]
@@ -151,17 +117,16 @@ def _finish(
             done.append(json)
         if report is not None and not found.interrupted:
             progress("writing the report")
-            write_fit_report(found, report, origin=origin, profiles=profiles, still=still)
+            psa.write_fit_report(found, report, origin=page[0], profiles=profiles, still=page[1])
         ended = found.interrupted
     except KeyboardInterrupt:
         if output is not None and output not in done:
-            save_model(found.model, output)
+            psa.save_model(found.model, output)
             done.append(output)
         ended = True
     if not ended:
         return profiles
     cut = found.fit.interrupted
     what = "the search was cut off" if cut else "the fit was finished before"
-    mark = " (marked as interrupted)" if cut else ""
-    missing = [p for p in (output, json, report) if p not in done]
-    raise KeyboardInterrupt(kept(what, done, missing, mark))
+    missing = [p for p in outputs.values() if p not in done]
+    raise KeyboardInterrupt(kept(what, done, missing, " (marked as interrupted)" if cut else ""))

@@ -4,40 +4,40 @@ import difflib
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from psa_casadi.cli.screen import tell
-from psa_casadi.component import Component
+import psa_casadi as psa
+from psa_casadi.cli.options import OwnEffects, Published, Reading, Start
+from psa_casadi.cli.screen import Quiet, tell
 from psa_casadi.errors import InputError
 from psa_casadi.files import why_not_written
-from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import load_model
-from psa_casadi.model.own_effects import known_effects, own_effects
-from psa_casadi.model.parts import part_model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record, read_record, read_records
-from psa_casadi.records.read.columns import ColumnMap, files_named, parse_columns
-from psa_casadi.simulation.simulate import settled_at
-from psa_casadi.units import parse_unit, to_si, units_of
+
+if TYPE_CHECKING:
+    from psa_casadi.records.read.columns import ColumnMap
 
 T = TypeVar("T")
 
 
+@dataclass(kw_only=True)
 class Given:
-    """Collects the problems of everything that a command is given, to tell them all at once."""
+    """Collects the problems of everything that a command is given, to tell them all at once.
 
-    def __init__(self, modules: Sequence[str] | None = None, *, quiet: bool = False) -> None:
-        """Begin with the effects of the `modules` that --effects names.
+    Unless `quiet`, what the reader took a record's columns for is told. `own` are the effects of
+    the modules that --effects names, `fitted` is the number of records that are not held out.
+    """
 
-        Unless `quiet`, what the reader took a record's columns for is told.
-        """
-        self._quiet, self.fitted = quiet, 0
-        self._problems: list[str] = []
-        read = [self.attempt(partial(own_effects, module)) for module in modules or ()]
-        self.effects = [c for found in read for c in (found or {}).values()]
+    effects: OwnEffects = None
+    quiet: Quiet = False
+    fitted: int = field(default=0, init=False)
+    _problems: list[str] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        """Read the effects."""
+        read = [self.attempt(partial(psa.own_effects, module)) for module in self.effects or ()]
+        self.own = [c for found in read for c in (found or {}).values()]
 
     def add(self, sentence: str) -> None:
         """Note one problem."""
@@ -57,27 +57,22 @@ class Given:
             raise InputError(self._problems)
 
     def records(
-        self,
-        paths: Sequence[Path],
-        *,
-        held_out: Sequence[Path] = (),
-        columns: str | None = None,
-        sample_time: float | None = None,
-    ) -> list[Record]:
+        self, paths: Sequence[Path], reading: Reading, held_out: Sequence[Path] = ()
+    ) -> "list[psa.Record]":
         """Read records to fit, `fitted` of them, then those held out; none may be given twice.
 
-        A record to fit must have a voltage that changes, all must have a displacement. `columns` is
-        what --columns says. Nothing is read where that is not understood. `sample_time` [s] gives
-        the time, whatever the files say of it.
+        A record to fit must have a voltage that changes, all must have a displacement. Nothing is
+        read where --columns is not understood.
         """
-        wanted = self.columns(columns, [*paths, *held_out])
+        wanted = self.columns(reading.columns, [*paths, *held_out])
         if wanted is None:
             return []
-        found: list[Record] = []
+        found: list[psa.Record] = []
         for files, fitted in ((paths, True), (held_out, False)):
             read = partial(
-                read_records, files, need_excitation=fitted, columns=wanted, sample_time=sample_time
-            )
+                psa.read_records, files, need_excitation=fitted, columns=wanted,
+                sample_time=reading.sample_time,
+            )  # fmt: skip
             for record in (self.attempt(read) if files else None) or ():
                 twin = next((r for r in found if r.sha256 == record.sha256), None)
                 if twin is not None:
@@ -88,39 +83,28 @@ class Given:
                     )
                 found.append(record)
                 self.fitted += fitted
-                for note in () if self._quiet else record.notes:
+                for note in () if self.quiet else record.notes:
                     tell(f"Note: {note}")
         return found
 
-    def voltage(
-        self, path: Path, *, columns: str | None = None, sample_time: float | None = None
-    ) -> Record | None:
-        """Read a record whose voltage is to be applied; it need not have a displacement."""
-        wanted = self.columns(columns, [path])
-        if wanted is None:
-            return None
-        return self.attempt(
-            lambda: read_record(
-                path, need_displacement=False, columns=wanted, sample_time=sample_time
-            )
-        )
-
-    def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> ColumnMap | None:
+    def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> "ColumnMap | None":
         """Return what --columns says, nothing where it is left out; None where it is wrong.
 
         A file that it names must be one of the `paths`, where these are known.
         """
+        from psa_casadi.records.read.columns import files_named, parse_columns
+
         found = self.attempt(lambda: parse_columns(text)) if text is not None else {}
         named = files_named(found or {}) if paths is not None else set()
         for name in sorted(named - {p.name for p in paths or ()}):
             self.add(f"--columns: '{name}' is none of the files; give its name without a folder.")
         return found
 
-    def model(self, path: Path | None) -> Model | None:
+    def model(self, path: Path | None) -> "psa.Model | None":
         """Read a model that turns a voltage into a displacement; None where no file is named."""
         if path is None:
             return None
-        model = self.attempt(lambda: load_model(path, self.effects))
+        model = self.attempt(lambda: psa.load_model(path, self.own))
         if model is None:
             return None
         if "voltage" not in model.input_names or "displacement" not in model.output_names:
@@ -131,17 +115,6 @@ class Given:
             return None
         return model
 
-    def searched(self, left_out: Sequence[str]) -> tuple[Component, ...]:
-        """Return the effects to search, without those that --leave-out names."""
-        known = known_effects(self.effects)
-        for name in dict.fromkeys(left_out):
-            if name not in known:
-                self.add(
-                    f"--leave-out: there is no effect '{name}'; {meant(name, known)}`psa effects`"
-                    " lists them."
-                )
-        return tuple(c for n, c in known.items() if n not in left_out)
-
     def model_or_stack(
         self,
         path: Path | None,
@@ -150,7 +123,7 @@ class Given:
         part: str | None = None,
         any_model: bool = False,
         needed: bool = True,
-    ) -> Model | None:
+    ) -> "psa.Model | None":
         """Read a model, or compose a named stack or part; one at most, and one where it is needed.
 
         With `any_model` the file need not hold a stack.
@@ -162,9 +135,9 @@ class Given:
             self.add(f"{' and '.join(given)} are {all_of_them} given; leave one of them out.")
             return None
         if part is not None:
-            return self.attempt(lambda: part_model(part))
+            return self.attempt(lambda: psa.part_model(part))
         if stack is not None:
-            return self.attempt(lambda: stack_model(stack))
+            return self.attempt(lambda: psa.stack_model(stack))
         if path is None:
             if needed:
                 self.add(
@@ -172,58 +145,38 @@ class Given:
                 )
             return None
         if any_model:
-            return self.attempt(lambda: load_model(path, self.effects))
+            return self.attempt(lambda: psa.load_model(path, self.own))
         return self.model(path)
 
-    def numbers(self, text: str | None, option: str, what: str) -> tuple[float, ...]:
-        """Return the numbers of a list with commas; none where it is not given."""
+    def turns(self, history: str | None) -> tuple[float, ...]:
+        """Return the voltages [V] of a history; none where it is not given."""
         try:
-            return tuple(float(part) for part in text.split(",")) if text is not None else ()
+            return tuple(float(part) for part in history.split(",")) if history is not None else ()
         except ValueError:
-            self.add(f"{option} is '{text}'; give {what} with commas between, such as 150,0.")
+            self.add(
+                f"--history is '{history}'; give voltages in V with commas between, such as 150,0."
+            )
             return ()
 
-    def priors(self, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
-        """Return centres and widths of priors that are given as NAME=CENTRE:WIDTH."""
-        centres: dict[str, float] = {}
-        widths: dict[str, float] = {}
-        for text in texts:
-            name, _, figures = text.partition("=")
-            centre, _, width = figures.partition(":")
-            try:
-                centres[name], widths[name] = float(centre), float(width)
-            except ValueError:
-                self.add(f"--prior is '{text}'; give NAME=CENTRE:WIDTH, such as k_L=7.3:0.1.")
-        return centres, widths
-
-    def fixed_step(self, text: str | None, *, wanted: bool) -> float | None:
-        """Return the time [s] of a fixed step, where one is wanted."""
-        if wanted != (text is not None):
-            self.add("--solver fixed and --step belong together; give both or neither.")
-        return self.attempt(lambda: step_seconds(text)) if text is not None and wanted else None
-
-    def started(
-        self, model: Model | None, voltage: float | None, history: str | None, **durations: float
-    ) -> Model | None:
+    def started(self, model: "psa.Model | None", start: Start) -> "psa.Model | None":
         """Return a model that starts settled at a voltage after a history; as it is without one."""
-        turns = self.numbers(history, "--history", "voltages in V")
-        if history is not None and voltage is None:
+        turns, voltage = self.turns(start.history), start.start_voltage
+        if start.history is not None and voltage is None:
             self.add("--history needs --start-voltage, the voltage at which it ends.")
         if model is None or voltage is None or self._problems:
             return model
-        return self.attempt(lambda: settled_at(model, voltage, turns, **durations))
+        return self.attempt(
+            lambda: psa.settled_at(model, voltage, turns, sweep=start.sweep, rest=start.rest)
+        )
 
-    def published(self, model: Model | None, **said: str | None) -> Model | None:
-        """Return a model that states what the options say, else what it stated before.
-
-        `said` are fields of `Publication`; a text may not be empty or have line breaks.
-        """
-        for name, text in said.items():
-            if text is not None and (not text.strip() or not text.isprintable()):
+    def published(self, model: "psa.Model | None", said: Published) -> "psa.Model | None":
+        """Return a model that states what the options say, else what it stated before."""
+        given = {name: text for name, text in asdict(said).items() if text is not None}
+        for name, text in given.items():
+            if not text.strip() or not text.isprintable():
                 self.add(f"--{name} is {text!r}; give a text of one line, or leave it out.")
         if model is None:
             return None
-        given = {name: text for name, text in said.items() if text is not None}
         return replace(model, publication=replace(model.publication, **given))
 
     def stiffness(self, value: float | None) -> None:
@@ -249,17 +202,13 @@ class Given:
             elif where in sources:
                 self.add(f"{path}: {option} would overwrite an input; give another name.")
             taken[where] = option
-            self._writable(path)
-
-    def _writable(self, path: Path) -> None:
-        reason = why_not_written(path)
-        if reason:
-            self.add(reason)
-        elif not os.access(path.resolve().parent, os.W_OK):
-            self.add(
-                f"{path}: cannot write, {path.resolve().parent} may not be written to; choose"
-                " another place."
-            )
+            if reason := why_not_written(path):
+                self.add(reason)
+            elif not os.access(where.parent, os.W_OK):
+                self.add(
+                    f"{path}: cannot write, {where.parent} may not be written to; choose another"
+                    " place."
+                )
 
 
 def meant(word: str, known: Iterable[str]) -> str:
@@ -273,6 +222,8 @@ def step_seconds(text: str) -> float:
 
     Raises InputError for anything else.
     """
+    from psa_casadi.units import parse_unit, to_si, units_of
+
     found = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
     try:
         number = float(found["number"]) if found else 0.0

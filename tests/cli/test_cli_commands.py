@@ -1,37 +1,27 @@
 """Single commands: stacks, models, what CI asks, the mechanism, and what is said of mistakes."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
-import fmpy
 import pytest
-from typer.testing import CliRunner, Result
 
-from psa_casadi.cli.app import app
 from psa_casadi.cli.screen import show_table
-from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.diagnosis import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport, CheckRow
 from psa_casadi.identification import identify
-from psa_casadi.model.model_file import load_model, save_model
-from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.model.model_file import save_model
+from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import sine, time_grid, write_record
 from psa_casadi.report.documents.junit import check_cases, junit_text
 from psa_casadi.report.page import playground
 from psa_casadi.report.words.tables import Table, effects_table
+from tests.cli.test_cli import psa
 from tests.records.record_files import HEADER, ROWS, write
 from tests.report.report_cases import diagnosis, identification
-from tests.report.test_schemas import valid
-from tests.tiers import slow
-
-
-def psa(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(a) for a in arguments])
 
 
 @pytest.fixture
@@ -39,21 +29,6 @@ def planned(tmp_path: Path) -> Path:
     path, time = tmp_path / "planned.csv", time_grid(0.1, 1e-3)
     write_record(path, {"time [s]": time, "voltage [V]": sine(time, 0.0, 80.0, 20.0)})
     return path
-
-
-@slow
-def test_export_takes_a_stack_and_the_fmu_passes_its_check(tmp_path: Path) -> None:
-    fmu = tmp_path / "p.fmu"
-    done = psa("export", "fmu", "--stack", "P-885.51", "-o", fmu)
-    assert done.exit_code == 0, done.output
-    description = fmpy.read_model_description(str(fmu))
-    assert description.modelName == "P_885_51"
-    start = {v.name: v.start for v in description.modelVariables}
-    assert float(start["k_B"]) == STACKS["P-885.51"].values["k_B"].value
-    assert psa("check", fmu, "--json", tmp_path / "check.json").exit_code == 0
-    content = valid("check", (tmp_path / "check.json").read_text())
-    assert (content["passed"], content["compared"]) == (True, True)
-    assert "equations" in {row["name"] for row in content["rows"]}
 
 
 def test_a_wrong_choice_of_model_is_one_sentence(planned: Path, tmp_path: Path) -> None:
@@ -187,10 +162,6 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str | Path]:
     return ["diagnose", write(tmp_path / "a.csv", HEADER, *ROWS), "--quiet"]
 
 
-def run(*words: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(w) for w in words])
-
-
 @pytest.mark.parametrize(
     ("options", "wrong"),
     [
@@ -211,7 +182,7 @@ def test_a_result_that_is_not_as_expected_ends_with_1(
     asked: list[str | Path], options: tuple[str, ...], wrong: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "tests.xml"
-    result = run(*asked, *options, "--junit", file)
+    result = psa(*asked, *options, "--junit", file)
     assert result.exit_code == bool(wrong), result.output
     assert result.output == (f"Not as expected: {wrong}\n" if wrong else "")
     cases = cases_of(file.read_text(encoding="utf-8"))
@@ -234,80 +205,6 @@ def test_the_checks_of_an_fmu_are_tests() -> None:
     }
 
 
-STACK = "PTBS200"
-
-
-@slow
-def test_command_writes_model_port_and_page(tmp_path: Path) -> None:
-    files = [tmp_path / name for name in ("mount.json", "stack.json", "page.html")]
-    arguments = ["design", "mechanism", "--stack", STACK, "--damping", "0.7", "--starts", "1"]
-    arguments += ["-o", str(files[0]), "--port", str(files[1]), "--report", str(files[2])]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    assert "no mechanism moves it" in result.output
-    expected = design_mechanism(stack_model(STACK), damping=0.7, starts=1)
-    mount, port = load_model(files[0]), load_model(files[1])
-    assert mount.values["m_m"] == pytest.approx(expected.mounting.mass, rel=1e-3)
-    assert "prestress_force" in port.input_names
-    page = files[2].read_text(encoding="utf-8")
-    assert "Root locus" in page
-    assert "lag, cannot be moved" in page
-    assert "Change the model and see" in page
-    assert '"kind": "report"' in page
-    assert page.count("data:image/png") == 1
-    assert len(page) < 3e6
-    assert json.loads(files[0].read_text())["components"] == ["prestress_mechanism"]
-
-
-def test_command_tells_every_mistake(tmp_path: Path) -> None:
-    arguments = ["design", "mechanism", "--stack", STACK, "--poles", "fast"]
-    arguments += ["--max-stroke-loss", "much", "-o", str(tmp_path / "no" / "mount.json")]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 2
-    for part in ("'fast' is no pole", "'much' is no share", "does not exist"):
-        assert part in " ".join(result.output.split())
-
-
-def refused(*arguments: str | Path, outputs: Path, code: int = 2) -> str:
-    """Run a command that must fail in the given way, and return what it says on stderr."""
-    before = sorted(outputs.rglob("*"))
-    result = psa(*arguments)
-    assert result.exit_code == code, result.output
-    assert isinstance(result.exception, SystemExit)
-    assert "Traceback" not in result.output
-    assert result.stdout == ""
-    assert sorted(outputs.rglob("*")) == before
-    return result.stderr
-
-
-def test_outputs_that_collide(tmp_path: Path) -> None:
-    good = write(tmp_path / "good.csv", HEADER, *ROWS)
-    same = tmp_path / "same"
-    said = refused("diagnose", good, "-o", same, "--json", same, outputs=tmp_path)
-    assert "both -o and --json name it" in said.replace("--output", "-o")
-    said = refused("identify", good, "-o", good, outputs=tmp_path)
-    assert "would overwrite an input" in said
-    assert good.read_text(encoding="utf-8").startswith(HEADER)
-
-
-def test_a_fault_of_the_package_ends_with_1_and_a_short_message(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    good = write(tmp_path / "good.csv", HEADER, *ROWS)
-
-    def broken(*_: object, **__: object) -> None:
-        raise ZeroDivisionError("one over none")
-
-    monkeypatch.setattr("psa_casadi.identification.identify.identify", broken)
-    monkeypatch.delenv("PSA_CASADI_DEBUG", raising=False)
-    out = tmp_path / "m.json"
-    said = refused("identify", good, "-o", out, "--quiet", outputs=tmp_path, code=1)
-    assert "unexpected ZeroDivisionError (one over none)" in said
-    assert len(said.splitlines()) == 1
-    monkeypatch.setenv("PSA_CASADI_DEBUG", "1")
-    assert isinstance(psa("identify", good, "-o", out).exception, ZeroDivisionError)
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -328,6 +225,22 @@ def test_a_fault_of_the_package_ends_with_1_and_a_short_message(
             ("design", "mechanism", "--stack", "demo", "--damping", "0.5", "--max-force", "inf"),
             "The largest force is inf N; give a positive one",
         ),
+        (
+            (
+                "design",
+                "mechanism",
+                "--stack",
+                "PTBS200",
+                "--poles",
+                "fast",
+                "-o",
+                "no/mount.json",
+                "--max-stroke-loss",
+                "much",
+            ),
+            "3 problems with what was given",
+        ),
+        (("identify", "good.csv", "-o", "good.csv"), "would overwrite an input"),
     ],
 )
 def test_what_cannot_be_used_is_told_in_words(
@@ -335,7 +248,12 @@ def test_what_cannot_be_used_is_told_in_words(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bytes").write_bytes(bytes(range(256)))
+    write(tmp_path / "good.csv", HEADER, *ROWS)
     output = () if "-o" in words or words[0] == "check" else ("-o", "out")
-    told = refused(*words, *output, outputs=tmp_path)
-    assert said in " ".join(told.split())
-    assert "Errno" not in told
+    before = sorted(tmp_path.rglob("*"))
+    result = psa(*words, *output)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert said in " ".join(result.stderr.split())
+    assert not re.search("Errno|Traceback", result.stderr)
+    assert sorted(tmp_path.rglob("*")) == before

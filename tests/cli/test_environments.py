@@ -142,10 +142,16 @@ def test_what_the_machine_refuses_is_no_fault_of_the_package(case: str) -> None:
         ImportError("cannot import name", name="psa_casadi.files"),
     ],
 )
-def test_a_fault_of_the_package_is_called_one(error: Exception) -> None:
+def test_a_fault_of_the_package_is_called_one(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PSA_CASADI_DEBUG", raising=False)
     code, output = ended_by(error)
     assert code == 1
-    assert FAULT in output
+    assert f"an unexpected {type(error).__name__} ({error}). {FAULT}" in output
+    assert len(output.splitlines()) == 1
+    monkeypatch.setenv("PSA_CASADI_DEBUG", "1")
+    assert ended_by(error) == (1, "")
 
 
 @pytest.fixture

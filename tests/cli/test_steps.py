@@ -7,7 +7,6 @@ import pytest
 from rich.console import Console
 
 from psa_casadi.cli import steps
-from psa_casadi.cli.demo import NEXT
 from psa_casadi.cli.screen import working
 from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, PLAIN, Course, Told
 
@@ -84,9 +83,3 @@ def test_what_is_told_belongs_to_a_step(course: Course, rooms: list[str]) -> Non
     assert len(found) > 5
     unknown = {told for told in found if not course.step_of(told)}
     assert not unknown
-
-
-def test_the_demonstration_ends_with_what_to_do_next() -> None:
-    said = NEXT.format(report="psa_demo/report.html")
-    assert "psa diagnose my_record.csv" in said
-    assert max(map(len, said.split("\n"))) < 100

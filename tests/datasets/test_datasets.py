@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from psa_casadi import datasets
 from psa_casadi.cli.datasets import datasets as command
-from psa_casadi.cli.failures import guarded
+from psa_casadi.cli.options import command as as_typer
 from psa_casadi.datasets import DATASETS, Dataset
 from psa_casadi.datasets.devices import Columns
 from psa_casadi.datasets.fetching import DATA_VARIABLE
@@ -28,7 +28,7 @@ def psa(*arguments: str | Path) -> tuple[int, str, str]:
     import typer  # noqa: PLC0415
 
     app = typer.Typer()
-    app.command()(guarded(command))
+    app.command()(as_typer(command))
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     return result.exit_code, result.stdout, result.stderr
 

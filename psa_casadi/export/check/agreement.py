@@ -5,6 +5,7 @@ from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -113,8 +114,15 @@ def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatA
     """
     if not has_reference(model):
         return simulated(model, times, inputs)
-    cascade = "k_B" in model.values
-    signals = {name: _signal(inputs, i) for i, name in enumerate(inputs.names)}
+    knots = inputs.times.tolist()
+
+    def held(values: list[float]) -> Signal:
+        return lambda t: float(values[max(bisect_left(knots, t) - 1, 0)])
+
+    signals = {
+        name: held(column.tolist()) if inputs.held else from_samples(inputs.times, column)
+        for name, column in zip(inputs.names, inputs.values.T, strict=True)
+    }
     found = simulate(
         model.values,
         signals["voltage"],
@@ -122,22 +130,11 @@ def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatA
         load_force=signals["load_force"],
         initial={s.name: s.start for s in model.structure.states},
         breakpoints=list(inputs.times),
-        mechanics="cascade" if cascade else "single_mass",
+        mechanics="cascade" if "k_B" in model.values else "single_mass",
         rtol=_TOLERANCE,
     )
-    return np.array(
-        [
-            getattr(found, "displacement" if n == "measured_displacement" else n)
-            for n in model.output_names
-        ]
-    ).T
-
-
-def _signal(inputs: Signals, column: int) -> Signal:
-    if not inputs.held:
-        return from_samples(inputs.times, inputs.values[:, column])
-    times, values = inputs.times.tolist(), inputs.values[:, column].tolist()
-    return lambda t: float(values[max(bisect_left(times, t) - 1, 0)])
+    names = ("displacement" if n == "measured_displacement" else n for n in model.output_names)
+    return np.array([getattr(found, name) for name in names]).T
 
 
 def simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
@@ -169,30 +166,19 @@ def bare_truth(model: Model) -> Truth:
     s = model.structure
     switches = ca.Function("z", s.arguments, [ca.vertcat(*s.switches.values())])
     names = model.output_names or model.state_names
-    truth = Truth(
-        model.state_names, model.input_names, model.parameter_names, model.output_names,
-        tuple(s.switches), s.f, switches, _starts(model), bool(model.sampled_names), names,
-        "reference" if has_reference(model) else "simulator", np.ones(len(names)), (),
-    )  # fmt: skip
-    return _with_settled_start(truth, model)
-
-
-def _starts(model: Model) -> dict[str, float]:
-    """Return the start values of states and inputs, and the outputs that follow from them."""
-    s = model.structure
     groups = [np.array([v.start for v in group]) for group in (s.states, s.inputs)]
     held = [np.array([v.start for v in s.sampled])] if s.sampled else []
     y = np.array(s.f(0.0, *groups, model.parameter_vector(), *held)[1]).ravel()
-    names = (model.state_names, model.input_names, model.output_names)
-    values = (*groups, y)
-    return {n: float(v) for k, own in enumerate(names) for n, v in zip(own, values[k], strict=True)}
-
-
-def _with_settled_start(truth: Truth, model: Model) -> Truth:
-    """Add the start at another voltage than that of the export, where there is one."""
+    names_of_starts = (*model.state_names, *model.input_names, *model.output_names)
+    starts = dict(zip(names_of_starts, np.concatenate([*groups, y]).tolist(), strict=True))
+    truth = Truth(
+        model.state_names, model.input_names, model.parameter_names, model.output_names,
+        tuple(s.switches), s.f, switches, starts, bool(model.sampled_names), names,
+        "reference" if has_reference(model) else "simulator", np.ones(len(names)), (),
+    )  # fmt: skip
     if not starts_at_voltage(model):
         return truth
-    voltage = next(i for i in model.structure.inputs if i.name == "voltage")
+    voltage = next(i for i in s.inputs if i.name == "voltage")
     usual = nominal_value(voltage.nominal, model.values)
     chosen = max((0.4 * usual, 0.6 * usual), key=lambda v: abs(v - voltage.start))
     try:
@@ -200,9 +186,9 @@ def _with_settled_start(truth: Truth, model: Model) -> Truth:
     except BREAKDOWNS:  # it does not rest there
         return truth
     sizes = model.state_nominals().tolist()
-    starts = {q.name: (q.start, v) for q, v in zip(settled.states, sizes, strict=True)}
-    starts["voltage"] = chosen, usual
-    return replace(truth, start_voltage=chosen, settled_starts=starts)
+    others = {q.name: (q.start, v) for q, v in zip(settled.states, sizes, strict=True)}
+    others["voltage"] = chosen, usual
+    return replace(truth, start_voltage=chosen, settled_starts=others)
 
 
 def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:
@@ -218,19 +204,22 @@ def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:
     grids = {step: _grid(step, slow.times[-1]) for step in _SLOW_STEPS}
     times = np.unique(np.concatenate([*grids.values(), slow.times]))
     linear = expected_outputs(model, times, slow)
-    scale = _scale(model, truth.compared, linear)
-    grid = grids[1e-3]
-    at = linear[np.searchsorted(times, grid)]
-    runs = [Run("model exchange", grid, slow, at, LIMIT, _TOLERANCE, integrated=True)]
+    ranges = np.ptp(linear, axis=0)
+    nominals = model.output_nominals() if model.output_names else model.state_nominals()
+    strict = np.array(["displacement" in n for n in truth.compared])
+    scale = np.where(strict & (ranges > 0.0), ranges, np.maximum(ranges, nominals))
+    expected = linear
+
+    def run(name: str, step: float, limit: float = LIMIT, **options: Any) -> Run:
+        at = expected[np.searchsorted(times, grids[step])]
+        return Run(name, grids[step], slow, at, limit, **options)
+
+    runs = [run("model exchange", 1e-3, tolerance=_TOLERANCE, integrated=True)]
     if held:
         slow, fast = (replace(signals, held=True) for signals in (slow, fast))
-    expected = expected_outputs(model, times, slow) if held else linear
-    for step, grid in grids.items():
-        at = expected[np.searchsorted(times, grid)]
-        runs.append(Run(f"co-simulation, step {step:g} s", grid, slow, at, LIMIT, _TOLERANCE))
-    grid = grids[1e-3]
-    at = expected[np.searchsorted(times, grid)]
-    runs.append(Run("co-simulation, default tolerance", grid, slow, at, DEFAULT_LIMIT))
+        expected = expected_outputs(model, times, slow)
+    runs += [run(f"co-simulation, step {q:g} s", q, tolerance=_TOLERANCE) for q in _SLOW_STEPS]
+    runs.append(run("co-simulation, default tolerance", 1e-3, DEFAULT_LIMIT))
     grid = _grid(_FAST_STEP, _FAST_STEP * _FAST_COUNT)
     at = expected_outputs(model, grid, fast)
     runs.append(Run(f"co-simulation, step {_FAST_STEP:g} s", grid, fast, at, LIMIT, _TOLERANCE))
@@ -240,14 +229,6 @@ def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:
 def _grid(step: float, end: float) -> FloatArray:
     count = min(_MOST_STEPS, round(end / step))
     return np.array([round(step * k, 12) for k in range(count + 1)])
-
-
-def _scale(model: Model, names: tuple[str, ...], expected: FloatArray) -> FloatArray:
-    ranges = np.ptp(expected, axis=0)
-    nominals = model.output_nominals() if model.output_names else model.state_nominals()
-    strict = np.array(["displacement" in n for n in names])
-    scale: FloatArray = np.where(strict & (ranges > 0.0), ranges, np.maximum(ranges, nominals))
-    return scale
 
 
 #: Errors are stated with two digits, and what they are compared with errs too.
@@ -308,7 +289,12 @@ def _run(model: Model, name: str, stated: StatedStep, *, held: bool, every: int 
     grid = np.arange(0, STEPS + 1, every)
     times = stated.step * grid.astype(np.float64)
     inputs = played_inputs(model, shape(np.linspace(0.0, 1.0, STEPS + 1)))[grid]
-    signals = _knots(Signals(model.input_names, times, inputs, held))
+    rounding = 1e-9 * np.max(np.abs(inputs), initial=0.0)
+    moved = inputs[1:-1] - inputs[:-2]
+    bends = moved if held else inputs[2:] - 2.0 * inputs[1:-1] + inputs[:-2]
+    kept = np.ones(len(inputs), dtype=bool)  # but for knots at which nothing bends or jumps
+    kept[1:-1] = np.any(np.abs(bends) > rounding, axis=1)
+    signals = Signals(model.input_names, times[kept], inputs[kept], held)
     exact = has_reference(model) and len(signals.times) <= _MOST_KNOTS
     compute = expected_outputs if exact else simulated
     column = model.output_names.index(shown_output(model))
@@ -324,13 +310,3 @@ def _run(model: Model, name: str, stated: StatedStep, *, held: bool, every: int 
         scale=np.where(scale > 0.0, scale, model.output_nominals()[column]),
         by="reference" if exact else "simulator",
     )
-
-
-def _knots(signals: Signals) -> Signals:
-    """Return the same signals without the knots at which nothing bends or jumps."""
-    u = signals.values
-    rounding = 1e-9 * np.max(np.abs(u), initial=0.0)
-    bends = u[1:-1] - u[:-2] if signals.held else u[2:] - 2.0 * u[1:-1] + u[:-2]
-    kept = np.ones(len(u), dtype=bool)
-    kept[1:-1] = np.any(np.abs(bends) > rounding, axis=1)
-    return replace(signals, times=signals.times[kept], values=u[kept])

@@ -17,12 +17,6 @@ def _inputs(fmu: Fmu, share: float) -> dict[str, float]:
     return {name: share * 0.9**i * fmu.nominals[name] for i, name in enumerate(names)}
 
 
-def displaced(fmu: Fmu) -> dict[str, float]:
-    """Return values of the states to start from that are not at rest: shares of their nominals."""
-    names = [*fmu.states(), *fmu.sampled()]
-    return {name: 0.5 * 0.9**i * fmu.nominals[name] for i, name in enumerate(names)}
-
-
 def _run(
     instance: Instance, size: float, shares: tuple[float, ...], begin: float = 0.0
 ) -> FloatArray:
@@ -68,18 +62,13 @@ def _exchanged(fmu: Fmu) -> Problems:
         if any(model.completed_integrator_step()):
             yield "the end of an integrator step asks for an event or for the end"
         model.require("EnterEventMode")
-        yield from needless_events(model)
+        *more, timed = model.update_discrete_states()
+        if any(more):
+            yield "an event asks for more than going on"
+        if timed != bool(fmu.sampled()):
+            yield "time events are announced without sampled states, or are not with them"
         model.require("EnterContinuousTimeMode")
         model.require("Terminate")
-
-
-def needless_events(instance: Instance) -> Problems:
-    """An update in event mode asks for nothing but the next instant of sampled states."""
-    *more, timed = instance.update_discrete_states()
-    if any(more):
-        yield "an event asks for more than going on"
-    if timed != bool(instance.fmu.sampled()):
-        yield "time events are announced without sampled states, or are not with them"
 
 
 def communication_points(fmu: Fmu) -> Problems:
@@ -119,18 +108,26 @@ def parameter_changes(fmu: Fmu) -> Problems:
     The states start displaced, where parameters do most; where a change before the run does nothing
     to its end, one between steps may do nothing either.
     """
-    starts, changed = displaced(fmu), _changed(fmu)
+    names = [*fmu.states(), *fmu.sampled()]
+    starts = {name: 0.5 * 0.9**i * fmu.nominals[name] for i, name in enumerate(names)}
+    changed = {}  # each 3 % from its start, to the side that its bounds allow
+    for v in fmu.description.modelVariables:
+        if v.variability == "tunable":
+            value, (low, high) = float(v.start), fmu.bounds[v.name]
+            near = (1.03 * value, 0.97 * value, value)
+            changed[v.name] = next(c for c in near if low <= c <= high)
+    size, shares = fmu.step_size, (0.5, 1.0, 0.3)
     with fmu.start(CO_SIMULATION, values=starts) as slave:
-        plain = _run(slave, fmu.step_size, (0.5, 1.0, 0.3))
+        plain = _run(slave, size, shares)
     with fmu.start(CO_SIMULATION, values={**starts, **changed}) as slave:
-        before = _run(slave, fmu.step_size, (0.5, 1.0, 0.3))
+        before = _run(slave, size, shares)
     with fmu.start(CO_SIMULATION, values=starts) as slave:
         slave.set(changed)
-        after = _run(slave, fmu.step_size, (0.5, 1.0, 0.3))
+        after = _run(slave, size, shares)
     with fmu.start(CO_SIMULATION, values=starts) as slave:
-        past = _run(slave, fmu.step_size, (0.5, 1.0))
+        past = _run(slave, size, shares[:2])
         slave.set(changed)
-        future = _run(slave, fmu.step_size, (0.3,), 2 * fmu.step_size)
+        future = _run(slave, size, shares[2:], 2 * size)
     if _differ(before, after):
         yield "parameters set before and after initialization give different results"
     acts = _differ(before[-1], plain[-1])
@@ -142,17 +139,6 @@ def parameter_changes(fmu: Fmu) -> Problems:
         model.set(changed)
         if _differ(model.derivatives(0.0, x, inputs), other.derivatives(0.0, x, inputs)):
             yield "parameters set in continuous-time mode do not reach the derivatives"
-
-
-def _changed(fmu: Fmu) -> dict[str, float]:
-    """Return all tunable parameters, each 3 % from its start, to the side that its bounds allow."""
-    changed = {}
-    for v in fmu.description.modelVariables:
-        if v.variability == "tunable":
-            value, (low, high) = float(v.start), fmu.bounds[v.name]
-            near = (1.03 * value, 0.97 * value, value)
-            changed[v.name] = next(c for c in near if low <= c <= high)
-    return changed
 
 
 def snapshots(fmu: Fmu) -> Problems:
@@ -175,22 +161,18 @@ def snapshots(fmu: Fmu) -> Problems:
             other.drop(copy)
             if _differ(first, _run(other, size, shares, 2 * size)):
                 yield "a state moved to another instance does not replay the same bits"
-        for wrong, what in _damaged(data):
+        flipped = ((len(data) * share // 16, "damaged") for share in range(4, 16))
+        wrongs = [
+            (data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :], what)
+            for place, what in ((0, "foreign"), *flipped)
+        ]
+        wrongs += [(data[:-1], "truncated"), (data[:8], "truncated"), (data + b"\0", "lengthened")]
+        for wrong, what in wrongs:
             try:
                 slave.drop(slave.deserialize(wrong))
             except FmuError:
                 continue
             yield f"a {what} serialised state is accepted"
-
-
-def _damaged(data: bytes) -> Iterator[tuple[bytes, str]]:
-    """Yield serialised states with something wrong, and what."""
-    damaged = ((len(data) * share // 16, "damaged") for share in range(4, 16))
-    for place, what in ((0, "foreign"), *damaged):
-        yield data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :], what
-    yield data[:-1], "truncated"
-    yield data[:8], "truncated"
-    yield data + b"\0", "lengthened"
 
 
 #: The checks by the name of their row.

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from psa_casadi.component import Component
 from psa_casadi.components.outputs import OUTPUT as VALIDITY
@@ -15,9 +16,8 @@ from psa_casadi.export.check.agreement import fixed_truth, stated_step, truth_of
 from psa_casadi.export.check.apart import OVERTIME, rows_apart
 from psa_casadi.export.check.description import (
     DESCRIBED,
-    not_compared,
     published_as,
-    unreproducible_parts,
+    reproducible,
     wrong_dependencies,
     wrong_start_values,
 )
@@ -114,7 +114,17 @@ def check_fmu(
             "What a binary needs of its system is not seen without lief; run `pip install lief`,"
             " or leave --portable out."
         )
-    rows = _archive_rows(path)
+    try:
+        with path.open("rb") as file:
+            head = file.read(2)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({why_not_read(error)}); name an FMU.") from error
+    if head != b"PK":
+        raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
+    rows = [
+        CheckRow(name, float(len(problems)), 0.0, not problems, plain("; ".join(problems)))
+        for name, problems in archive_problems(path).items()
+    ]
     if not all(row.passed for row in rows):
         return CheckReport(path, tuple(rows), compared=False)
     chosen: list[Model] = [model] if model else []
@@ -131,39 +141,21 @@ def check_fmu(
             if time.monotonic() > end:
                 rows.append(stopped("time", OVERTIME.format(timeout)))
                 return CheckReport(path, tuple(rows), compared=False)
-        compared = chosen[0] if chosen else None
-        truth = None
-        if compared:
-            version = archive.version
-            truth = (
-                fixed_truth(compared, version, stated) if stated else truth_of(compared, version)
-            )
-        again = repeated(archive, compared, records) if evidence or records else ()
+        model, version, truth = chosen[0] if chosen else None, archive.version, None
+        if model:
+            truth = fixed_truth(model, version, stated) if stated else truth_of(model, version)
+        again = repeated(archive, model, records) if evidence or records else ()
         rows += [row for row in again if isinstance(row, CheckRow)]
         runs = tuple(run for run in again if not isinstance(run, CheckRow))
-        task = Task(path, archive.directory, truth, timeout, memory, portable, runs)
-        rows += rows_apart(task, end)
+        rows += rows_apart(
+            Task(path, archive.directory, truth, timeout, memory, portable, runs), end
+        )
         left_out = LEFT_OUT + (LEFT_OUT3 if archive.version == 3 else ()) if stated else ()
     if not binaries.has_lief():
         left_out = (*left_out, *OF_BINARIES)
     last = "start of a run" if stated else "equations"
     done = any(row.name == last for row in rows)
     return CheckReport(path, tuple(rows), done, left_out)
-
-
-def _archive_rows(path: Path) -> list[CheckRow]:
-    """Return the checks of the archive itself; raises InputError if the file is none."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(2)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({why_not_read(error)}); name an FMU.") from error
-    if head != b"PK":
-        raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
-    return [
-        CheckRow(name, float(len(problems)), 0.0, not problems, plain("; ".join(problems)))
-        for name, problems in archive_problems(path).items()
-    ]
 
 
 def _described(
@@ -173,10 +165,19 @@ def _described(
 
     Each check is to be made before the next one is taken.
     """
+
+    def read_model() -> Iterator[str]:
+        """Append the model that the FMU carries; what prevents that is the problem."""
+        try:
+            content = read_json(archive.directory / MODEL_ENTRY, "export it again.", MODEL_ENTRY)
+            chosen.append(model_of(content, MODEL_ENTRY, effects))
+        except PsaError as error:
+            yield str(error)
+
     for name, check in DESCRIBED.items():
         yield Check(name, partial(check, archive))
     if not chosen and (archive.directory / MODEL_ENTRY).is_file():
-        yield Check("model inside", partial(_read_model, archive, chosen, effects))
+        yield Check("model inside", read_model)
     if chosen:
         chosen[:] = [as_exported(archive, chosen[0])]
         model = chosen[0]
@@ -184,55 +185,27 @@ def _described(
         yield Check("dependencies of the model", partial(wrong_dependencies, archive, model))
         if model.evidence is not None and fixed_step_of(archive.directory) is None:
             yield Check("evidence inside", partial(wrong_evidence, archive, model))
-        yield Check("reproducible", partial(_reproducible, archive, model))
-
-
-def _reproducible(archive: Archive, model: Model) -> Iterable[str] | CheckRow:
-    """Return what differs in the export made again; a row says what was not compared."""
-    problems = list(unreproducible_parts(archive, model))
-    if problems:
-        return problems
-    return CheckRow("reproducible", 0.0, 0.0, True, not_compared(archive))
-
-
-def _read_model(
-    archive: Archive, found: list[Model], effects: Iterable[Component]
-) -> Iterator[str]:
-    """Append the model that the FMU carries; what prevents that is the problem."""
-    try:
-        content = read_json(archive.directory / MODEL_ENTRY, "export it again.", MODEL_ENTRY)
-        found.append(model_of(content, MODEL_ENTRY, effects))
-    except PsaError as error:
-        yield str(error)
+        yield Check("reproducible", partial(reproducible, archive, model))
 
 
 def as_exported(archive: Archive, model: Model) -> Model:
     """Return the model as the exporter took it: whole, or without sensor and environment.
 
-    And with the output that tells how far a run is outside of what the records have shown.
+    And with the output that tells how far a run is outside of what the records have shown. That
+    sensor and environment are left out is told by all their variables: a sensor's effect need not
+    have an output of its own.
     """
-    exported = model.plant() if _left_out(archive, model) else model
+    inside, apart = (
+        {v.name for c in model.components if c.in_plant is plant for v in _variables(c)}
+        for plant in (True, False)
+    )
+    own = apart - inside  # what only sensor and environment have
+    described = {v.name for v in archive.description.modelVariables}
+    exported = model.plant() if own and own.isdisjoint(described) else model
     if VALIDITY in archive.names("output") and exported.evidence is not None:
         exported = with_validity(exported)
     return published_as(archive, exported)
 
 
-def _left_out(archive: Archive, model: Model) -> bool:
-    """Whether an FMU has nothing of what only sensor and environment have.
-
-    Told by all their variables: a sensor's effect need not have an output of its own.
-    """
-    inside, apart = (
-        {n for c in model.components if c.in_plant is plant for n in _names(c)}
-        for plant in (True, False)
-    )
-    own = apart - inside
-    return bool(own) and own.isdisjoint(v.name for v in archive.description.modelVariables)
-
-
-def _names(component: Component) -> Iterator[str]:
-    """Yield the names of a component's variables."""
-    yield from (p.name for p in component.parameters)
-    yield from (s.name for s in (*component.states, *component.sampled))
-    yield from (q.name for q in component.inputs)
-    yield from (y.name for y in component.outputs)
+def _variables(c: Component) -> Iterable[Any]:
+    return (*c.parameters, *c.states, *c.sampled, *c.inputs, *c.outputs)

@@ -11,6 +11,7 @@ import fmpy
 from fmpy.model_description import ValidationError
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.publication import (
     LICENSE_ENTRY,
@@ -60,17 +61,13 @@ def invalid(archive: Archive) -> Iterator[str]:
             yield f"'{v.name}' (line {v.sourceline}) is no name of the convention '{convention}'"
 
 
-def _reals(archive: Archive) -> list[Any]:
-    kinds = ("Real", "Float64")
-    return [v for v in archive.description.modelVariables if v.type in kinds]
-
-
 def undefined_units(archive: Archive) -> Iterator[str]:
     """Every variable but an event indicator has a unit, with a definition; so has its display."""
     units = archive.description.unitDefinitions
     defined = {u.name: {d.name for d in u.displayUnits} for u in units}
-    for v in _reals(archive):
-        if v.unit is None and v.name in archive.indicators():
+    for v in archive.description.modelVariables:
+        real = v.type in ("Real", "Float64")
+        if not real or (v.unit is None and v.name in archive.indicators()):
             continue
         if v.unit not in defined:
             yield f"'{v.name}' has the unit '{v.unit}', which is not defined"
@@ -180,22 +177,16 @@ def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
         for claims in (*truth.values(), *initial.values()):
             for parameter in model.parameter_names:
                 claims.pop(parameter, None)
-    yield from _listed(archive, names)
     described = archive.description
+    for kind, entries in (("output", described.outputs), ("derivative", described.derivatives)):
+        expected = [name for (found_kind, _), name in names.items() if found_kind == kind]
+        if [e.variable.name for e in entries] != expected:
+            yield f"the list of {kind}s is not the model's: {', '.join(expected)}"
     indicators = described.eventIndicators if archive.version == 3 else []
     for entry in (*described.outputs, *described.derivatives, *indicators):
         yield from _differences(entry, truth.get(entry.variable.name, {}), kinds=True)
     for entry in described.initialUnknowns:
         yield from _differences(entry, initial.get(entry.variable.name, {}), kinds=False)
-
-
-def _listed(archive: Archive, names: dict[Key, str]) -> Iterator[str]:
-    """The lists of outputs and derivatives name those of the model, in its order."""
-    described = archive.description
-    for kind, entries in (("output", described.outputs), ("derivative", described.derivatives)):
-        expected = [name for (found, _), name in names.items() if found == kind]
-        if [e.variable.name for e in entries] != expected:
-            yield f"the list of {kind}s is not the model's: {', '.join(expected)}"
 
 
 def _differences(entry: Any, truth: dict[str, str], *, kinds: bool) -> Iterator[str]:
@@ -221,8 +212,15 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     if tool != generation_tool():
         yield f"it was exported by {tool}, this is {generation_tool()}; export it again to compare"
         return
-    found = {p.relative_to(archive.directory).as_posix(): p for p in archive.directory.rglob("*")}
-    untouched = _as_found(archive) if other_casadi(archive) else {}
+    found = {
+        p.relative_to(archive.directory).as_posix(): p.read_bytes()
+        for p in archive.directory.rglob("*")
+        if p.is_file()
+    }
+    untouched = {}
+    if _other_casadi(archive):
+        places = {name: f"sources/{name}" for name in FROM_CASADI}
+        untouched = {n: found[p].decode("utf-8") for n, p in places.items() if p in found}
     step = fixed_step_of(archive.directory)
     fixed = planned_step(model, archive.identifier, archive.version, step) if step else None
     token, texts, xml = exported_texts(
@@ -237,14 +235,25 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     for name, text in sorted(expected.items()):
         if name not in found:
             yield f"{name} is missing"
-        elif found[name].read_bytes() != text.encode("utf-8"):
+        elif found[name] != text.encode("utf-8"):
             yield f"{name} differs"
-    more = {n for n, p in found.items() if n.startswith("sources/") and p.is_file()} - set(expected)
-    for name in sorted(more):
+    for name in sorted({n for n in found if n.startswith("sources/")} - set(expected)):
         yield f"{name} is not among the sources of the model"
 
 
-def other_casadi(archive: Archive) -> str:
+def reproducible(archive: Archive, model: Model) -> Iterable[str] | CheckRow:
+    """Return what differs in the export made again; a row says what was taken as it is."""
+    problems, other = list(unreproducible_parts(archive, model)), _other_casadi(archive)
+    if problems:
+        return problems
+    remark = (
+        f"its C is CasADi {other}'s, unchanged since; this is CasADi {ca.CasadiMeta.version()}:"
+        " 'equations' compares"
+    )
+    return CheckRow("reproducible", 0.0, 0.0, True, remark if other else "")
+
+
+def _other_casadi(archive: Archive) -> str:
     """Return the version of CasADi that an FMU was made with; empty if it is the one in use."""
     source = archive.directory / "sources" / "model.c"
     try:
@@ -252,18 +261,3 @@ def other_casadi(archive: Archive) -> str:
     except (OSError, UnicodeDecodeError):
         return ""
     return said[1] if said and said[1] != ca.CasadiMeta.version() else ""
-
-
-def not_compared(archive: Archive) -> str:
-    """Return what `unreproducible_parts` takes as it is; empty if it compares all."""
-    other = other_casadi(archive)
-    this = ca.CasadiMeta.version()
-    return other and (
-        f"its C is CasADi {other}'s, unchanged since; this is CasADi {this}: 'equations' compares"
-    )
-
-
-def _as_found(archive: Archive) -> dict[str, str]:
-    """Return the texts that CasADi wrote, as they are in the archive; a missing one is left out."""
-    places = {name: archive.directory / "sources" / name for name in FROM_CASADI}
-    return {n: p.read_bytes().decode("utf-8") for n, p in places.items() if p.is_file()}

@@ -1,10 +1,8 @@
 """What an FMU carries as evidence: whether it is the model's, and what it takes to repeat it."""
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.measured import ERROR_LIMIT, Playback
@@ -23,9 +21,8 @@ from psa_casadi.export.importer.masters import Signals
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.prepare import as_read, prepared
 from psa_casadi.model.compose import Model
-from psa_casadi.model.evidence import Evidence, RecordRun
+from psa_casadi.model.evidence import RecordRun
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
 
 _NONE = (
     "the model says nothing of its records and errors; identify or diagnose it with this version of"
@@ -58,37 +55,32 @@ def repeated(
         return (Check("evidence", lambda: (_NONE,)).row(),)
     found: list[CheckRow | Playback] = []
     if records:
-        found.append(Check("records as stated", partial(_strange, evidence, records)).row())
+        known = {r.sha256 for r in evidence.runs}
+        of = ", ".join(f"{r.record} ({r.sha256[:12]}...)" for r in evidence.runs)
+        strange = [
+            f"{r.name} has sha256 {r.sha256[:12]}..., the model states {of}"
+            for r in records
+            if r.sha256 not in known
+        ]
+        found.append(Check("records as stated", lambda: strange).row())
     try:
         if evidence.reference is not None:
-            found.append(_reference(archive, model))
+            times, values = run_inputs(model)
+            text = (archive.directory / OUTPUTS).read_text(encoding="utf-8")
+            names = text.partition("\n")[0].split(",")
+            table = np.loadtxt(text.splitlines()[1:], delimiter=",", ndmin=2)
+            if table.shape != (len(times), len(names)) or "displacement" not in names:
+                raise InputError(f"{OUTPUTS} has not a row of outputs for each time")
+            inputs = Signals(model.input_names, times, values)
+            expected = table[:, names.index("displacement")]
+            start = run_start(model)
+            found.append(Playback("reference run", times, inputs, start, "displacement", expected))
     except BREAKDOWNS as error:
         found.append(stopped("reference run", f"the check stopped: {error}"))
     for record in records:
         runs = (r for r in evidence.runs if r.sha256 == record.sha256)
         found += [_of_record(archive, model, record, run) for run in runs]
     return tuple(found)
-
-
-def _strange(evidence: Evidence, records: Sequence[Record]) -> Iterator[str]:
-    known = {r.sha256 for r in evidence.runs}
-    for record in records:
-        if record.sha256 not in known:
-            of = ", ".join(f"{r.record} ({r.sha256[:12]}...)" for r in evidence.runs)
-            yield f"{record.name} has sha256 {record.sha256[:12]}..., the model states {of}"
-
-
-def _reference(archive: Archive, model: Model) -> Playback:
-    """Return the run that the archive holds; raises what is wrong with its file of outputs."""
-    times, values = run_inputs(model)
-    text = (archive.directory / OUTPUTS).read_text(encoding="utf-8")
-    names = text.partition("\n")[0].split(",")
-    table = np.loadtxt(text.splitlines()[1:], delimiter=",", ndmin=2)
-    if table.shape != (len(times), len(names)) or "displacement" not in names:
-        raise InputError(f"{OUTPUTS} has not a row of outputs for each time")
-    inputs = Signals(model.input_names, times, values)
-    expected = table[:, names.index("displacement")]
-    return Playback("reference run", times, inputs, run_start(model), "displacement", expected)
 
 
 def _of_record(
@@ -107,26 +99,17 @@ def _of_record(
         return stopped(name, f"the record has {ready.n} samples, {run.samples} are stated")
     shown = "measured_displacement"
     times = ready.time - ready.time[0]
+    columns = {n: getattr(ready, n, None) for n in archive.names("input")}
+    inputs = {n: c for n, c in columns.items() if c is not None}
+    judged = np.full(run.samples, not run.held_out)  # the samples that the stated error is over
+    for first, stop in run.held_out:
+        judged[first:stop] = True
     return Playback(
         name,
         times,
-        _signals(archive, ready, times),
+        Signals(tuple(inputs), times, np.array(list(inputs.values())).T),
         {n: v for n, v in run.start.items() if n in model.state_names},
         shown if shown in archive.names("output") else "displacement",
-        np.where(_judged(run), measured(ready) - run.offset_m, np.nan),
+        np.where(judged, measured(ready) - run.offset_m, np.nan),
         run.held_out_m if run.held_out else run.fitted_m,
     )
-
-
-def _signals(archive: Archive, record: Record, times: FloatArray) -> Signals:
-    columns = {n: getattr(record, n, None) for n in archive.names("input")}
-    known = {n: c for n, c in columns.items() if c is not None}
-    return Signals(tuple(known), times, np.array(list(known.values())).T)
-
-
-def _judged(run: RecordRun) -> npt.NDArray[np.bool_]:
-    """Return the samples that the stated error is over."""
-    mask = np.full(run.samples, not run.held_out)
-    for first, stop in run.held_out:
-        mask[first:stop] = True
-    return mask

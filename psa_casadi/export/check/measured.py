@@ -82,35 +82,30 @@ def _played(fmu: Fmu, p: Playback) -> FloatArray:
     Co-simulation of FMI 3.0 has no such inputs. There they are held at the mean over a step, which
     leaves the end of the step late by half of it; from steps and half steps follows what none is.
     """
+
+    def stepped(inputs: Signals) -> FloatArray:
+        """Return the output at the times of the playback, stepped from knot to knot of inputs."""
+        found = co_simulate(
+            fmu, inputs.times, inputs, [p.output], tolerance=_TOLERANCE, values=dict(p.start)
+        )
+        return np.asarray(found[np.isin(inputs.times, p.times), 0])
+
+    def means(parts: int) -> Signals:
+        """Return inputs held at the mean of both ends of a step, of which many parts are made."""
+        counts = parts * np.clip(np.ceil(moved / _STEP), 1, _MOST_STEPS).astype(int)
+        steps = [
+            np.linspace(a, b, m, endpoint=False)
+            for a, b, m in zip(p.inputs.times, p.inputs.times[1:], counts, strict=False)
+        ]
+        fine = p.inputs.on(np.concatenate([*steps, p.inputs.times[-1:]]))
+        ends = np.vstack([fine.values[1:], fine.values[-1:]])
+        return Signals(fine.names, fine.times, 0.5 * (fine.values + ends), held=True)
+
     if fmu.version == 2:
-        return _stepped(fmu, p, p.inputs)
-    whole, halves = (_stepped(fmu, p, _held_means(p.inputs, parts)) for parts in (1, 2))
-    return 2.0 * halves - whole
-
-
-def _stepped(fmu: Fmu, p: Playback, inputs: Signals) -> FloatArray:
-    """Return the output at the times of a playback, stepped from knot to knot of inputs."""
-    found = co_simulate(
-        fmu, inputs.times, inputs, [p.output], tolerance=_TOLERANCE, values=dict(p.start)
-    )
-    return np.asarray(found[np.isin(inputs.times, p.times), 0])
-
-
-def _held_means(inputs: Signals, parts: int) -> Signals:
-    """Return inputs that are held at the mean of both ends of a step, many where they move much.
-
-    Every step is cut into so many parts.
-    """
-    size = np.maximum(np.ptp(inputs.values, axis=0), 1e-300)
-    moved = np.max(np.abs(np.diff(inputs.values, axis=0)) / size, axis=1)
-    counts = parts * np.clip(np.ceil(moved / _STEP), 1, _MOST_STEPS).astype(int)
-    steps = [
-        np.linspace(a, b, m, endpoint=False)
-        for a, b, m in zip(inputs.times, inputs.times[1:], counts, strict=False)
-    ]
-    fine = inputs.on(np.concatenate([*steps, inputs.times[-1:]]))
-    ends = np.vstack([fine.values[1:], fine.values[-1:]])
-    return Signals(fine.names, fine.times, 0.5 * (fine.values + ends), held=True)
+        return stepped(p.inputs)
+    size = np.maximum(np.ptp(p.inputs.values, axis=0), 1e-300)
+    moved = np.max(np.abs(np.diff(p.inputs.values, axis=0)) / size, axis=1)
+    return 2.0 * stepped(means(2)) - stepped(means(1))
 
 
 _EQUATION_LIMIT = 1e-9

@@ -195,9 +195,8 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
 
     That is at the start values of its states and inputs, with the outputs that follow from them.
     """
-    kinds = {CO_SIMULATION: "co-simulation", MODEL_EXCHANGE: "model exchange"}
     for interface in fmu.interfaces():
-        kind = kinds[interface]
+        kind = "co-simulation" if interface == CO_SIMULATION else "model exchange"
         with fmu.start(interface) as instance:
             found = instance.get(list(truth.starts))
         others = [
@@ -251,15 +250,15 @@ def input_line_error(fmu: Fmu) -> float:
     of sampled states among them, is twice their difference from half as many at most, and is taken
     off. Inputs that move no state within a step leave nothing to compare: 0.
     """
-    return max(_share(fmu, rise) for rise in _RISES)
-
-
-def _share(fmu: Fmu, rise: float) -> float:
-    line, held = (_moved(fmu, value, rise, 1) for value in (1.0, 0.0))
-    coarse, fine = (_moved(fmu, 0.0, rise, parts) for parts in (_PARTS // 2, _PARTS))
-    change = float(np.max(np.abs(held - fine), initial=0.0))
-    left = np.abs(line - fine) - 2.0 * np.abs(coarse - fine)
-    return max(0.0, float(np.max(left))) / change if change > _SMALL * rise else 0.0
+    worst = 0.0
+    for rise in _RISES:
+        line, held = (_moved(fmu, value, rise, 1) for value in (1.0, 0.0))
+        coarse, fine = (_moved(fmu, 0.0, rise, parts) for parts in (_PARTS // 2, _PARTS))
+        change = float(np.max(np.abs(held - fine), initial=0.0))
+        left = np.abs(line - fine) - 2.0 * np.abs(coarse - fine)
+        if change > _SMALL * rise:
+            worst = max(worst, float(np.max(left)) / change)
+    return worst
 
 
 def _moved(fmu: Fmu, line: float, rise: float, parts: int) -> FloatArray:
@@ -290,6 +289,7 @@ def event_indicators(fmu: Fmu) -> Iterator[str]:
     names, count = fmu.indicators(), fmu.indicator_count()
     if count != len(names):
         yield f"{count} event indicators are announced, {len(names)} variables switch.* repeat them"
+    values, rest = [], np.zeros(len(fmu.states()))
     with fmu.start(MODEL_EXCHANGE, tolerance=_TOLERANCE) as instance:
         if fmu.version == 3:
             if instance.fmi.getNumberOfEventIndicators() != count:
@@ -298,25 +298,18 @@ def event_indicators(fmu: Fmu) -> Iterator[str]:
                 yield "the binary has another number of states than the description"
             if [u.variable.name for u in fmu.description.eventIndicators] != names:
                 yield "the event indicators of the description are not the variables switch.*"
-        yield from _one_sided(fmu, instance)
-    yield from dict.fromkeys(_dead_or_not_turned(fmu))
-
-
-def _one_sided(fmu: Fmu, instance: Instance) -> Iterator[str]:
-    """Yield the indicators that follow the inputs at rest, but have one sign for all of them."""
-    names, count = fmu.indicators(), fmu.indicator_count()
-    rest = np.zeros(len(fmu.states()))
-    values = []
-    for size in _SIZES:
-        inputs = {n: size * fmu.nominals[n] for n in fmu.names("input")}
-        instance.derivatives(0.0, rest, inputs)
-        values.append(instance.vector("GetEventIndicators", count))
-        if values[-1].tobytes() != instance.get(names).tobytes():
-            yield "the event indicators differ from the variables that repeat them"
-            return
-    for name, z in zip(names, np.array(values).T, strict=False):
+        for size in _SIZES:
+            inputs = {n: size * fmu.nominals[n] for n in fmu.names("input")}
+            instance.derivatives(0.0, rest, inputs)
+            values.append(instance.vector("GetEventIndicators", count))
+            same = values[-1].tobytes() == instance.get(names).tobytes()
+            if not same:
+                yield "the event indicators differ from the variables that repeat them"
+                break
+    for name, z in zip(names, np.array(values).T if same else (), strict=False):
         if np.ptp(z) > 0.0 and not np.min(z) * np.max(z) < 0.0:
             yield f"'{name}' follows the inputs and does not change its sign when they turn"
+    yield from dict.fromkeys(_dead_or_not_turned(fmu))
 
 
 def _dead_or_not_turned(fmu: Fmu) -> Iterator[str]:

@@ -5,7 +5,6 @@ remembers nothing between calls.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -65,23 +64,8 @@ def limit_words(limit: float) -> str:
 def timed(plan: CodePlan) -> bool:
     """Whether the equations depend on the time itself."""
     e, s = plan.expression, plan.model.structure
-    every = (e.change, e.port_end, outputs_of(plan.model), sampled_of(plan.model))
-    return bool(ca.depends_on(ca.vertcat(*every), s.time))
-
-
-def moves(plan: CodePlan) -> bool:
-    """Whether there is something to do between sample instants: states, or the clock."""
-    return bool(plan.model.structure.states) or timed(plan)
-
-
-def outputs_of(model: Model) -> Expression:
-    """Return the outputs of a model with its values."""
-    return with_numbers(model, model.structure.y)
-
-
-def sampled_of(model: Model) -> Expression:
-    """Return the sampled states of a model after an instant, with its values."""
-    return with_numbers(model, model.structure.znext)
+    after = with_numbers(plan.model, ca.vertcat(s.y, s.znext))
+    return bool(ca.depends_on(ca.vertcat(e.change, e.port_end, after), s.time))
 
 
 def check_names(plan: CodePlan) -> None:
@@ -111,18 +95,17 @@ def source_code(plan: CodePlan) -> str:
     """Return the source: the start, the step and the outputs."""
     s, literal = plan.model.structure, plan.precision.literal
     advance = sample = None
-    if moves(plan):
-        gone = [] if plan.precision.single else [plan.expression.low]
-        advance = _block(plan, *_without_change(plan, gone))
+    if s.states or timed(plan):
+        advance = _block(plan, *_without_change(plan))
     if s.sampled:
-        sample = _block(plan, sampled_of(plan.model))
+        sample = _block(plan, with_numbers(plan.model, s.znext))
     return filled(
         "fixed_step.c",
         **names_of(plan),
         start=_start(plan),
         advance=advance,
         sample=sample,
-        outputs=_block(plan, outputs_of(plan.model)),
+        outputs=_block(plan, with_numbers(plan.model, s.y)),
         nothing=_nothing(plan),
         limit=literal(plan.limit) if bounded(plan) else "",
     )
@@ -186,7 +169,23 @@ class _Block:
 
 
 def _block(plan: CodePlan, *expressions: Expression) -> _Block:
-    printer = _printer(plan)
+    e, s = plan.expression, plan.model.structure
+    step = plan.precision.literal(plan.step / plan.substeps)
+    printer = Printer(
+        plan.precision,
+        {"t": s.time, "x": s.x, "v": ca.vertcat(e.low, s.u, e.du, e.port, s.z)},
+        {
+            "t": [f"({step} * state->steps_done)"],
+            "x": [f"state->{q.name}" for q in s.states],
+            "v": [
+                *(f"state->low_of_{q.name}" for q in s.states),
+                *(f"state->last_input.{q.name}" for q in s.inputs),
+                *(f"change->{q.name}" for q in s.inputs),
+                *(f"state->port_of_{q}" for q in e.port_names),
+                *(f"state->{q.name}" for q in s.sampled),
+            ],
+        },
+    )
     return _Block(*printer.lines(expressions), reads=bool(printer.used))
 
 
@@ -212,34 +211,15 @@ def _start(plan: CodePlan) -> list[tuple[str, str]]:
     return fields + ([("steps_done", literal(0.0))] if timed(plan) else [])
 
 
-def _printer(plan: CodePlan) -> Printer:
-    e, s = plan.expression, plan.model.structure
-    step = plan.precision.literal(plan.step / plan.substeps)
-    return Printer(
-        plan.precision,
-        {"t": s.time, "x": s.x, "v": ca.vertcat(e.low, s.u, e.du, e.port, s.z)},
-        {
-            "t": [f"({step} * state->steps_done)"],
-            "x": [f"state->{q.name}" for q in s.states],
-            "v": [
-                *(f"state->low_of_{q.name}" for q in s.states),
-                *(f"state->last_input.{q.name}" for q in s.inputs),
-                *(f"change->{q.name}" for q in s.inputs),
-                *(f"state->port_of_{q}" for q in e.port_names),
-                *(f"state->{q.name}" for q in s.sampled),
-            ],
-        },
-    )
+def _without_change(plan: CodePlan) -> list[Expression]:
+    """Return a step's expressions as they are needed: without what is not there.
 
-
-def _without_change(plan: CodePlan, gone: Sequence[Expression]) -> list[Expression]:
-    """Return a step's expressions as they are needed: without the change of inputs that hold.
-
-    Ports that read such an input or a sampled state jump with it, so that they are evaluated at the
+    That is the change of inputs that hold, and in double precision what rounding takes. Ports that
+    read such an input or a sampled state jump with it, so that they are evaluated at the
     start.
     """
     e, s = plan.expression, plan.model.structure
-    away = [*gone, *([e.du] if plan.held else [])]
+    away = [*([] if plan.precision.single else [e.low]), *([e.du] if plan.held else [])]
     given = [ca.SX.zeros(q.numel()) for q in away]
     still = ca.vertcat(s.u, s.z) if plan.held else s.z
     if still.numel():

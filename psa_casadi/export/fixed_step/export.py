@@ -7,6 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -106,7 +107,11 @@ def fixed_step(
     best = (good or sorted(found, key=lambda f: f.worst.error))[0]
     if not best.worst.error <= USELESS:
         raise InputError(_useless(best))
-    return _limited(best)
+    # the voltage is limited to where the step is as good as on the reference ones
+    limit = reach(best.plan, best.texts, max(GOOD, best.worst.error))
+    plan = replace(best.plan, limit=limit)
+    sources = (header_code(plan, best.errors), source_code(plan))
+    return FixedStep(plan, dict(zip(best.texts, sources, strict=True)), best.errors)
 
 
 def header_code(plan: CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
@@ -125,14 +130,6 @@ def header_code(plan: CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
         licence="\n".join(code_license().splitlines()),
         tool=generation_tool(),
     )
-
-
-def _limited(found: FixedStep) -> FixedStep:
-    """Return a step whose voltage is limited to where it is as good as on the reference ones."""
-    limit = reach(found.plan, found.texts, max(GOOD, found.worst.error))
-    plan = replace(found.plan, limit=limit)
-    texts = (header_code(plan, found.errors), source_code(plan))
-    return FixedStep(plan, dict(zip(found.texts, texts, strict=True)), found.errors)
 
 
 def _useless(best: FixedStep) -> str:
@@ -172,9 +169,11 @@ def _planned(model: Model, attempt: Attempt) -> tuple[CodePlan, str]:
     if not isinstance(found, str):
         check_names(found[0])
         return found
-    own = {c.name for c in (*BASE, *SIMPLIFIED)}
-    without = [c.name for c in model.components if _fits_without(model, c.name, attempt)]
-    blamed = [name for name in without if name not in own]
+    own, blamed = {c.name for c in (*BASE, *SIMPLIFIED)}, []
+    for name in (c.name for c in model.components if c.name not in own):
+        with suppress(InputError):  # where others need it
+            if not isinstance(attempt(model.without([name])), str):
+                blamed.append(name)
     if not blamed:
         raise InputError(
             f"The model '{model.name}' has no step of fixed length and constant cost: {found}."
@@ -222,14 +221,6 @@ def _steps_of_a_period(model: Model, step: float) -> int:
             f" of the step of {step:g} s; give a step of {period / max(count, 1):.12g} s."
         )
     return count
-
-
-def _fits_without(model: Model, name: str, attempt: Attempt) -> bool:
-    try:
-        other = model.without([name])
-    except InputError:
-        return False  # others need it
-    return not isinstance(attempt(other), str)
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,9 @@ class Probe:
     def __init__(self, plan: CodePlan, texts: dict[str, str]) -> None:
         self._plan = plan
         library = shared_library({**texts, "probe.c": probe_code(plan)}, (), ("-O2",))
-        self._play = library_function(library)
+        self._play = ctypes.CDLL(str(library)).psa_probe
+        self._play.argtypes = [ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]
+        self._play.restype = None
 
     def play(self, u: FloatArray) -> FloatArray:
         """Return all outputs (n - 1, ny) after each step of inputs (n, nu), from the start on."""
@@ -89,24 +91,15 @@ class Probe:
         return y
 
 
-def library_function(path: object) -> Callable[..., None]:
-    """Return the function of a probe's library."""
-    function = ctypes.CDLL(str(path)).psa_probe
-    function.argtypes = [ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p]
-    function.restype = None
-    return function
-
-
 def errors(plan: CodePlan, texts: dict[str, str]) -> tuple[VoltageError, ...]:
     """Return the errors on all reference voltages, by the stepper at a far finer tolerance.
 
     An error that is no number is infinite. Raises SimulationError where the model itself fails.
     """
     probe, share = Probe(plan, texts), np.linspace(0.0, 1.0, STEPS + 1)
-    shapes = {name: shape(share) for name, (_, shape) in VOLTAGES.items()}
     return tuple(
-        VoltageError(name, _error(plan, probe, played_inputs(plan.model, shape)))
-        for name, shape in shapes.items()
+        VoltageError(name, _error(plan, probe, played_inputs(plan.model, shape(share))))
+        for name, (_, shape) in VOLTAGES.items()
     )
 
 

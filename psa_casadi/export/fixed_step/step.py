@@ -26,7 +26,7 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.component import Expression
-from psa_casadi.export.fixed_step.way import Ends, Leaving, along_the_way, rosenbrock, solved
+from psa_casadi.export.fixed_step.way import Ends, along_the_way, rosenbrock, solved
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
 from psa_casadi.simulation.exact.split import Split, closure, jumps, split_of
@@ -35,35 +35,13 @@ from psa_casadi.variables import Input
 FloatArray = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class LinearPart:
-    """M (n, n), B (n, nu), c (n,) of L' = M L + B u + c + ports, with values."""
+def _responses(
+    m: FloatArray, nominal: FloatArray, step: float, share: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return E_1, E_2 / step and 2 E_3 / step^2 (n, n each) at `share` of a `step` [s].
 
-    m: FloatArray
-    b: FloatArray
-    c: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Responses:
-    """E_1, E_2 / step and 2 E_3 / step^2 (n, n each) over a part of a step."""
-
-    constant: FloatArray
-    ramp: FloatArray
-    square: FloatArray
-
-
-def linear_part(model: Model, split: Split) -> LinearPart:
-    """Return the linear part of a split with the model's values."""
-    matrices = ca.Function("linear", [split.structure.p], list(split.matrices))
-    m, b, c = (q.full() for q in matrices(model.parameter_vector()))
-    return LinearPart(m, b, c[:, 0])
-
-
-def responses(m: FloatArray, nominal: FloatArray, *, step: float, share: float) -> Responses:
-    """Return the responses at `share` of a `step` [s]; what M does not join is exactly 0.
-
-    `nominal` (n,) are the states' usual sizes, which keep the exponential's numbers alike.
+    `nominal` (n,) are the states' usual sizes, which keep the exponential's numbers alike. What M
+    does not join is exactly 0.
     """
     n = len(m)
     scaled = m * nominal / nominal[:, None]
@@ -73,13 +51,11 @@ def responses(m: FloatArray, nominal: FloatArray, *, step: float, share: float) 
         system[k * n : (k + 1) * n, (k + 1) * n : (k + 2) * n] = np.eye(n)
     full = scipy.linalg.expm(system)
     joined = closure(m != 0.0)
-    parts = [
+    one, two, three = (
         np.where(joined, full[:n, k * n : (k + 1) * n] * nominal[:, None] / nominal, 0.0)
         for k in (1, 2, 3)
-    ]
-    return Responses(
-        parts[0] * step * share, parts[1] * step * share**2, 2.0 * parts[2] * step * share**3
     )
+    return one * step * share, two * step * share**2, 2.0 * three * step * share**3
 
 
 #: Newton steps of ports that feed back.
@@ -117,29 +93,24 @@ def with_numbers(model: Model, expression: Expression) -> Expression:
     return ca.substitute([ca.SX(expression)], [p], [ca.DM(model.parameter_vector())])[0]
 
 
-def step_expression(model: Model, split: Split, step: float) -> StepExpression:
-    """Return the step of `step` [s] of a model with its values."""
-    return _Builder(model, split, step).built()
-
-
 class _Builder:
     """A step under construction: how each state has changed by the half and the end."""
 
     def __init__(self, model: Model, split: Split, step: float) -> None:
         self.model, self.split, self.step = model, split, step
         s = split.structure
-        self.linear = linear_part(model, split)
+        # the linear part L' = m L + b u + c + ports, with the model's values
+        linear = ca.Function("linear", [s.p], list(split.matrices))
+        self.m, self.b, self.c = (q.full() for q in linear(model.parameter_vector()))
         nominal = model.state_nominals()[list(split.linear)]
-        self.responses = [
-            responses(self.linear.m, nominal, step=step, share=share) for share in SHARES
-        ]
+        self.responses = [_responses(self.m, nominal, step, share) for share in SHARES]
         self.low, self.du = ca.SX.sym("low", s.x.numel()), ca.SX.sym("du", s.u.numel())
         self.port = ca.SX.sym("port", len(split.ports))
         self.slope = self._first_slopes()
         # what the linear states have changed by, in their order, and all others in the model's
         self.moved = [
-            _times(r.constant, self.slope) + _times(r.ramp, _times(self.linear.b, self.du))
-            for r in self.responses
+            _times(constant, self.slope) + _times(ramp, _times(self.b, self.du))
+            for constant, ramp, _ in self.responses
         ]
         self.turned = [ca.SX.zeros(s.x.numel()) for _ in SHARES]
         self.ports = [ca.SX(self.port) for _ in SHARES]
@@ -150,10 +121,13 @@ class _Builder:
             if kind == "group":
                 self._group(members[0])
             elif kind == "port":
-                self._port(members[0])
+                for node in range(len(SHARES)):
+                    value = split.ports[members[0]].value
+                    self.ports[node][members[0]] = self._at(node, value)
+                self._respond(members[0])
             else:
                 self._loop(members)
-        start = [self._numbers(q.value) for q in split.ports]
+        start = [with_numbers(self.model, q.value) for q in split.ports]
         return StepExpression(
             time=s.time, x=s.x, low=self.low, u=s.u, du=self.du, port=self.port,
             change=self._change(WHOLE), port_end=self.ports[WHOLE],
@@ -161,12 +135,9 @@ class _Builder:
             port_names=tuple(s.states[q.state].name for q in split.ports),
         )  # fmt: skip
 
-    def _numbers(self, expression: Expression) -> Expression:
-        return with_numbers(self.model, expression)
-
     def _first_slopes(self) -> Expression:
         """Return L' at the start; the diagonal is taken out, so that rest is rest when rounded."""
-        s, (m, b, c) = self.split.structure, (self.linear.m, self.linear.b, self.linear.c)
+        s, m, b = self.split.structure, self.m, self.b
         rows = list(self.split.linear)
         x, low = s.x[rows], self.low[rows]
         slopes = []
@@ -177,7 +148,7 @@ class _Builder:
                 (m[i, j] / scale * x[j] for j in range(len(rows)) if j != i and m[i, j]), ca.SX(0)
             )
             given = sum((b[i, j] / scale * s.u[j] for j in range(b.shape[1]) if b[i, j]), ca.SX(0))
-            rest = own + given + others + c[i] / scale
+            rest = own + given + others + self.c[i, 0] / scale
             slopes.append(scale * (rest + low[i] if m[i, i] else rest))
         for k, port in enumerate(self.split.ports):
             slopes[rows.index(port.state)] += self.port[k]
@@ -190,70 +161,64 @@ class _Builder:
             parts[i] = self.moved[node][k]
         return ca.vertcat(*parts)
 
-    def _at(self, node: int, expression: Expression, change: Expression) -> Expression:
-        """Return an expression at a node at which the states have changed."""
+    def _at(self, node: int, expression: Expression) -> Expression:
+        """Return an expression at a node, where the states have changed as far as it is known."""
         s, share = self.split.structure, SHARES[node]
-        there = [s.time + share * self.step, s.x + change, s.u + share * self.du]
-        return ca.substitute([self._numbers(expression)], [s.time, s.x, s.u], there)[0]
+        there = [s.time + share * self.step, s.x + self._change(node), s.u + share * self.du]
+        given = with_numbers(self.model, expression)
+        return ca.substitute([given], [s.time, s.x, s.u], there)[0]
 
     def _respond(self, k: int) -> None:
         """Add the response to a port, once its values at the half and the end are known."""
         first, second = self.ports[HALF][k] - self.port[k], self.ports[WHOLE][k] - self.port[k]
         ramp, square = 4.0 * first - second, 2.0 * (second - 2.0 * first)
         place = self.split.linear.index(self.split.ports[k].state)
-        for node, r in enumerate(self.responses):
-            self.moved[node] += _column(r.ramp, place) * ramp + _column(r.square, place) * square
-
-    def _port(self, k: int) -> None:
-        value = self.split.ports[k].value
-        for node in range(len(SHARES)):
-            self.ports[node][k] = self._at(node, value, self._change(node))
-        self._respond(k)
+        for node, (_, *both) in enumerate(self.responses):
+            sloped, bent = (ca.sparsify(ca.DM(np.ascontiguousarray(q[:, place]))) for q in both)
+            self.moved[node] += sloped * ramp + bent * square
 
     def _loop(self, members: Sequence[int]) -> None:
         """Take ports that depend on their own responses: Newton steps from the start's values."""
-        guess = ca.SX.sym("guess", len(SHARES) * len(members))
+        places = [(node, k) for k in members for node in range(len(SHARES))]
+        guess = ca.SX.sym("guess", len(places))
         before = [ca.SX(q) for q in self.moved]
-        for place, k in enumerate(members):
-            for node in range(len(SHARES)):
-                self.ports[node][k] = guess[len(SHARES) * place + node]
-            self._respond(k)
-        found = [
-            self._at(node, self.split.ports[k].value, self._change(node))
-            for k in members
-            for node in range(len(SHARES))
-        ]
+        self._take(places, guess)
+        found = [self._at(node, self.split.ports[k].value) for node, k in places]
         miss = ca.vertcat(*found) - guess
         slopes = ca.jacobian(miss, guess)
-        values = ca.vertcat(*[self.port[k] for k in members for _ in SHARES])
+        values = ca.vertcat(*[self.port[k] for _, k in places])
         for _ in range(_NEWTON):
             at, by = ca.substitute([miss, slopes], [guess], [values])
             values -= solved(by, at)
         self.moved = before
-        for place, k in enumerate(members):
-            for node in range(len(SHARES)):
-                self.ports[node][k] = values[len(SHARES) * place + node]
-            self._respond(k)
+        self._take(places, values)
+
+    def _take(self, places: Sequence[tuple[int, int]], values: Expression) -> None:
+        """Give ports their values at the nodes, and add the responses to them."""
+        for place, (node, k) in enumerate(places):
+            self.ports[node][k] = values[place]
+            if node == WHOLE:
+                self._respond(k)
 
     def _group(self, g: int) -> None:
         """Take the states along a driver's way."""
         s, group = self.split.structure, self.split.groups[g]
         slopes = ca.Function(
-            "slopes", [s.time, s.x, s.u, group.rate], [self._numbers(group.slopes)]
+            "slopes", [s.time, s.x, s.u, group.rate], [with_numbers(self.model, group.slopes)]
         )
         ends = Ends(
             step=self.step, time=s.time, x=s.x, u=s.u, du=self.du,
             half=self._change(HALF), whole=self._change(WHOLE),
         )  # fmt: skip
-        leaving = Leaving(group.driver, group.states, self._rates(group.driver), slopes)
-        for node, change in enumerate(along_the_way(ends, leaving)):
+        found = along_the_way(ends, group.driver, group.states, self._rates(group.driver), slopes)
+        for node, change in enumerate(found):
             for place, i in enumerate(group.states):
                 self.turned[node][i] = change[place]
 
     def _rates(self, driver: int) -> tuple[Expression, Expression, Expression]:
         """Return a driver's rate at start, half and end, from its changes: rest is exactly 0."""
         place = self.split.linear.index(driver)
-        m, b = self.linear.m[[place], :], self.linear.b[[place], :]
+        m, b = self.m[[place], :], self.b[[place], :]
         rates = [self.slope[place]]
         for node, share in enumerate(SHARES):
             rate = rates[0] + _times(m, self.moved[node]) + _times(b, share * self.du)
@@ -269,10 +234,6 @@ def _times(matrix: FloatArray, column: Expression) -> Expression:
     return ca.mtimes(ca.sparsify(ca.DM(matrix)), ca.SX(column))
 
 
-def _column(matrix: FloatArray, place: int) -> ca.DM:
-    return ca.sparsify(ca.DM(np.ascontiguousarray(matrix[:, place])))
-
-
 def step_of(model: Model, step: float) -> StepExpression | str:
     """Return the step of `step` [s] of a model between its sample instants, or why it has none."""
     s = model.structure
@@ -280,7 +241,7 @@ def step_of(model: Model, step: float) -> StepExpression | str:
     held = replace(model, structure=between)
     split = split_of(between)
     if not isinstance(split, str):
-        found = step_expression(held, split, step)
+        found = _Builder(held, split, step).built()
     elif between.states and jumps(between):
         return split
     else:

@@ -50,103 +50,88 @@ class Ends:
     whole: Expression
 
 
-@dataclass(frozen=True, eq=False)
-class Leaving:
-    """A driver and the states along its way, by index; its rates at start, half and end.
+def along_the_way(
+    ends: Ends,
+    driver: int,
+    states: Sequence[int],
+    rates: tuple[Expression, Expression, Expression],
+    slopes: ca.Function,
+) -> tuple[Expression, Expression]:
+    """Return what the states along a driver's way have changed by at half and end, (n,) each.
 
-    `slopes` is the function (time, x, u, rate) of the states' derivatives.
+    `driver` and `states` are indices, `rates` the driver's at start, half and end, `slopes` is the
+    function (time, x, u, rate) of the states' derivatives.
     """
+    half, count = ends.half[driver], ends.x.numel()
+    turned, share, turn = _turn(rates, half, ends.whole[driver], ends.step)
+    # where the legs meet: parabolas in time, but the driver's own value
+    change = 4.0 * share * (1.0 - share) * ends.half + share * (2.0 * share - 1.0) * ends.whole
+    parts = [ends.x[i] + change[i] for i in range(count)]
+    parts[driver] = ends.x[driver] + turn
+    meeting = ca.vertcat(*parts)
 
-    driver: int
-    states: tuple[int, ...]
-    rates: tuple[Expression, Expression, Expression]
-    slopes: ca.Function
+    def shifted(x: Expression, moved: Expression) -> Expression:
+        """Return states of which those along the way have changed by so much."""
+        parts = [x[i] for i in range(count)]
+        for place, i in enumerate(states):
+            parts[i] = parts[i] + moved[place]
+        return ca.vertcat(*parts)
+
+    def leg(
+        origin: Expression, target: Expression, begin: Expression, share: Expression
+    ) -> tuple[Expression, Expression, Expression]:
+        """Return the driver's way over a leg, the states' changes at its begin's slopes, and all.
+
+        States beside the way go on a line from `origin` to `target`, from `begin` on for `share`.
+        """
+        duration = share * ends.step
+        way = target[driver] - origin[driver]
+        rate = way / ca.fmax(duration, _SHORTEST * ends.step)
+        theta, gone = ca.SX.sym("theta"), ca.SX.sym("gone", len(states))
+        when = begin + theta * share
+        parts = [origin[i] + theta * (target[i] - origin[i]) for i in range(count)]
+        for i in states:
+            parts[i] = origin[i]
+        x = shifted(ca.vertcat(*parts), gone)
+        given = (ends.time + when * ends.step, x, ends.u + when * ends.du, rate)
+        return way, *rosenbrock(duration * slopes(*given), theta, gone)
+
+    first = leg(ends.x, meeting, ca.SX(0), share)
+    last = leg(shifted(meeting, first[2]), ends.x + ends.whole, share, 1.0 - share)
+    # at the half: a parabola over the way of the leg that it lies on
+    inside = share > 0.5
+    way, straight, moved = (ca.if_else(inside, a, b) for a, b in zip(first, last, strict=True))
+    gone = ca.if_else(inside, half, half - turn)
+    done = ca.fmin(ca.fmax(gone / ca.if_else(way == 0.0, 1.0, way), 0.0), 1.0)
+    behind = ca.if_else(inside, 0.0, first[2])
+    on_leg = done * (straight + done * (moved - straight))
+    return ca.if_else(turned, behind + on_leg, first[2]), first[2] + last[2]
 
 
-@dataclass(frozen=True, eq=False)
-class _Turn:
-    """Where the legs meet: whether the driver turns, at which share, and its change by then."""
+def _turn(
+    rates: tuple[Expression, Expression, Expression],
+    half: Expression,
+    whole: Expression,
+    step: float,
+) -> tuple[Expression, Expression, Expression]:
+    """Return whether the driver turns, at which share of the step, and its change by then.
 
-    turned: Expression
-    share: Expression
-    way: Expression
-
-
-@dataclass(frozen=True, eq=False)
-class _Leg:
-    """One leg: the driver's way, the states' changes, and these at the slopes of its begin."""
-
-    way: Expression
-    change: Expression
-    straight: Expression
-
-
-def along_the_way(ends: Ends, leaving: Leaving) -> tuple[Expression, Expression]:
-    """Return what the states along a driver's way have changed by at half and end, (n,) each."""
-    turn = _turn(ends, leaving)
-    x0 = ends.x
-    meeting = _between(ends, leaving.driver, turn)
-    first = _leg(ends, leaving, x0, meeting, ca.SX(0), turn.share)
-    x1 = _shifted(meeting, leaving.states, first.change)
-    last = _leg(ends, leaving, x1, ends.x + ends.whole, turn.share, 1.0 - turn.share)
-    half = _at_half(ends, leaving, turn, first, last)
-    return half, first.change + last.change
-
-
-def _turn(ends: Ends, leaving: Leaving) -> _Turn:
-    """Find the turn: the rate's zero in a half, and Hermite's cubic of the driver there."""
-    start, middle, end = leaving.rates
+    The turn is the rate's zero in a half of the step, the change Hermite's cubic there.
+    """
+    start, middle, end = rates
     early, late = start * middle < 0.0, middle * end < 0.0
     turned = ca.logic_or(early, late)
-    half, whole = ends.half[leaving.driver], ends.whole[leaving.driver]
     before, after = ca.if_else(early, start, middle), ca.if_else(early, middle, end)
     low, high = ca.if_else(early, 0.0, half), ca.if_else(early, half, whole)
     local = before / ca.if_else(turned, before - after, 1.0)
-    rest, length = 1.0 - local, 0.5 * ends.step
+    rest, length = 1.0 - local, 0.5 * step
     way = (
         rest * rest * (1.0 + 2.0 * local) * low
         + local * local * (3.0 - 2.0 * local) * high
         + local * rest * length * (rest * before - local * after)
     )
     share = ca.if_else(turned, ca.if_else(early, 0.0, 0.5) + 0.5 * local, 0.5)
-    return _Turn(turned, share, ca.if_else(turned, way, half))
-
-
-def _between(ends: Ends, driver: int, turn: _Turn) -> Expression:
-    """Return the states where the legs meet: parabolas in time, but the driver's own value."""
-    s = turn.share
-    change = 4.0 * s * (1.0 - s) * ends.half + s * (2.0 * s - 1.0) * ends.whole
-    parts = [ends.x[i] + change[i] for i in range(ends.x.numel())]
-    parts[driver] = ends.x[driver] + turn.way
-    return ca.vertcat(*parts)
-
-
-def _shifted(x: Expression, states: Sequence[int], change: Expression) -> Expression:
-    """Return states of which some have changed by so much since the start of the step."""
-    parts = [x[i] for i in range(x.numel())]
-    for place, i in enumerate(states):
-        parts[i] = parts[i] + change[place]
-    return ca.vertcat(*parts)
-
-
-def _leg(
-    ends: Ends,
-    leaving: Leaving,
-    origin: Expression,
-    target: Expression,
-    begin: Expression,
-    share: Expression,
-) -> _Leg:
-    """Take one leg from the states `origin` to `target`, from `begin` on for `share`."""
-    duration = share * ends.step
-    way = target[leaving.driver] - origin[leaving.driver]
-    rate = way / ca.fmax(duration, _SHORTEST * ends.step)
-    theta, gone = ca.SX.sym("theta"), ca.SX.sym("gone", len(leaving.states))
-    when = begin + theta * share
-    x = _shifted(_towards(origin, target, theta, leaving.states), leaving.states, gone)
-    given = (ends.time + when * ends.step, x, ends.u + when * ends.du, rate)
-    start, change = rosenbrock(duration * leaving.slopes(*given), theta, gone)
-    return _Leg(way, change, start)
+    return turned, share, ca.if_else(turned, way, half)
 
 
 def rosenbrock(
@@ -174,33 +159,8 @@ def rosenbrock(
     return start, _weighted(_END, stages)
 
 
-def _towards(
-    origin: Expression, target: Expression, theta: Expression, states: Sequence[int]
-) -> Expression:
-    """Return the states at a share of a leg; those along the way stand at its begin."""
-    parts = [origin[i] + theta * (target[i] - origin[i]) for i in range(origin.numel())]
-    for i in states:
-        parts[i] = origin[i]
-    return ca.vertcat(*parts)
-
-
 def _weighted(weights: Sequence[float], stages: Sequence[Expression]) -> Expression:
     return sum((w * k for w, k in zip(weights, stages, strict=True)), ca.SX(0))
-
-
-def _at_half(ends: Ends, leaving: Leaving, turn: _Turn, first: _Leg, last: _Leg) -> Expression:
-    """Return the states' changes at the half: a parabola over the way of the leg it lies on."""
-    inside = turn.share > 0.5  # the half lies on the first leg
-    half = ends.half[leaving.driver]
-    way = ca.if_else(inside, first.way, last.way)
-    gone = ca.if_else(inside, half, half - turn.way)
-    still = way == 0.0
-    share = ca.fmin(ca.fmax(gone / ca.if_else(still, 1.0, way), 0.0), 1.0)
-    change = ca.if_else(inside, first.change, last.change)
-    straight = ca.if_else(inside, first.straight, last.straight)
-    behind = ca.if_else(inside, 0.0, first.change)
-    on_leg = share * (straight + share * (change - straight))
-    return ca.if_else(turn.turned, behind + on_leg, first.change)
 
 
 def solved(a: Expression, b: Expression) -> Expression:

@@ -11,11 +11,10 @@ from pathlib import Path
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.export.ssp.drawing import (
     OUTSIDE,
-    Layout,
     Port,
     Wire,
     WiredParts,
-    arrange,
+    layout_of,
     save_wiring,
     wiring_picture,
 )
@@ -51,7 +50,13 @@ def export_ssp(
     Raises what `connect` and `export_fmu` raise.
     """
     system.model()
-    wiring = _published(wiring_of(system), publication)
+    wiring = wiring_of(system)
+    if publication is not None:
+        parts = {
+            name: part if part.publication.stated else replace(part, publication=publication)
+            for name, part in wiring.parts.items()
+        }
+        wiring = replace(wiring, parts=parts, publication=publication)
     layout = layout_of(wiring)
     entries, bindings = parameter_files(wiring.parts, wiring.name)
     description = structure_description(
@@ -71,32 +76,16 @@ def export_ssp(
     return Path(path)
 
 
-def _published(wiring: WiredParts, publication: Publication | None) -> WiredParts:
-    if publication is None:
-        return wiring
-    parts = {
-        name: part if part.publication.stated else replace(part, publication=publication)
-        for name, part in wiring.parts.items()
-    }
-    return replace(wiring, parts=parts, publication=publication)
-
-
-def layout_of(wiring: WiredParts) -> Layout:
-    """Return the drawing of a system."""
-    return arrange(tuple(wiring.parts), wiring.wires)
-
-
 def wiring_of(system: System) -> WiredParts:
     """Return the parts with all wires, those from and to the surroundings too.
 
     An input that has no wire and no name outside is no connector: it rests at its start value.
     """
-    wires = [Wire(Port(OUTSIDE, name), _port(end)) for name, end in system.inputs.items()]
-    wires += [Wire(_port(start), _port(end)) for start, end in system.wires]
-    wires += [Wire(_port(start), Port(OUTSIDE, name)) for name, start in system.outputs.items()]
+
+    def port(text: str) -> Port:
+        return Port(*text.split(".", 1))
+
+    wires = [Wire(Port(OUTSIDE, name), port(end)) for name, end in system.inputs.items()]
+    wires += [Wire(port(start), port(end)) for start, end in system.wires]
+    wires += [Wire(port(start), Port(OUTSIDE, name)) for name, start in system.outputs.items()]
     return WiredParts(system.name, system.parts, tuple(wires))
-
-
-def _port(text: str) -> Port:
-    part, _, name = text.partition(".")
-    return Port(part, name)

@@ -18,7 +18,6 @@ import numpy as np
 import scipy
 
 from psa_casadi.export.ssp.drawing import OUTSIDE, WiredParts
-from psa_casadi.model.compose import Model
 from psa_casadi.units import FloatArray
 
 #: Growth of a step below which a system counts as stable: memories have the radius 1 itself.
@@ -64,7 +63,14 @@ def linear(wiring: WiredParts) -> Linear:
 
     Sampled parts hold their outputs, so they take no part in a loop.
     """
-    pieces = [_matrices(model) for model in wiring.parts.values()]
+    pieces = []
+    for model in wiring.parts.values():
+        s, size = model.structure, model.state_nominals()
+        rest = [[v.start for v in group] for group in (s.states, s.inputs)]
+        held = [[v.start for v in s.sampled]] if s.sampled else []
+        found = s.slopes(0.0, *rest, model.parameter_vector(), *held)
+        a, b, c, d = (np.array(m, dtype=float).reshape(m.shape) for m in found)
+        pieces.append((a / size[:, None] * size, b / size[:, None], c * size, d))
     a, b, c, d = (scipy.linalg.block_diag(*(p[k] for p in pieces)) for k in range(4))
     ends = [(part, n) for part, model in wiring.parts.items() for n in model.input_names]
     starts = [(part, n) for part, model in wiring.parts.items() for n in model.output_names]
@@ -74,16 +80,6 @@ def linear(wiring: WiredParts) -> Linear:
             row = ends.index((wire.end.part, wire.end.name))
             wires[row, starts.index((wire.start.part, wire.start.name))] = 1.0
     return Linear(a, b, c, d, wires)
-
-
-def _matrices(model: Model) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    s = model.structure
-    rest = [[v.start for v in group] for group in (s.states, s.inputs)]
-    held = [[v.start for v in s.sampled]] if s.sampled else []
-    found = s.slopes(0.0, *rest, model.parameter_vector(), *held)
-    a, b, c, d = (np.array(m, dtype=float).reshape(m.shape) for m in found)
-    size = model.state_nominals()
-    return a / size[:, None] * size, b / size[:, None], c * size, d
 
 
 def stable_step(wiring: WiredParts, *, rates: bool) -> float:
@@ -98,11 +94,16 @@ def stable_step(wiring: WiredParts, *, rates: bool) -> float:
     if not speeds.size:
         return float("inf")
     steps = np.geomspace(1e-2 / speeds.max(), 1e2 / speeds.min(), _STEPS_IN_SEARCH)
-    last = 0.0
-    for step in steps:
+    for k, step in enumerate(steps):
         if system.growth(float(step), rates=rates) > 1.0 + _GROWTH:
-            return _between(system, last, float(step), rates)
-        last = float(step)
+            stable, unstable = float(steps[k - 1]) if k else 0.0, float(step)
+            for _ in range(_BISECTIONS):
+                middle = 0.5 * (stable + unstable)
+                if system.growth(middle, rates=rates) > 1.0 + _GROWTH:
+                    unstable = middle
+                else:
+                    stable = middle
+            return stable
     return float("inf")
 
 
@@ -115,13 +116,3 @@ def master_step(wiring: WiredParts, stop_time: float) -> float:
     longest = min(stable_step(wiring, rates=False) / 20.0, stop_time / 1000.0)
     size = 10.0 ** math.floor(math.log10(longest))
     return max(round(k * size, 15) for k in (1.0, 2.0, 5.0) if k * size <= longest)
-
-
-def _between(system: Linear, stable: float, unstable: float, rates: bool) -> float:
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (stable + unstable)
-        if system.growth(middle, rates=rates) > 1.0 + _GROWTH:
-            unstable = middle
-        else:
-            stable = middle
-    return stable

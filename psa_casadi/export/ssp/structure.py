@@ -52,11 +52,19 @@ def structure_description(
     refuses; without it the drawing extends over all elements, as the standard has it.
     """
 
+    def connection(wire: Wire, path: Sequence[Point]) -> tuple[dict[str, str], list[str]]:
+        """Return the ends of a wire, and the coordinates of its inner corners."""
+        ends = {}
+        for side, port in (("start", wire.start), ("end", wire.end)):
+            if port.part != OUTSIDE:
+                ends[f"{side}Element"] = port.part
+            ends[f"{side}Connector"] = port.name
+        return ends, [" ".join(map(_place, along)) for along in zip(*path[1:-1], strict=True)]
+
     def ports(part: str) -> list[tuple[str, ...]]:
-        places = [(name, kind, Port(part, name)) for name, kind in wiring.ports(part)]
+        found = [(Port(part, name), kind) for name, kind in wiring.ports(part)]
         return [
-            (name, kind, wiring.unit(p), *map(_place, layout.relative(p)))
-            for name, kind, p in places
+            (p.name, kind, wiring.unit(p), *map(_place, layout.relative(p))) for p, kind in found
         ]
 
     parts = [
@@ -81,7 +89,7 @@ def structure_description(
         ports=ports(OUTSIDE),
         bindings=bindings,
         parts=parts,
-        wires=[_connection(*pair) for pair in zip(layout.wires, layout.paths, strict=True)],
+        wires=[connection(*pair) for pair in zip(layout.wires, layout.paths, strict=True)],
         step=_decimal(step),
         tolerance=_decimal(TOLERANCE),
         units={name: base_unit(parse_unit(name)) for name in sorted(used)},
@@ -90,16 +98,6 @@ def structure_description(
     )
     check_text(text, "SystemStructure.ssd, an XML file,")
     return text
-
-
-def _connection(wire: Wire, path: Sequence[Point]) -> tuple[dict[str, str], list[str]]:
-    """Return the ends of a wire, and the coordinates of its inner corners."""
-    ends = {}
-    for side, port in (("start", wire.start), ("end", wire.end)):
-        if port.part != OUTSIDE:
-            ends[f"{side}Element"] = port.part
-        ends[f"{side}Connector"] = port.name
-    return ends, [" ".join(map(_place, along)) for along in zip(*path[1:-1], strict=True)]
 
 
 def _decimal(value: float) -> str:
@@ -144,59 +142,39 @@ def parameter_files(
     bindings = []
     lifted: dict[str, ET.Element] = {}
     for part, root in sets.items():
-        listed = root.find(f"{{{_VALUES}}}Parameters")
-        for element in [] if listed is None else list(listed):
-            if part in shared.get(element.get("name", ""), ()) and listed is not None:
-                lifted.setdefault(element.get("name", ""), element)
-                listed.remove(element)
-        if listed is None or not len(listed):
-            continue
-        _keep_units(root)
-        place = f"{_FOLDER}/{part}.ssv"
-        entries[place] = xml_text(root).encode("utf-8")
-        bindings.append(Binding(part, place))
+        own = []
+        for element in root.iter(f"{{{_VALUES}}}Parameter"):
+            named = element.get("name", "")
+            if part in shared.get(named, ()):
+                lifted.setdefault(named, element)
+            else:
+                own.append(element)
+        if own:
+            place = f"{_FOLDER}/{part}.ssv"
+            entries[place] = _set_text(parts[part].name, own, units)
+            bindings.append(Binding(part, place))
     if lifted:
         values, mapping = f"{_FOLDER}/shared.ssv", f"{_FOLDER}/shared.ssm"
-        entries[values] = _shared_set(name, lifted, units).encode("utf-8")
-        entries[mapping] = _mapping(shared).encode("utf-8")
+        elements = [lifted[n] for n in sorted(lifted)]
+        entries[values] = _set_text(f"{name}_shared", elements, units)
+        ET.register_namespace("ssm", _MAPPING)
+        attributes = {"version": "1.0", "generationTool": generation_tool()}
+        root = ET.Element(f"{{{_MAPPING}}}ParameterMapping", attributes)
+        for source in sorted(shared):
+            for part in shared[source]:
+                target = {"source": source, "target": f"{part}.{source}"}
+                ET.SubElement(root, f"{{{_MAPPING}}}MappingEntry", target)
+        entries[mapping] = xml_text(root).encode("utf-8")
         bindings.append(Binding(OUTSIDE, values, mapping))
     return entries, tuple(bindings)
 
 
-def _shared_set(
-    name: str, lifted: Mapping[str, ET.Element], units: Mapping[str, ET.Element]
-) -> str:
-    attributes = {"version": "1.0", "name": f"{name}_shared", "generationTool": generation_tool()}
+def _set_text(name: str, elements: Sequence[ET.Element], units: Mapping[str, ET.Element]) -> bytes:
+    """Return a parameter set of some parameters, with the units that they have."""
+    attributes = {"version": "1.0", "name": name, "generationTool": generation_tool()}
     root = ET.Element(f"{{{_VALUES}}}ParameterSet", attributes)
-    listed = ET.SubElement(root, f"{{{_VALUES}}}Parameters")
-    listed.extend([lifted[n] for n in sorted(lifted)])
-    used = sorted(_units_of(root))
+    ET.SubElement(root, f"{{{_VALUES}}}Parameters").extend(elements)
+    used = {e.get("unit", "") for e in root.iter(f"{{{_VALUES}}}Real")} - {""}
     if used:
-        ET.SubElement(root, f"{{{_VALUES}}}Units").extend([units[n] for n in used])
-    return xml_text(root)
-
-
-def _mapping(shared: Mapping[str, tuple[str, ...]]) -> str:
-    ET.register_namespace("ssm", _MAPPING)
-    attributes = {"version": "1.0", "generationTool": generation_tool()}
-    root = ET.Element(f"{{{_MAPPING}}}ParameterMapping", attributes)
-    for name in sorted(shared):
-        for part in shared[name]:
-            target = {"source": name, "target": f"{part}.{name}"}
-            ET.SubElement(root, f"{{{_MAPPING}}}MappingEntry", target)
-    return xml_text(root)
-
-
-def _keep_units(root: ET.Element) -> None:
-    """Remove the units that no parameter has any more."""
-    used = _units_of(root)
-    for units in root.findall(f"{{{_VALUES}}}Units"):
-        for unit in list(units):
-            if unit.get("name") not in used:
-                units.remove(unit)
-        if not len(units):
-            root.remove(units)
-
-
-def _units_of(root: ET.Element) -> set[str]:
-    return {e.get("unit", "") for e in root.iter(f"{{{_VALUES}}}Real")} - {""}
+        ET.SubElement(root, f"{{{_VALUES}}}Units").extend([units[n] for n in sorted(used)])
+    return xml_text(root).encode("utf-8")
