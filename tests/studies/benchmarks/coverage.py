@@ -102,6 +102,11 @@ class Found:
         """Whether it would lie there in linear theory at the truth."""
         return abs(self.drawn) <= _NORMAL_95
 
+    @property
+    def relative(self) -> float:
+        """Relative error of the estimate."""
+        return abs(self.value / self.truth - 1.0)
+
 
 @dataclass(frozen=True)
 class Run:
@@ -111,6 +116,7 @@ class Run:
     found: tuple[Found, ...]
     rms_ratio: float
     white: tuple[bool, ...]
+    converged: bool
 
     @property
     def told(self) -> list[Found]:
@@ -148,7 +154,8 @@ def one_run(name: str, seed: int) -> Run:
         stack_model(name), clean, records, told, level, lambda p: quantities(p, size)
     )
     white = tuple(whiteness(r) > _WHITE for r in found.fit.residuals_of(found.experiments))
-    return Run(name, compared(found, truth, drawn), found.fit.rms / level, white)
+    quality = (found.fit.rms / level, white, found.fit.converged)
+    return Run(name, compared(found, truth, drawn), *quality)
 
 
 def compared(found: Identification, truth: Values, drawn: Values) -> tuple[Found, ...]:

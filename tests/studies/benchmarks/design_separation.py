@@ -1,13 +1,11 @@
 """Tables of benchmark `design`: experiments that separate causes, and the time a design takes."""
 
 import os
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
@@ -34,14 +32,12 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.search import CORE, fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from psa_casadi.report.words.tables import Table
+from tests.studies.benchmarks.records import hidden_record, played_again
 from tests.studies.benchmarks.table import Progress, TitledTable, table_of
-from tests.studies.plants.again import play_again
 from tests.studies.plants.excitations import PoorKind
-from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.table import KNOWN
 
 #: Ambiguous pairs that are resolved, and the seeds from which they are drawn.
@@ -113,10 +109,8 @@ def resolve(seed: int) -> Resolved | None:
     rng = np.random.default_rng(seed)
     effect = str(rng.choice([n for n in KNOWN if n != "temperature"]))
     voltage = CLASSES[rng.integers(len(CLASSES))]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "first.csv"
-        truth = make_record(effect, seed, path, excitation=voltage, visible=RHO)
-        first = read_record(path).slice(0, SAMPLES)
+    truth, first = hidden_record(effect, seed, excitation=voltage, visible=RHO)
+    first = first.slice(0, SAMPLES)
     try:
         rival = likely_rival(first, effect)
         pair = [EFFECTS[effect], EFFECTS[rival]]
@@ -131,8 +125,9 @@ def resolve(seed: int) -> Resolved | None:
         return None
     usual = usual_records(designed.limits, designed.limits.steepest(None))
     named = {
-        name: judged(diagnose([first, played(truth, record, seed)], effects=pair), effect)
+        name: judged(diagnose([first, again], effects=pair), effect)
         for name, record in {"designed": designed.record, **usual}.items()
+        for again in (played_again(truth, seed, (record.time, record.voltage)),)
     }
     growth = {"designed": min(p.designed for p in designed.pairs)}
     growth |= {n: min(p.usual[n] for p in designed.pairs) for n in _FURTHER[1:]}
@@ -151,14 +146,6 @@ def likely_rival(record: Record, effect: str) -> str:
     evidence = levelled(examine(plain, task).estimated(), task.alike(base))
     others = {n: p for n, p in evidence.items() if n != effect}
     return max(others, key=lambda n: others[n])
-
-
-def played(truth: Truth, record: Record, seed: int) -> Record:
-    """Return what the same device measures when a planned voltage is played to it."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{record.name}.csv"
-        play_again(truth, seed, path, (record.time, record.voltage))
-        return read_record(path)
 
 
 def judged(d: Diagnosis, effect: str) -> str:

@@ -1,10 +1,8 @@
 """The benchmark `diagnose`: hidden causes on independent plants, and what was named."""
 
 import itertools
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +14,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out import Gain, gain_of
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.model.compose import Model
-from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, judging
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate_record
@@ -28,9 +26,8 @@ from tests.studies.benchmarks.hidden_cases import (
     run_case,
     study,
 )
+from tests.studies.benchmarks.records import hidden_record, played_again
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
 
 _NONE = ("unexplained", "adequate")
@@ -192,14 +189,12 @@ def intervals_table(found: Sequence[Covered]) -> TitledTable:
 
 def covered(effect: str, seed: int) -> Covered | None:
     """Diagnose one record of an effect; None where nothing is named, so that nothing is gained."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "record.csv"
-        truth = make_record(effect, seed, path, visible=ORDINARY)
-        found = diagnose([read_record(path)])
-        if not found.causes:
-            return None
-        models = (found.base_fit.model, found.extended_fit.model)
-        plays = [_play(truth, seed + k, path, models) for k in range(1, PLAYS + 1)]
+    truth, record = hidden_record(effect, seed, visible=ORDINARY)
+    found = diagnose([record])
+    if not found.causes:
+        return None
+    models = (found.base_fit.model, found.extended_fit.model)
+    plays = [_play(played_again(truth, seed + k), models) for k in range(1, PLAYS + 1)]
     groups = [range(k, k + HELD_OUT) for k in range(0, PLAYS, HELD_OUT)]
     rests = [[p for k, p in enumerate(plays) if k not in group] for group in groups]
     return Covered(
@@ -214,10 +209,8 @@ def covered(effect: str, seed: int) -> Covered | None:
 _Play = tuple[Experiment, FloatArray, FloatArray]
 
 
-def _play(truth: Truth, seed: int, path: Path, models: tuple[Model, Model]) -> _Play:
-    """Play the device again and predict it with both models, the offset from the first tenth."""
-    play_again(truth, seed, path)
-    record = read_record(path)
+def _play(record: Record, models: tuple[Model, Model]) -> _Play:
+    """Predict a further record with both models, the offset from the first tenth."""
     experiment = judging(record)
     y = np.asarray(record.displacement)
     predicted = []

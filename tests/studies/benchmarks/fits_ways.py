@@ -4,7 +4,6 @@ The truth is the stepper at 1e-11. Records with kinks and jumps are the hard one
 rest there within a sample.
 """
 
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +27,6 @@ from psa_casadi.records import (
     Record,
     concatenate,
     decaying_triangle,
-    read_record,
     steps,
     time_grid,
     triangle,
@@ -51,9 +48,8 @@ from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
 from psa_casadi.simulation.timings import timed
 from tests.model.stack_models import at_ordinary_size
+from tests.studies.benchmarks.records import hidden_record, played_again
 from tests.studies.benchmarks.table import Progress, TitledTable, share, table_of
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import make_record
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -385,15 +381,8 @@ def _both_ways(
 
 def six_records(cause: str) -> list[Record]:
     """Return records of one device of the independent plants, each with a voltage of its own."""
-    records = []
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "record.csv"
-        truth = make_record(cause, _FIRST_SEED, path, visible=(1.0, 3.0))
-        for k in range(_RECORDS):
-            path = Path(folder) / f"record_{k}.csv"
-            play_again(truth, _FIRST_SEED + k, path)
-            records.append(read_record(path).slice(0, _CUT))
-    return records
+    truth, _ = hidden_record(cause, _FIRST_SEED, visible=(1.0, 3.0))
+    return [played_again(truth, _FIRST_SEED + k).slice(0, _CUT) for k in range(_RECORDS)]
 
 
 def long_record(samples: int) -> Record:

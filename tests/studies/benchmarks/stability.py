@@ -122,7 +122,7 @@ def said_of(given: Given, draw: int) -> Said:
 def _records(given: Given, folder: Path) -> tuple[float, Sequence[Record]]:
     """Return the rms of the noise of the readings [m], and the records."""
     if isinstance(given.source, Case):
-        truth, records = records_of(given.source, folder)
+        truth, records = records_of(given.source)
         return truth.sigma, records
     if isinstance(given.source, ExamRecord):
         record = read_back(given.source, folder)
