@@ -47,10 +47,10 @@ def test_clean_data_leave_the_diagnosis_silent(seed: int, tmp_path: Path) -> Non
 
 
 @slow
-def test_three_causes_are_found_where_one_by_one_ends_with_two(tmp_path: Path) -> None:
+def test_three_causes_are_found_where_one_by_one_ends_with_two() -> None:
     other = ("self_heating", "structural_mode")
     case = Case("three", "temperature", 205877, (1.0, 3.0), other)
-    truth, records = records_of(case, tmp_path)
+    truth, records = records_of(case)
     few = [psa.EFFECTS[n] for n in LIKE_THREE]
     found = psa.diagnose(records, effects=few)
     assert {c.effect for c in found.causes} == set(case.hidden)

@@ -27,7 +27,14 @@ from tests.studies.benchmarks.hidden_cases import (
     study,
 )
 from tests.studies.benchmarks.records import hidden_record, played_again
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
+from tests.studies.benchmarks.table import (
+    Outcome,
+    Progress,
+    TitledTable,
+    on_all_cores,
+    share,
+    table_of,
+)
 from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
 
 _NONE = ("unexplained", "adequate")
@@ -154,34 +161,27 @@ class Covered:
     others: tuple[float, ...]
 
 
-def gain_table(known: Sequence[str], first: int, progress: Progress) -> TitledTable:
-    """Diagnose one record with each effect and compare its gain with that of further records."""
-    jobs = [(effect, first + 100 * k) for k, effect in enumerate(known, start=1)]
-    found = on_all_cores(
-        covered, jobs, lambda one: f"gain of {one.effect}" if one else "", progress
-    )
-    return intervals_table([one for one in found if one])
-
-
 def intervals_table(found: Sequence[Covered]) -> TitledTable:
     """Return how many intervals hold the reduction over records that they do not know."""
-    rows = []
-    for title, pairs in (
-        (
-            "eight blocks of one record's held-out quarter",
-            [(f.blocks, f.reduction) for f in found],
-        ),
-        (
-            f"{HELD_OUT} held-out records",
-            [p for f in found for p in zip(f.experiments, f.others, strict=True)],
-        ),
-    ):
-        held = sum(low <= true <= high for (low, high), true in pairs)
-        width = float(np.median([high - low for (low, high), _ in pairs])) if pairs else np.nan
-        rows.append((title, share(held, len(pairs)), f"{width:.1f} %"))
-    return TitledTable(
+    blocks = [(f.blocks, f.reduction) for f in found]
+    records = [p for f in found for p in zip(f.experiments, f.others, strict=True)]
+    pairs = {
+        "eight blocks of one record's held-out quarter": blocks,
+        f"{HELD_OUT} held-out records": records,
+    }
+
+    def held(name: str) -> str:
+        inside = [low <= true <= high for (low, high), true in pairs[name]]
+        return share(sum(inside), len(inside))
+
+    def width(name: str) -> str:
+        widths = [high - low for (low, high), _ in pairs[name]]
+        return f"{np.median(widths) if widths else np.nan:.1f} %"
+
+    return table_of(
         "Intervals of the gain (95 %)",
-        Table(("interval from", "hold the truth", "median width"), tuple(rows)),
+        pairs,
+        {"interval from": str, "hold the truth": held, "median width": width},
         f"The truth is the reduction of the rms over those of {PLAYS} further records of the same"
         " device, with other voltages and fresh noise, that the interval does not know.",
     )
@@ -239,9 +239,12 @@ def run(progress: Progress, quick: bool) -> Outcome:
     if not quick:
         lost = missed(found)
         known = diagnose_all([f.case for f in lost], progress, only=True)
-        tables.append(limits_table(lost, known))
-        tables.append(gain_table(KNOWN, FIRST, progress))
-    return Outcome(tuple(tables), lambda: picture(found, KNOWN, FOREIGN))
+        jobs = [(effect, FIRST + 100 * k) for k, effect in enumerate(KNOWN, start=1)]
+        gains = on_all_cores(
+            covered, jobs, lambda one: f"gain of {one.effect}" if one else "", progress
+        )
+        tables += [limits_table(lost, known), intervals_table([one for one in gains if one])]
+    return Outcome(tables, lambda: picture(found, KNOWN, FOREIGN))
 
 
 def diagnose_all(
@@ -370,20 +373,20 @@ def _summary(found: Sequence[Found]) -> TitledTable:
 
 
 def _by_effect(found: Sequence[Found]) -> TitledTable:
-    rows = []
-    for effect in dict.fromkeys(f.case.effect for f in found if f.case.effect):
-        cells = []
-        for kind in ("known", "weak", "left out", "foreign"):
-            own = [f for f in of_kind(found, kind) if f.case.effect == effect]
-            cells.append("; ".join(_said(f) for f in own))
-        rows.append((effect, *cells))
-    head = ("hidden", "rho 0.3 to 3", "rho 0.1 to 0.3", "own entry left out", "foreign")
-    return TitledTable(
+    def said(kind: str) -> Callable[[str], str]:
+        own = of_kind(found, kind)
+        return lambda effect: "; ".join(_said(f) for f in own if f.case.effect == effect)
+
+    return table_of(
         "What was said of each",
-        Table(head, tuple(rows)),
+        dict.fromkeys(f.case.effect for f in found if f.case.effect),
+        {
+            "hidden": str, "rho 0.3 to 3": said("known"), "rho 0.1 to 0.3": said("weak"),
+            "own entry left out": said("left out"), "foreign": said("foreign"),
+        },
         "+ right name alone, (+) right name in a set of that size, ? unexplained, - adequate; other"
         " names are wrong ones, in brackets where structure remained or others were as likely.",
-    )
+    )  # fmt: skip
 
 
 def _said(f: Found) -> str:
@@ -402,9 +405,11 @@ def _reliability(found: Sequence[Found]) -> TitledTable:
     rows = []
     for low, high in itertools.pairwise(BINS):
         groups = [in_class(found, kinds, low, high) for kinds in RELIABILITY]
-        if groups[-1]:
-            cells = [c for own in groups for c in _right(own)]
-            rows.append((f"{100 * low:.0f} to {100 * high:.0f} %", *cells))
+        cells = [f"{100 * low:.0f} to {100 * high:.0f} %"]
+        for own in groups:
+            means = [f"{100.0 * float(np.mean(x)):.0f} %" for x in zip(*own, strict=True)]
+            cells += [*(means or ["", ""]), f"{len(own)}"]
+        rows += [tuple(cells)] if groups[-1] else []
     head = ("stated probability", "mean", "right", "effects", "mean", "right", "effects")
     return TitledTable(
         "Probability against frequency",
@@ -413,11 +418,3 @@ def _reliability(found: Sequence[Found]) -> TitledTable:
         " First where the hidden effect is in the table, which the probability takes for granted,"
         " then with the cases whose own entry was left out.",
     )
-
-
-def _right(own: Sequence[tuple[float, bool]]) -> tuple[str, str, str]:
-    """Return mean probability, share of true ones and number of effects of one class."""
-    if not own:
-        return ("", "", "0")
-    stated, true = (100.0 * float(np.mean(column)) for column in zip(*own, strict=True))
-    return (f"{stated:.0f} %", f"{true:.0f} %", f"{len(own)}")

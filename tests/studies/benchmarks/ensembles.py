@@ -308,8 +308,7 @@ def measured(
         doubts.append(float(np.max(apart) / np.ptp(truth[0])))
         progress(f"{case.name}: {OURS}, {count} sets")
         short = Record(name="part", time=work.times, voltage=work.voltage)
-        judged = partial(simulate_many, model, sets[:_JUDGED], short)
-        ours = loosest(lambda rtol, f=judged: partial(f, rtol=rtol), truth)
+        ours = loosest(partial(_judged, model, sets[:_JUDGED], short), truth)
         done.append((case.record, ours.tolerance))
         how: Any = {"rtol": ours.tolerance, "reduce": np.ptp}
         wall, spent = least_times(partial(simulate_many, model, sets[:count], case.record, **how))
@@ -361,6 +360,10 @@ def measured(
     return Outcome((whole, *gpu, beside))
 
 
+def _judged(model: Model, sets: Sequence[dict[str, float]], record: Record, rtol: float) -> Solve:
+    return lambda: simulate_many(model, sets, record, rtol=rtol)
+
+
 def drawn(model: Model, count: int) -> list[dict[str, float]]:
     """Return sets of parameters around a model's; the first are the same for any count."""
     rng = np.random.default_rng(5)
@@ -380,18 +383,6 @@ def loosest(at: At, truth: FloatArray) -> Reached:
         if found.accurate:
             break
     return found
-
-
-def least_time(solve: Solve) -> float:
-    """Return the least processor time of a run [s] over repeats, of which a slow run has one."""
-    least = inf
-    for _ in range(_REPEATS):
-        begin = time.process_time()
-        solve()
-        least = min(least, time.process_time() - begin)
-        if least > _SLOW:
-            break
-    return least
 
 
 @dataclass(frozen=True)

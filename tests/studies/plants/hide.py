@@ -74,7 +74,8 @@ def hide(
         shown = visible_ratio(directions, added, noise_rms)
         return Hidden(hidden, gain, parameters, shown, gain_limited=False, added=added)
     if isinstance(visible, tuple):
-        wanted = math.exp(float(rng.uniform(*map(math.log, visible))))
+        low, high = visible
+        wanted = math.exp(float(rng.uniform(math.log(low), math.log(high))))
     else:
         wanted = strength * float(rng.uniform(*RATIO)) if visible is None else float(visible)
     weakest = hidden.plausible[0] * (1.0 if visible is None else WEAK)
@@ -171,6 +172,3 @@ def added_by(run: Run, effects: Sequence[Effect]) -> FloatArray:
         between = CubicSpline(run.times, own)(run.path.time)
         run = replace(run, fine_displacement=run.fine_displacement + between)
     return total
-
-
-ATTEMPTS, ENOUGH = 4, 1.25
