@@ -13,9 +13,7 @@ from tests.simulation.cuda_host import lend
 from tests.studies.benchmarks import ensembles
 from tests.studies.benchmarks.ensembles import (
     Case,
-    Peer,
     Solve,
-    Work,
     cases,
     drawn,
     loosest,
@@ -84,16 +82,3 @@ def test_a_gpu_has_rows_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     assert row[:5] == ("sine of 10 Hz", "12", "40", "1e-06", "0.0e+00")
     assert "this processor" in tables[0].note
     assert host.launches == [1, 128, 1, 128]
-
-
-def test_a_way_that_is_never_accurate_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ensembles, "_REPEATS", 1)
-    monkeypatch.setattr(Work, "reference", lambda self, rtol: np.tile(self.voltage, (3, 1)))
-    none = Peer("none", lambda work: lambda _: lambda: np.zeros((3, len(work.times))), 3)
-    row = measured(told, [short()], 8, 40, [none]).tables[1].table.rows[1]
-    assert row[4] == "1.0 (missed)"
-
-
-def test_the_first_sets_are_the_same_for_any_count() -> None:
-    model = stack_model("P-885.51")
-    assert drawn(model, 3) == drawn(model, 8)[:3]

@@ -5,7 +5,7 @@ import numpy as np
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.simulate import simulate
-from tests.studies.benchmarks.excerpts import LENGTHS, Ended, ended_of, pieces, table
+from tests.studies.benchmarks.excerpts import Ended, ended_of, table
 
 
 def _record() -> Record:
@@ -18,14 +18,6 @@ def _record() -> Record:
         voltage=voltage,
         displacement=x + 5e-9 * np.random.default_rng(2).standard_normal(t.size),
     )
-
-
-def test_pieces_are_the_same_every_time_and_of_every_kind() -> None:
-    made, again = (pieces([_record()], 60) for _ in range(2))
-    assert [p.name for p in made] == [p.name for p in again]
-    assert all(LENGTHS[0] // 5 <= p.n <= LENGTHS[1] for p in made)
-    assert len({np.sign(np.corrcoef(p.voltage, p.displacement)[0, 1]) for p in made}) == 2
-    assert len({round(float(np.median(np.diff(p.time))), 6) for p in made}) == 3
 
 
 def test_a_refusal_is_no_crash_and_a_crash_is_told() -> None:

@@ -11,11 +11,11 @@ import jsonschema
 import numpy as np
 import pytest
 
-from tests.studies.benchmarks.causes import data
+from tests.studies.benchmarks.causes import data as writing
 from tests.studies.benchmarks.causes.data import cases_of
 from tests.tiers import slow
 
-OWN = Path(data.__file__).parent
+OWN = Path(writing.__file__).parent
 SCORE = OWN / "score.py"
 #: Alone: no folder of ours on the path; numpy's is added by hand.
 ALONE = "import sys, runpy; sys.path.append(sys.argv.pop(1)); sys.argv.pop(0);" \
@@ -136,8 +136,8 @@ def test_a_seed_gives_the_same_bytes_and_the_truth_stays_apart(tmp_path: Path) -
     case = next(c for c in cases_of(5, 10) if c.kind == "clean")
     first, again = tmp_path / "first", tmp_path / "again"
     for folder in (first, again):
-        data.write_case(folder, (1, case))
-        data.write_sums(folder)
+        writing.write_case(folder, (1, case))
+        writing.write_sums(folder)
     sums = (first / "SHA256SUMS").read_text("utf-8")
     assert sums == (again / "SHA256SUMS").read_text("utf-8")
     for line in sums.splitlines():

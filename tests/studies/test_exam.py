@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from psa_casadi.records.read.reading import read_record
-from tests.studies.benchmarks.exam import Marked, answers, counts
 from tests.studies.exam import hysteresis as h
 from tests.studies.exam import marks as m
 from tests.studies.exam.hysteresis import draw_density, preisach
@@ -146,14 +145,3 @@ CREEP, HUM, PLAY = ("slow_creep", 0.99, ()), ("mains_hum", 0.6, ()), ("backlash"
 )
 def test_marks_of_answers_made_by_hand(name: str, answer: m.Answer, mark: str) -> None:
     assert m.mark(BY_NAME[name], answer) == mark
-
-
-def test_the_tables_tell_names_rivals_and_counts() -> None:
-    answer = _said("ambiguous", ("offset_drift", 0.5, ("slow_creep",)))
-    found = [
-        Marked(BY_NAME["k01"], answer, m.IN_SET, 1.0),
-        Marked(BY_NAME["k02"], ADEQUATE, m.MISSED, 1.0),
-    ]
-    rows = answers(found).table.rows
-    assert rows[0][-2:] == ("offset_drift 50 % (or slow_creep)", m.IN_SET)
-    assert ("one cause", "2", f"1 {m.IN_SET}; 1 {m.MISSED}") in counts(found).table.rows

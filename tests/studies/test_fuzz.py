@@ -25,7 +25,7 @@ from tests.tiers import slow
 if not hasattr(os, "fork"):
     pytest.skip("the inputs are attacked in forked processes", allow_module_level=True)
 
-from tests.studies.benchmarks.fuzz import app
+from tests.studies.benchmarks.fuzz import TARGETS, app, tables
 from tests.studies.fuzz import readers
 from tests.studies.fuzz.campaign import (
     CRASH,
@@ -42,7 +42,6 @@ from tests.studies.fuzz.campaign import (
     run,
 )
 from tests.studies.fuzz.damage import damaged_bytes, damaged_json, damaged_table
-from tests.studies.fuzz.table import TARGETS, tables
 
 #: Inputs of each target in the quick tier, and in the full one.
 QUICK = {"records-csv": 500, "column-maps": 300, "paths": 200, "models": 200}

@@ -45,14 +45,6 @@ def ringing() -> list[Match]:
     return matches(values, silent, ("reciprocal",), starts=2)
 
 
-def made_up(kind: str = LOOPS, error: float = 1e-8) -> Comparison:
-    x = 1e-6 * np.arange(11.0)
-    measured = x + error * (-1.0) ** np.arange(11)
-    measured[:3] = np.nan
-    return Comparison(kind, "P-885.51", "made up", np.arange(11.0), np.arange(11.0), measured, x,
-                      1e-5)  # fmt: skip
-
-
 def test_what_is_kept_was_not_fitted() -> None:
     assert not set(FITTED_LOOPS) & set(KEPT_LOOPS)
     assert not {f for _, f in FITTED_LOOPS} & {f for _, f in KEPT_LOOPS}
@@ -70,18 +62,6 @@ def test_a_stack_is_predicted_to_its_noise(shown: list[Comparison]) -> None:
         assert c.voltage[0] == 0.0
         assert c.voltage.min() >= 0.0
         assert c.voltage.max() <= RATED
-
-
-def test_a_table_for_each_of_the_papers_figures() -> None:
-    shown = [made_up(LOOPS), made_up(STEPS, 2e-8), made_up(OTHER)]
-    loops, steps, other = verification_tables(shown)
-    assert loops.table.rows[0] == ("P-885.51", "made up", "0.010 um", "0.10", "0.100")
-    assert loops.table.rows[-1][2:4] == ("0.41 um", "2.65")
-    assert steps.table.rows[0][2:] == ("0.0020", "0.20", "0.200")
-    assert steps.table.rows[-1][2:4] == ("0.0142", "1.42")
-    assert len(other.table.rows) == 2
-    assert "synthetic: the independent reference" in loops.note
-    assert "left out" not in loops.note
 
 
 @slow

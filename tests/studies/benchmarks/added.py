@@ -15,7 +15,14 @@ from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.hidden_cases import names_of
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
+from tests.studies.benchmarks.table import (
+    Outcome,
+    Progress,
+    TitledTable,
+    on_all_cores,
+    share,
+    table_of,
+)
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.hide import hide
 from tests.studies.plants.stack import FloatArray, draw_stack
@@ -67,9 +74,8 @@ class Added:
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Diagnose excerpts of the measured records as they are and with every effect on top."""
-    effects = [e for e in KNOWN if HIDDEN_EFFECTS[e].room is None]
+    effects = [e for e in KNOWN if HIDDEN_EFFECTS[e].room is None][:: 5 if quick else 1]
     pieces = excerpts(1 if quick else EXCERPTS)[: 1 if quick else None]
-    effects = effects[::5] if quick else effects
     plain = on_all_cores(said_of, [(p,) for p in pieces], lambda one: ", ".join(one[0]), progress)
     jobs = [
         (piece, effect, FIRST + 100 * k + j, *own)
@@ -77,7 +83,18 @@ def run(progress: Progress, quick: bool) -> Outcome:
         for j, effect in enumerate(effects)
     ]
     found = on_all_cores(with_effect, jobs, str, progress)
-    return Outcome((summary(found), rows_of(found)))
+    each = table_of(
+        "What was said of each",
+        found,
+        {
+            "record": lambda f: f.record,
+            "named by itself": lambda f: ", ".join(f.own) or "-",
+            "added": lambda f: f.effect,
+            "verdict": lambda f: f.verdict,
+            "named": lambda f: ", ".join(f.within) or "-",
+        },
+    )
+    return Outcome((summary(found), each))
 
 
 def excerpts(each: int) -> list[Record]:
@@ -143,13 +160,3 @@ def summary(found: Sequence[Added]) -> TitledTable:
         f" not count. What is added is {SIZE:g} times what the extended model of the record leaves,"
         " beside what the base can absorb.",
     )
-
-
-def rows_of(found: Sequence[Added]) -> TitledTable:
-    """Return what was said of each."""
-    rows = tuple(
-        (f.record, ", ".join(f.own) or "-", f.effect, f.verdict, ", ".join(f.within) or "-")
-        for f in found
-    )
-    head = ("record", "named by itself", "added", "verdict", "named")
-    return TitledTable("What was said of each", Table(head, rows), "")

@@ -8,12 +8,11 @@ import resource
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,8 +20,7 @@ from psa_casadi.devices.batch import BatchRun, batch
 from psa_casadi.devices.executors import LOCAL, dask_client
 from psa_casadi.population.population import Population, population
 from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share, table_of
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.make import write_csv
 from tests.studies.plants.stack import FloatArray, Stack, draw_stack
@@ -54,22 +52,16 @@ def on_dask(
     """Return a batch on a new cluster of so many workers, and what became of them."""
     devices = len(list(records.glob("*.csv"))) - 1  # jobs.csv
     with dask_client(LOCAL, workers) as client:
-        before = _worker_processes(client)
+        before: dict[str, int] = client.run(os.getpid)  # by the worker's address
         killer = Killer(before, devices)
-        say: Callable[[str], None] = (lambda t: killer(t, progress)) if kill else progress
+        say: Progress = partial(killer, progress=progress) if kill else progress
         found = batch(records, output, executor=client, progress=say)
-        after = set(_worker_processes(client).values())
+        after = set(client.run(os.getpid).values())
     gone = sorted(set(before.values()) - after)
     if kill and gone != killer.killed:
         raise RuntimeError(f"Workers {killer.killed} were killed, and {gone} are gone.")
     new = len(after - set(before.values()))
-    return found, f"{len(gone)} worker killed, {new} new in its place" if kill else ""
-
-
-def _worker_processes(client: Any) -> dict[str, int]:
-    """Return the process of each worker by its address."""
-    found: dict[str, int] = client.run(os.getpid)
-    return found
+    return found, f", {len(gone)} worker killed, {new} new in its place" if kill else ""
 
 
 #: Samples of a record, time between them [s], noise over the stroke.
@@ -87,22 +79,17 @@ DEFECTS: dict[str, Callable[[Stack], Stack]] = {
 }
 
 
-@dataclass(frozen=True)
-class Device:
-    """A device of the population and its defect, "" where it has none."""
+def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> dict[str, str]:
+    """Write a record for each device, and a table of jobs; return the defects by name, "" for none.
 
-    name: str
-    defect: str
-
-
-def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> tuple[Device, ...]:
-    """Write a record for each device, and a table of jobs; the same seed gives the same bytes."""
+    The same seed gives the same bytes.
+    """
     rng = np.random.default_rng(seed)
     usual = draw_stack(np.random.default_rng(7))
     times: FloatArray = STEP * np.arange(SAMPLES, dtype=np.float64)
     bad = set(rng.choice(count, defects, replace=False).tolist())
     kinds = list(DEFECTS)
-    found, rows = [], ["device,batch,date,files"]
+    found, rows = {}, ["device,batch,date,files"]
     for k in range(count):
         stack = _drawn(usual, rng)
         defect = kinds[len([b for b in bad if b < k]) % len(kinds)] if k in bad else ""
@@ -112,9 +99,9 @@ def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> tup
         name = f"S{k:04d}"
         write_csv(folder / f"{name}.csv", times, run.command, run.displacement + noise)
         rows.append(f"{name},B{k * 10 // count},2026-{k * 12 // count + 1:02d}-15,{name}.csv")
-        found.append(Device(name, defect))
+        found[name] = defect
     (folder / "jobs.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    return tuple(found)
+    return found
 
 
 def _drawn(usual: Stack, rng: np.random.Generator) -> Stack:
@@ -153,34 +140,35 @@ def run(progress: Progress, quick: bool) -> Outcome:
 
 def run_sized(progress: Progress, count: int) -> Outcome:
     """Return the tables for `count` devices."""
+
+    def own(what: str, records: Path, output: Path, workers: int) -> _Cost:
+        work = partial(batch, records, output, workers=workers, progress=progress)
+        return _measured(what, lambda: (work(), ""))
+
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        records = folder / "records"
-        records.mkdir()
+        records, part, results = folder / "records", folder / "part", folder / "results"
         progress("making the devices")
+        records.mkdir()
         devices = write_devices(records, count, max(4, count // 20))
-        part = folder / "part"
         part.mkdir()
         write_devices(part, PART, 0, seed=21)
         batch(part, folder / "warm", progress=progress)  # compiles
-        own = partial(_own, progress=progress)
         costs = [
-            _measured(_processes(n), partial(own, part, folder / f"with{n}", n))
+            own(f"{n} process{'es' if n > 1 else ''}", part, folder / f"with{n}", n)
             for n in (1, 2, WORKERS)
         ]
-        results = folder / "results"
         if find_spec("distributed") is None:
             many = os.cpu_count() or 1
-            costs.append(_measured(_processes(many), partial(own, records, results, many)))
+            costs.append(own(f"{many} processes", records, results, many))
         else:
             by = f"{WORKERS} workers of Dask"
             dask = partial(on_dask, workers=WORKERS, progress=progress)
             costs.append(_measured(by, partial(dask, part, folder / "dask")))
             costs.append(_measured(by, partial(dask, records, results, kill=True)))
         whole = costs[-1].run
-        costs.append(_measured("all kept", partial(own, records, results, 1)))
-    found = population(whole.findings)
-    return Outcome((_roc(devices, found), _cost(costs)))
+        costs.append(own("all kept", records, results, 1))
+    return Outcome((_roc(devices, population(whole.findings)), _cost(costs)))
 
 
 @dataclass(frozen=True)
@@ -198,24 +186,21 @@ class _Cost:
     memory: float
     own: float
 
-
-def _own(records: Path, output: Path, workers: int, progress: Progress) -> tuple[BatchRun, str]:
-    return batch(records, output, workers=workers, progress=progress), ""
-
-
-def _processes(count: int) -> str:
-    return f"{count} process{'es' if count > 1 else ''}"
+    @property
+    def each(self) -> float:
+        """Processor time of a device [s]."""
+        return self.processor / len(self.run.devices)
 
 
 def _measured(by: str, work: Callable[[], tuple[BatchRun, str]]) -> _Cost:
     before, began = _processor(), time.perf_counter()
     found, remark = work()
     wall, spent = time.perf_counter() - began, _processor() - before
-    what = f"{len(found.devices)} devices, {by}{f', {remark}' if remark else ''}"
-    own, children = (
+    children, own = (
         resource.getrusage(who).ru_maxrss / 1024.0
-        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        for who in (resource.RUSAGE_CHILDREN, resource.RUSAGE_SELF)
     )
+    what = f"{len(found.devices)} devices, {by}{remark}"
     return _Cost(what, found, wall, spent, children, own)
 
 
@@ -226,72 +211,56 @@ def _processor() -> float:
 
 
 def _cost(costs: Sequence[_Cost]) -> TitledTable:
-    one = costs[0]
-    rows = tuple(
-        (
-            c.what,
-            number(c.wall),
-            number(c.processor),
-            number(c.processor / len(c.run.devices), 2),
-            number(_per_device(c) / _per_device(one), 2),
-            ", ".join(f"{n} {status}" for status, n in c.run.counts.items()),
-            number(c.memory),
-            number(c.own),
-        )
-        for c in costs
-    )
-    note = (
+    return table_of(
+        "Cost",
+        costs,
+        {
+            "run": lambda c: c.what,
+            "wall [s]": lambda c: number(c.wall),
+            "processor [s]": lambda c: number(c.processor),
+            "for a device [s]": lambda c: number(c.each, 2),
+            "over one process": lambda c: number(c.each / costs[0].each, 2),
+            "ended": lambda c: ", ".join(f"{n} {status}" for status, n in c.run.counts.items()),
+            "largest worker [MiB]": lambda c: number(c.memory),
+            "own process [MiB]": lambda c: number(c.own),
+        },
         "Processor times are of all processes, their start included, and do not depend on what else"
         " the machine does, as wall times do. Over one process: what a device costs more with more"
         " workers; its inverse bounds the parallel efficiency where every worker has a core of its"
-        f" own (here {os.cpu_count()} cores). Memory is the largest so far."
+        f" own (here {os.cpu_count()} cores). Memory is the largest so far.",
     )
-    head = (
-        "run",
-        "wall [s]",
-        "processor [s]",
-        "for a device [s]",
-        "over one process",
-        "ended",
-        "largest worker [MiB]",
-        "own process [MiB]",
-    )
-    return TitledTable("Cost", Table(head, rows), note)
 
 
-def _per_device(c: _Cost) -> float:
-    return c.processor / len(c.run.devices)
-
-
-def _roc(devices: Sequence[Device], found: Population) -> TitledTable:
+def _roc(devices: Mapping[str, str], found: Population) -> TitledTable:
     """Return how well the tests for outliers tell devices with defects from sound ones."""
-    smallest = dict.fromkeys((d.name for d in devices), 1.0)
+    smallest = dict.fromkeys(devices, 1.0)
     for s in found.spreads:
         for k, p in zip(s.estimates.places, s.far.p, strict=True):
             name = found.findings[k].device
             smallest[name] = min(smallest[name], float(p))
     score = {name: -np.log(max(p, 1e-300)) for name, p in smallest.items()}
     told = {o.device for o in found.outliers}
-    sound = [d.name for d in devices if not d.defect]
-    rows = []
-    for defect in ("", *DEFECTS):
-        those = [d.name for d in devices if d.defect and defect in ("", d.defect)]
-        auc, error = _auc([score[n] for n in those], [score[n] for n in sound])
-        rows.append(
-            (
-                defect or "any",
-                share(sum(n in told for n in those), len(those)),
-                f"{auc:.3f} ± {1.96 * error:.3f}",
-            )
-        )
-    false = sum(n in told for n in sound)
-    note = (
-        f"False alarms: {share(false, len(sound))} of the sound devices. Told: p below"
-        " 0.05, adjusted by Benjamini and Hochberg over all devices and parameters. The area under"
-        " the ROC curve is of the smallest p of a device (interval: Hanley and McNeil 1982)."
+    sound = [name for name, defect in devices.items() if not defect]
+
+    def those(wanted: str) -> list[str]:
+        return [name for name, defect in devices.items() if defect and wanted in ("any", defect)]
+
+    def area(wanted: str) -> str:
+        auc, error = _auc([score[n] for n in those(wanted)], [score[n] for n in sound])
+        return f"{auc:.3f} ± {1.96 * error:.3f}"
+
+    def named(wanted: str) -> str:
+        return share(sum(n in told for n in those(wanted)), len(those(wanted)))
+
+    return table_of(
+        f"Defects among {len(devices)} devices",
+        ("any", *DEFECTS),
+        {"defect": str, "told": named, "area under the ROC curve": area},
+        f"False alarms: {share(sum(n in told for n in sound), len(sound))} of the sound devices."
+        " Told: p below 0.05, adjusted by Benjamini and Hochberg over all devices and parameters."
+        " The area under the ROC curve is of the smallest p of a device (interval: Hanley and"
+        " McNeil 1982).",
     )
-    head = ("defect", "told", "area under the ROC curve")
-    return TitledTable(f"Defects among {len(devices)} devices", Table(head, tuple(rows)), note)
 
 
 def _auc(bad: Sequence[float], good: Sequence[float]) -> tuple[float, float]:

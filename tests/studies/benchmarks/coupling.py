@@ -397,9 +397,8 @@ def _table(case: Case, runs: Sequence[Run], apart: dict[float, float]) -> Titled
     for step in dict.fromkeys(r.step for r in runs):
         errors = (of[name, step] for name in names)
         shares = (number(100.0 * e, 2) if isfinite(e) else "unstable" for e in errors)
-        rows.append(
-            (number(1e6 * step, 4), *shares, number(apart[step], 1) if step in apart else "")
-        )
+        between = number(apart[step], 1) if step in apart else ""
+        rows.append((number(1e6 * step, 4), *shares, between))
     slopes = (number(order([r for r in runs if r.master == n]), 3) for n in names)
     rows.append(("order", *slopes, ""))
     head = ("communication step [us]", *(f"{n} [%]" for n in names), "fmpy - ecos (of the range)")

@@ -8,7 +8,7 @@ covariance of the fit gives it. Every stack has its own draws. Beside the share 
 stands what these draws alone give (`coverage_control`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,15 +16,15 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import whiteness
 from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.identify import Identification, identify
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.records import Record
 from psa_casadi.records.split import whole
-from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.records import Values, clean_set, with_noise
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, table_of
 
 FloatArray = npt.NDArray[np.float64]
 _STEP, _RTOL = 1e-5, 1e-8
@@ -45,8 +45,7 @@ def drawn_scores(
     """
     experiments = [whole(r) for r in clean]
     at = fit(model, experiments, names, sigma=[level] * len(clean), evaluations=1, rtol=_RTOL)
-    pairs = zip(noisy, clean, strict=True)
-    noise = np.concatenate([_displacement(n) - _displacement(c) for n, c in pairs])
+    noise = np.concatenate([measured(n) - measured(c) for n, c in zip(noisy, clean, strict=True)])
     scaled, count = at.jacobian / level, len(names)
     covariance = np.linalg.pinv(
         scaled.T @ scaled + np.diag(1.0 / at.unknowns.prior**2), hermitian=True
@@ -68,12 +67,6 @@ def gradients(
         up, down = (quantities({**values, name: values[name] + s}) for s in (h, -h))
         columns.append([(up[q] - down[q]) / (2.0 * h) for q in up])
     return np.array(columns).T
-
-
-def _displacement(record: Record) -> FloatArray:
-    if record.displacement is None:
-        raise ValueError(f"record '{record.name}' has no displacement")
-    return record.displacement
 
 
 NOISE, SEEDS, QUICK_SEEDS = 1e-3, 50, 2
@@ -117,14 +110,18 @@ class Found:
 
 @dataclass(frozen=True)
 class Run:
-    """One identification: what was found, rms over the noise put in, white records, warnings."""
+    """One identification: what was found, rms over the noise put in, white records."""
 
     stack: str
-    seed: int
     found: tuple[Found, ...]
     rms_ratio: float
     white: tuple[bool, ...]
     converged: bool
+
+    @property
+    def told(self) -> list[Found]:
+        """What the records determine."""
+        return [f for f in self.found if f.determined]
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -141,7 +138,7 @@ def _over(names: Sequence[str], seeds: int, progress: Progress) -> Outcome:
     """Identify the named stacks from `seeds` sets of records each, on all cores."""
     jobs = [(name, seed) for name in names for seed in range(seeds)]
     runs = on_all_cores(one_run, jobs, lambda run: run.stack, progress)
-    return Outcome((_quantities(runs), _residuals(runs)))
+    return Outcome([by_stack(runs)])
 
 
 def one_run(name: str, seed: int) -> Run:
@@ -152,23 +149,13 @@ def one_run(name: str, seed: int) -> Run:
     records = with_noise(clean, NOISE, (tuple(STACKS).index(name), seed))
     found = identify(records, stiffness=truth["k_B"])
     size = static_compliance(truth) * truth["h_ref"]
+    told = found.determinacy.names
     drawn = drawn_scores(
-        stack_model(name),
-        clean,
-        records,
-        found.determinacy.names,
-        level,
-        lambda p: quantities(p, size),
+        stack_model(name), clean, records, told, level, lambda p: quantities(p, size)
     )
     white = tuple(whiteness(r)[0] > _WHITE for r in found.fit.residuals_of(found.experiments))
-    return Run(
-        stack=name,
-        seed=seed,
-        found=compared(found, truth, drawn),
-        rms_ratio=found.fit.rms / level,
-        white=white,
-        converged=found.fit.converged,
-    )
+    quality = (found.fit.rms / level, white, found.fit.converged)
+    return Run(name, compared(found, truth, drawn), *quality)
 
 
 def compared(found: Identification, truth: Values, drawn: Values) -> tuple[Found, ...]:
@@ -210,86 +197,45 @@ def quantities(p: Values, size: float) -> dict[str, float]:
     }
 
 
-SHOWN: Mapping[str, str] = {
-    "k_L": "k", "A": "A", "beta": "beta", "gamma": "gamma", "delta": "delta", "n": "n",
-    "tau": "tau", "R_s": "R_s C_p", "c_P": "c_P/k_P", "m_P": "m_P/k_P", "c_B": "c_B/k_B",
-    "m_B": "m_B/k_B",
-}  # fmt: skip
-
-
-def _quantities(runs: Sequence[Run]) -> TitledTable:
-    rows = []
-    for stack in dict.fromkeys(r.stack for r in runs):
-        own = [r for r in runs if r.stack == stack]
-        for name, shown in SHOWN.items():
-            all_found = [f for r in own for f in r.found if f.name == name]
-            told = [f for f in all_found if f.determined]
-            if not told:
-                rows.append((stack, shown, f"0 of {len(all_found)}", *[""] * 5))
-                continue
-            errors = 100.0 * np.array([f.relative for f in told])
-            limit = 5.0 if name in ("n", "beta", "gamma") else 1.0
-            rows.append(
-                (
-                    stack,
-                    shown,
-                    f"{len(told)} of {len(all_found)}",
-                    f"{100.0 * np.mean([f.covered for f in told]):.0f} %",
-                    f"{100.0 * np.mean([f.covered_by_draws for f in told]):.0f} %",
-                    f"{np.median([100.0 * f.error / abs(f.value) for f in told]):.2g} %",
-                    f"{np.median(errors):.2g} %",
-                    f"{100.0 * np.mean(errors < limit):.0f} % within {limit:g} %",
-                )
-            )
-    head = (
-        "stack", "quantity", "determined in", "truth in its 95 % interval", "by the draws alone",
-        "standard error, median", "error, median", "close to the truth",
-    )  # fmt: skip
-    return TitledTable(
-        "Identified from scratch, against the truth", Table(head, tuple(rows)), share_sentence(runs)
-    )
-
-
 def share_sentence(runs: Sequence[Run]) -> str:
     """Say how many intervals hold the truth, with the error of that share.
 
     Quantities of one run depend on each other, so the error is that of a mean over runs.
     """
-    each = [[f for f in r.found if f.determined] for r in runs]
-    told = [f for own in each for f in own]
-    share = float(np.mean([f.covered for f in told]))
-    drawn = float(np.mean([f.covered_by_draws for f in told]))
-    over = [sum(f.covered for f in own) - share * len(own) for own in each]
-    error = float(np.sqrt(np.sum(np.square(over)))) / len(told)
+    told = [f for r in runs for f in r.told]
     held = sum(f.covered for f in told)
+    share, drawn = held / len(told), float(np.mean([f.covered_by_draws for f in told]))
+    over = [sum(f.covered for f in r.told) - share * len(r.told) for r in runs]
+    error = float(np.sqrt(np.sum(np.square(over)))) / len(told)
     return (
         f"Of {len(told)} intervals {held} hold the truth, {100.0 * share:.1f} % (standard error"
         f" {100.0 * error:.1f} %). By these draws alone it would be {100.0 * drawn:.1f} %."
     )
 
 
-def _residuals(runs: Sequence[Run]) -> TitledTable:
-    rows = []
-    for stack in dict.fromkeys(r.stack for r in runs):
-        own = [r for r in runs if r.stack == stack]
-        ratios = np.array([r.rms_ratio for r in own])
-        white = [w for r in own for w in r.white]
-        rows.append(
-            (
-                stack,
-                f"{len(own)}",
-                f"{np.median(ratios):.3f}",
-                f"{ratios.min():.3f} to {ratios.max():.3f}",
-                f"{100.0 * np.mean(white):.1f} %",
-                f"{sum(r.converged for r in own)}",
-            )
-        )
-    head = (
-        "stack", "fits", "residual over noise, median", "least to most",
-        "records with white residual", "converged",
-    )  # fmt: skip
-    return TitledTable(
-        "What the fits leave",
-        Table(head, tuple(rows)),
-        "White: portmanteau test of 25 lags with p above 1 %, so that 99 % of pure noise pass.",
-    )
+def by_stack(runs: Sequence[Run]) -> TitledTable:
+    """Return how many intervals of each stack hold the truth, and what the fits leave."""
+    of = {n: [r for r in runs if r.stack == n] for n in dict.fromkeys(r.stack for r in runs)}
+
+    def held(n: str) -> str:
+        found = [f.covered for r in of[n] for f in r.told]
+        return f"{sum(found)} of {len(found)}, {100.0 * np.mean(found):.1f} %"
+
+    def drawn(n: str) -> str:
+        return f"{100.0 * np.mean([f.covered_by_draws for r in of[n] for f in r.told]):.1f} %"
+
+    def left(n: str) -> str:
+        ratios = [r.rms_ratio for r in of[n]]
+        return f"{min(ratios):.3f} to {max(ratios):.3f}"
+
+    def white(n: str) -> str:
+        found = [w for r in of[n] for w in r.white]
+        return f"{sum(found)} of {len(found)}"
+
+    columns: dict[str, Callable[[str], str]] = {
+        "stack": str, "intervals that hold the truth": held, "by the draws alone": drawn,
+        "residual over noise": left, "white records": white,
+    }  # fmt: skip
+    note = " White: portmanteau test of 25 lags with p above 1 %, so that 99 % of pure noise pass."
+    title = "Identified from scratch, against the truth"
+    return table_of(title, of, columns, share_sentence(runs) + note)

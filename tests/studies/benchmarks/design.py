@@ -2,14 +2,10 @@
 
 import time
 from collections.abc import Callable
-from importlib import import_module
 
 import numpy as np
 
-from psa_casadi.design.mechanism.mechanism import design_mechanism
-from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.examples.linearisation_trial import (
-    Drive,
     ageing,
     driven,
     off_values,
@@ -27,32 +23,19 @@ from psa_casadi.online import (
 )
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
-
-#: Each part measures its own tables: `tables(progress, quick)`.
-_PARTS = ("design_separation", "design_tracking", "design_linearisation")
+from tests.studies.benchmarks import design_separation, design_tracking
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, table_of
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Measure every part; with `quick` on fewer and smaller cases."""
-    found = []
-    for part in _PARTS:
-        found += import_module(f"tests.studies.benchmarks.{part}").tables(progress, quick)
-    return Outcome(tuple(found))
+    found = [p.tables(progress, quick) for p in (design_separation, design_tracking)]
+    linear = (_nonlinearity(progress, quick), _time_table(progress, quick))
+    return Outcome((*found[0], *found[1], *linear))
 
 
 STACKS = ("P-885.51", "demo")
 FREQUENCY, PERIOD = 5.0, 5e-4
-_CONTROLS = ("none", "feed-forward", "tracked")
-
-
-def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
-    """Measure nonlinearity, time per sample and mechanisms again."""
-    return (
-        _nonlinearity(progress, quick),
-        _time_table(progress, quick),
-        _mechanisms(progress, quick),
-    )
 
 
 def _nonlinearity(progress: Progress, quick: bool) -> TitledTable:
@@ -81,15 +64,15 @@ def _nonlinearity(progress: Progress, quick: bool) -> TitledTable:
 
 def _run(plant: Model, known: Model, ages: float | None = None) -> tuple[str, ...]:
     end = ages or 3.0
-    time_ = np.arange(0.0, end, PERIOD)
     drift = ageing(plant, end) if ages else None
     part = slice(-round((2.0 if ages else 1.2) / PERIOD), None)
 
     def figure(control: str) -> str:
-        run: Drive = driven(plant, control, known, time_, drift=drift, frequency=FREQUENCY)
+        times = np.arange(0.0, end, PERIOD)
+        run = driven(plant, control, known, times, drift=drift, frequency=FREQUENCY)
         return number(100.0 * run.nonlinearity(part), 3)
 
-    return tuple(figure(control) for control in _CONTROLS)
+    return tuple(figure(control) for control in ("none", "feed-forward", "tracked"))
 
 
 def _time_table(progress: Progress, quick: bool) -> TitledTable:
@@ -101,51 +84,23 @@ def _time_table(progress: Progress, quick: bool) -> TitledTable:
     x = [1e-7 * v for v in u]
     observer, forward = HysteresisObserver(values), FeedForward(values)
     online, adaptive = OnlineIdentification(tuned), AdaptiveFeedForward(tuned)
-    rows = [
-        ("observer (37)", _microseconds(lambda k: observer.step(u[k]), count)),
-        ("feed-forward (39-41)", _microseconds(lambda k: forward.step_voltage(u[k]), count)),
-        ("recursive least squares (38)", _microseconds(lambda k: online.step(u[k], x[k]), count)),
-        ("tracked feed-forward", _microseconds(lambda k: adaptive.step_voltage(u[k], x[k]), count)),
-    ]
-    return TitledTable(
-        "Time per sample of the streaming objects, CPU [us]",
-        Table(("object", "time"), tuple((name, number(value, 3)) for name, value in rows)),
-        "One call from Python, with the loop around it.",
-    )
+    steps: dict[str, Callable[[int], object]] = {
+        "observer (37)": lambda k: observer.step(u[k]),
+        "feed-forward (39-41)": lambda k: forward.step_voltage(u[k]),
+        "recursive least squares (38)": lambda k: online.step(u[k], x[k]),
+        "tracked feed-forward": lambda k: adaptive.step_voltage(u[k], x[k]),
+    }
 
+    def microseconds(name: str) -> str:
+        """Return the least CPU time of three passes per sample [us]."""
+        found = []
+        for _ in range(3):
+            start = time.process_time()
+            for k in range(count):
+                steps[name](k)
+            found.append((time.process_time() - start) / count)
+        return number(1e6 * min(found), 3)
 
-def _microseconds(step: Callable[[int], float], count: int) -> float:
-    """Return the least CPU time of three passes per sample [us]."""
-    found = []
-    for _ in range(3):
-        start = time.process_time()
-        for k in range(count):
-            step(k)
-        found.append((time.process_time() - start) / count)
-    return 1e6 * min(found)
-
-
-def _mechanisms(progress: Progress, quick: bool) -> TitledTable:
-    rows = []
-    for text, limits in (
-        ("stroke loss 10 %", Limits()),
-        ("and a mass of 50 g", Limits(mass=(0.0, 0.05))),
-        ("and a force of 500 N", Limits(force=500.0)),
-    ):
-        progress(f"mechanism within {text}")
-        start = time.perf_counter()
-        d = design_mechanism(
-            stack_model("PTBS200"), damping=0.7, limits=limits, starts=2 if quick else 8
-        )
-        r, m = d.reached, d.mounting
-        figures = (1e3 * m.mass, m.damping, 1e-6 * m.stiffness, r.damping, r.bandwidth)
-        rest = (100.0 * r.stroke_loss, r.peak_force, time.perf_counter() - start)
-        agree = f"{d.agreeing} of {d.starts}"
-        rows.append((text, *(number(v, 3) for v in (*figures, *rest)), agree))
-    head = (
-        "within", "mass [g]", "damping [N.s/m]", "stiffness [N/um]", "damping ratio",
-        "bandwidth [Hz]", "stroke loss [%]", "peak force [N]", "time [s]", "same design",
-    )  # fmt: skip
-    return TitledTable(
-        "Mechanism for a damping ratio of 0.7 on the PTBS200 (free: 0.03)", Table(head, tuple(rows))
-    )
+    title = "Time per sample of the streaming objects, CPU [us]"
+    note = "One call from Python, with the loop around it."
+    return table_of(title, steps, {"object": str, "time": microseconds}, note)

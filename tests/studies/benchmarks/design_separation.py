@@ -1,13 +1,11 @@
 """Tables of benchmark `design`: experiments that separate causes, and the time a design takes."""
 
 import os
-import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
@@ -15,7 +13,6 @@ from psa_casadi.design.experiment.criteria import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.experiment import (
     ASKED,
     PLAYS,
-    Separated,
     informative_experiment,
     resolving_experiment,
     rival_of_effect,
@@ -34,16 +31,13 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.search import CORE, fit_base
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
 from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.table import Progress, TitledTable
-from tests.studies.plants.again import play_again
+from tests.studies.benchmarks.records import hidden_record, played_again
+from tests.studies.benchmarks.table import Progress, TitledTable, table_of
 from tests.studies.plants.excitations import PoorKind
-from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.table import KNOWN
 
 #: Ambiguous pairs that are resolved, and the seeds from which they are drawn.
@@ -52,8 +46,7 @@ PAIRS, QUICK_PAIRS, FIRST = 20, 2, 8400
 SAMPLES, RHO = 2000, (0.3, 2.0)
 CLASSES: tuple[PoorKind, ...] = ("sine", "triangle")
 _FURTHER = ("designed", "sine", "triangle")
-_NAMED = ("right", "wrong", "open")
-_SIZES, _QUICK_SIZES = (250, 500, 1000, 2000, 4000), (250, 1000)
+_SIZES = (250, 500, 1000, 2000, 4000)
 _TIMED = (("slow_creep", "offset_drift"), ("field_dependent_gain", "rate_independent_asymmetry"))
 
 
@@ -62,26 +55,27 @@ class Resolved:
     """One ambiguous pair: what is hidden, its rival, and what was named after each further record.
 
     `named` holds for each voltage "right", "wrong", "open" or "not played"; `growth` the predicted
-    least ln of the Bayes factor; `chance` the predicted probability to name the hidden effect;
-    `plays` how often the record must be played for 90 % of it, None if that is never reached.
+    least ln of the Bayes factor; `plays` how often the record must be played to name the hidden
+    effect with 90 %, None if that is never reached.
     """
 
-    seed: int
     effect: str
     rival: str
     voltage: str
-    kind: str
     named: dict[str, str]
     growth: dict[str, float]
-    chance: float
     plays: int | None
-    seconds: float
+
+    def __str__(self) -> str:
+        """Return pair and answers in a line."""
+        said = ", ".join(f"{n} {v} ({self.growth[n]:.3g})" for n, v in self.named.items())
+        return f"{self.effect} or {self.rival} after a {self.voltage}; {said}"
 
 
 def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
     """Measure both tables; the seeds are the same in every run."""
     found = resolve_pairs(QUICK_PAIRS if quick else PAIRS, FIRST, progress)
-    return (_summary(found), _by_pair(found), _times(progress, quick))
+    return (_summary(found), _times(progress, quick))
 
 
 def resolve_pairs(count: int, first: int, progress: Progress) -> list[Resolved]:
@@ -90,20 +84,14 @@ def resolve_pairs(count: int, first: int, progress: Progress) -> list[Resolved]:
     They come in the order of their seeds, with those among them that no voltage tells.
     """
     found: list[Resolved] = []
-    workers = os.cpu_count() or 1
+    workers, seed = os.cpu_count() or 1, first
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        seed = first
         while len(_played(found)) < count:
             batch = range(seed, seed + 2 * workers)
             for number, one in zip(batch, pool.map(resolve, batch), strict=True):
                 if one is not None and len(_played(found)) < count:
                     found.append(one)
-                    said = ", ".join(f"{n} {v}" for n, v in one.named.items())
-                    so_far = len(_played(found))
-                    progress(
-                        f"{so_far} of {count} (seed {number}): {one.effect} or {one.rival}"
-                        f" after a {one.voltage}; {said} [{one.seconds:.0f} s to design]"
-                    )
+                    progress(f"{len(_played(found))} of {count} (seed {number}): {one}")
             seed = batch.stop
     return found
 
@@ -121,10 +109,8 @@ def resolve(seed: int) -> Resolved | None:
     rng = np.random.default_rng(seed)
     effect = str(rng.choice([n for n in KNOWN if n != "temperature"]))
     voltage = CLASSES[rng.integers(len(CLASSES))]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "first.csv"
-        truth = make_record(effect, seed, path, excitation=voltage, visible=RHO)
-        first = read_record(path).slice(0, SAMPLES)
+    truth, first = hidden_record(effect, seed, excitation=voltage, visible=RHO)
+    first = first.slice(0, SAMPLES)
     try:
         rival = likely_rival(first, effect)
         pair = [EFFECTS[effect], EFFECTS[rival]]
@@ -132,43 +118,34 @@ def resolve(seed: int) -> Resolved | None:
         if d.verdict != "ambiguous" or len(d.contenders) < 2:
             return None
         if len(one_of_each(d.contenders, d.experiments)[0]) < 2:
-            nothing = dict.fromkeys(_FURTHER, 0.0)
             left = dict.fromkeys(_FURTHER, "not played")
-            return Resolved(seed, effect, rival, voltage, "none", left, nothing, 0.0, None, 0.0)
+            return Resolved(effect, rival, voltage, left, dict.fromkeys(_FURTHER, 0.0), None)
         designed = resolving_experiment(d)
     except PsaError:
         return None
     usual = usual_records(designed.limits, designed.limits.steepest(None))
-    named = {}
-    for name, record in {"designed": designed.record, **usual}.items():
-        again = diagnose([first, played(truth, record, seed)], effects=pair)
-        named[name] = judged(again, effect)
-    return _resolved(seed, effect, rival, voltage, named, designed)
+    named = {
+        name: judged(diagnose([first, again], effects=pair), effect)
+        for name, record in {"designed": designed.record, **usual}.items()
+        for again in (played_again(truth, seed, (record.time, record.voltage)),)
+    }
+    growth = {"designed": min(p.designed for p in designed.pairs)}
+    growth |= {n: min(p.usual[n] for p in designed.pairs) for n in _FURTHER[1:]}
+    return Resolved(effect, rival, voltage, named, growth, designed.plays)
 
 
 def likely_rival(record: Record, effect: str) -> str:
     """Return the effect, other than the hidden one, that is most probable after the screening."""
     experiments = (split(record),)
     base = fit_base(starting_model([record], None), experiments)
-    table = [e for e in EFFECTS.values() if not e.inputs and set(e.needs) <= _names(base.model)]
+    there = {c.name for c in base.model.components}
+    table = [e for e in EFFECTS.values() if not e.inputs and set(e.needs) <= there]
     plain = hypothesis((), base, experiments)
     assert plain is not None
     task = Task(experiments, tuple(table))
     evidence = levelled(examine(plain, task).estimated(), task.alike(base))
     others = {n: p for n, p in evidence.items() if n != effect}
     return max(others, key=lambda n: others[n])
-
-
-def _names(model: Model) -> set[str]:
-    return {c.name for c in model.components}
-
-
-def played(truth: Truth, record: Record, seed: int) -> Record:
-    """Return what the same device measures when a planned voltage is played to it."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{record.name}.csv"
-        play_again(truth, seed, path, (record.time, record.voltage))
-        return read_record(path)
 
 
 def judged(d: Diagnosis, effect: str) -> str:
@@ -178,55 +155,35 @@ def judged(d: Diagnosis, effect: str) -> str:
     return "right" if d.causes[0].effect == effect else "wrong"
 
 
-def _resolved(
-    seed: int, effect: str, rival: str, voltage: str, named: dict[str, str], s: Separated
-) -> Resolved:
-    growth = {"designed": min(p.designed for p in s.pairs)}
-    growth |= {n: min(p.usual[n] for p in s.pairs) for n in _FURTHER[1:]}
-    return Resolved(
-        seed, effect, rival, voltage, s.kind, named, growth, s.chance[effect], s.plays, s.seconds
-    )
-
-
 def _summary(found: Sequence[Resolved]) -> TitledTable:
-    rows = []
     played = _played(found)
-    for name in _FURTHER:
-        counts = {v: sum(r.named[name] == v for r in played) for v in _NAMED}
-        growth = float(np.median([r.growth[name] for r in played])) if played else float("nan")
-        asked = f"{round(0.9 * len(played))} of {len(played)} right" if name == "designed" else ""
-        rows.append((name, asked, *(str(c) for c in counts.values()), f"{growth:.3g}"))
+
+    def named(value: str) -> Callable[[str], str]:
+        return lambda name: str(sum(r.named[name] == value for r in played))
+
+    def growth(name: str) -> str:
+        return f"{np.median([r.growth[name] for r in played]):.3g}" if played else "nan"
+
+    def asked(name: str) -> str:
+        return f"{round(0.9 * len(played))} of {len(played)} right" if name == "designed" else ""
+
     alike = [r for r in played if r.plays is None]
-    open_ = sum(r.named["designed"] == "open" for r in alike)
-    head = ("further record", "asked", "right name", "wrong name", "open", "predicted ln B, median")
-    return TitledTable(
+    return table_of(
         "Ambiguous pairs on independent plants, after one further record",
-        Table(head, tuple(rows)),
+        _FURTHER,
+        {
+            "further record": str, "asked": asked, "right name": named("right"),
+            "wrong name": named("wrong"), "open": named("open"), "predicted ln B, median": growth,
+        },
         f"{len(found)} pairs were ambiguous; {len(found) - len(played)} of them are effects that"
         " bend the same curve, which no voltage of such a record tells apart: nothing was played."
         " All further records have the length, the sampling and the voltage range of the first. The"
         " predicted ln B is the growth of the logarithm of the Bayes factor for the less favourable"
-        " of the two truths. Of "
-        f"{len(alike)} pairs it was said beforehand that no record found, nor"
-        f" {PLAYS[-1]} of them, would tell with {100.0 * ASKED:.0f} %; {open_} of them stayed open"
-        " with the designed one.",
-    )
-
-
-def _by_pair(found: Sequence[Resolved]) -> TitledTable:
-    rows = [
-        (
-            str(r.seed), r.effect, r.rival, r.voltage, r.kind,
-            *(f"{r.named[n]} ({r.growth[n]:.3g})" for n in _FURTHER),
-            f"{100.0 * r.chance:.0f} %", "never" if r.plays is None else f"{r.plays}",
-            f"{r.seconds:.0f} s",
-        )
-        for r in found
-    ]  # fmt: skip
-    head = ("seed", "hidden", "rival", "first record", "family", "designed (ln B)",
-            "sine (ln B)", "triangle (ln B)", "predicted chance", "plays for 90 %",
-            "to design")  # fmt: skip
-    return TitledTable("Every pair", Table(head, tuple(rows)))
+        f" of the two truths. Of {len(alike)} pairs it was said beforehand that no record found,"
+        f" nor {PLAYS[-1]} of them, would tell with {100.0 * ASKED:.0f} %;"
+        f" {sum(r.named['designed'] == 'open' for r in alike)} of them stayed open with the"
+        " designed one.",
+    )  # fmt: skip
 
 
 def _times(progress: Progress, quick: bool) -> TitledTable:
@@ -236,7 +193,7 @@ def _times(progress: Progress, quick: bool) -> TitledTable:
     pairs = [[rival_of_effect(model, EFFECTS[n], free) for n in pair] for pair in _TIMED]
     base, noise = rival_of_model("base", model, free), SensorNoise(20e-9)
     rows = []
-    for samples in _QUICK_SIZES if quick else _SIZES:
+    for samples in _SIZES[:3:2] if quick else _SIZES:
         progress(f"designs of {samples} samples")
         limits = Limits(0.0, 100.0, 2.0, samples)
         clock = [time.perf_counter()]

@@ -1,6 +1,6 @@
 """Designed inputs measured: tracking, wrong parameters, quickest moves, time to design."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -241,7 +241,7 @@ def judged(values: Mapping[str, float], target: Target, voltage: FloatArray) -> 
 
 
 def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
-    """Measure everything; `quick` on shorter scans, fewer draws and sizes."""
+    """Measure everything; `quick` on shorter scans and fewer draws."""
     model = scanner()
     target = scan(model, 500 if quick else 2000)
     progress("scan")
@@ -250,7 +250,6 @@ def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
         _errors(model, target, designed.voltage),
         _wrong(model, target, designed.voltage, 2 if quick else 10, progress),
         _moves(progress, quick),
-        _times(model, (500,) if quick else (500, 1000, 2000, 4000), progress),
     )
 
 
@@ -332,17 +331,11 @@ def _moves(progress: Progress, quick: bool) -> TitledTable:
             found = quickest_move(model, begin, end, LIMITS)
             bound = bang_bang_bound(model.values, begin, end, -20.0, 120.0)
             own = own_bang_bang(model, found)
-            over = ["none found"] * 2 if own is None else [
-                number(1e6 * own), number(100.0 * (found.move_time / own - 1.0))
-            ]  # fmt: skip
-            rows.append(
-                (
-                    f"{payload:g}", f"{1e6 * begin:g} to {1e6 * end:g}",
-                    number(1e6 * found.move_time), number(1e6 * bound),
-                    number(100.0 * (found.move_time / bound - 1.0)), *over,
-                    number(100.0 * found.residual, 2),
-                )
-            )  # fmt: skip
+            times = [1e6 * found.move_time, 1e6 * bound, 100.0 * (found.move_time / bound - 1.0)]
+            over = [] if own is None else [1e6 * own, 100.0 * (found.move_time / own - 1.0)]
+            cells = [*map(number, times), *(map(number, over) if over else ["none found"] * 2)]
+            name = f"{1e6 * begin:g} to {1e6 * end:g}"
+            rows.append((f"{payload:g}", name, *cells, number(100.0 * found.residual, 2)))
     note = (
         "-20 V to 120 V. The bound is that of the linear part, which knows neither hysteresis nor"
         " creep. The hysteresis takes part of the voltage of a move, and more of it downward, where"
@@ -368,18 +361,3 @@ def own_bang_bang(model: Model, found: QuickMove) -> float | None:
     )  # fmt: skip
     played = found.response.voltage[2 : 2 + INTERVALS]
     return own.shortest(played, found.move_time)
-
-
-def _times(model: Model, sizes: Sequence[int], progress: Progress) -> TitledTable:
-    rows = []
-    for samples in sizes:
-        progress(f"{samples} samples")
-        target = scan(model, samples)
-        found = track(model, target)
-        rows.append(
-            (str(samples), number(found.seconds), str(found.iterations),
-             number(found.error.rms_percent))
-        )  # fmt: skip
-    head = ("samples", "time to design [s]", "IPOPT iterations", "error, rms [% of range]")
-    note = "Inversion, three solutions and the simulations between them. Target: 2,000 in 60 s."
-    return TitledTable("Time to design", Table(head, tuple(rows)), note)

@@ -1,10 +1,8 @@
 """The benchmark `diagnose`: hidden causes on independent plants, and what was named."""
 
 import itertools
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +14,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out import Gain, gain_of
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.model.compose import Model
-from psa_casadi.records.read.reading import read_record
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, judging
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate_record
@@ -28,9 +26,15 @@ from tests.studies.benchmarks.hidden_cases import (
     run_case,
     study,
 )
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import Truth, make_record
+from tests.studies.benchmarks.records import hidden_record, played_again
+from tests.studies.benchmarks.table import (
+    Outcome,
+    Progress,
+    TitledTable,
+    on_all_cores,
+    share,
+    table_of,
+)
 from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
 
 _NONE = ("unexplained", "adequate")
@@ -157,34 +161,27 @@ class Covered:
     others: tuple[float, ...]
 
 
-def gain_table(known: Sequence[str], first: int, progress: Progress) -> TitledTable:
-    """Diagnose one record with each effect and compare its gain with that of further records."""
-    jobs = [(effect, first + 100 * k) for k, effect in enumerate(known, start=1)]
-    found = on_all_cores(
-        covered, jobs, lambda one: f"gain of {one.effect}" if one else "", progress
-    )
-    return intervals_table([one for one in found if one])
-
-
 def intervals_table(found: Sequence[Covered]) -> TitledTable:
     """Return how many intervals hold the reduction over records that they do not know."""
-    rows = []
-    for title, pairs in (
-        (
-            "eight blocks of one record's held-out quarter",
-            [(f.blocks, f.reduction) for f in found],
-        ),
-        (
-            f"{HELD_OUT} held-out records",
-            [p for f in found for p in zip(f.experiments, f.others, strict=True)],
-        ),
-    ):
-        held = sum(low <= true <= high for (low, high), true in pairs)
-        width = float(np.median([high - low for (low, high), _ in pairs])) if pairs else np.nan
-        rows.append((title, share(held, len(pairs)), f"{width:.1f} %"))
-    return TitledTable(
+    blocks = [(f.blocks, f.reduction) for f in found]
+    records = [p for f in found for p in zip(f.experiments, f.others, strict=True)]
+    pairs = {
+        "eight blocks of one record's held-out quarter": blocks,
+        f"{HELD_OUT} held-out records": records,
+    }
+
+    def held(name: str) -> str:
+        inside = [low <= true <= high for (low, high), true in pairs[name]]
+        return share(sum(inside), len(inside))
+
+    def width(name: str) -> str:
+        widths = [high - low for (low, high), _ in pairs[name]]
+        return f"{np.median(widths) if widths else np.nan:.1f} %"
+
+    return table_of(
         "Intervals of the gain (95 %)",
-        Table(("interval from", "hold the truth", "median width"), tuple(rows)),
+        pairs,
+        {"interval from": str, "hold the truth": held, "median width": width},
         f"The truth is the reduction of the rms over those of {PLAYS} further records of the same"
         " device, with other voltages and fresh noise, that the interval does not know.",
     )
@@ -192,14 +189,12 @@ def intervals_table(found: Sequence[Covered]) -> TitledTable:
 
 def covered(effect: str, seed: int) -> Covered | None:
     """Diagnose one record of an effect; None where nothing is named, so that nothing is gained."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "record.csv"
-        truth = make_record(effect, seed, path, visible=ORDINARY)
-        found = diagnose([read_record(path)])
-        if not found.causes:
-            return None
-        models = (found.base_fit.model, found.extended_fit.model)
-        plays = [_play(truth, seed + k, path, models) for k in range(1, PLAYS + 1)]
+    truth, record = hidden_record(effect, seed, visible=ORDINARY)
+    found = diagnose([record])
+    if not found.causes:
+        return None
+    models = (found.base_fit.model, found.extended_fit.model)
+    plays = [_play(played_again(truth, seed + k), models) for k in range(1, PLAYS + 1)]
     groups = [range(k, k + HELD_OUT) for k in range(0, PLAYS, HELD_OUT)]
     rests = [[p for k, p in enumerate(plays) if k not in group] for group in groups]
     return Covered(
@@ -214,10 +209,8 @@ def covered(effect: str, seed: int) -> Covered | None:
 _Play = tuple[Experiment, FloatArray, FloatArray]
 
 
-def _play(truth: Truth, seed: int, path: Path, models: tuple[Model, Model]) -> _Play:
-    """Play the device again and predict it with both models, the offset from the first tenth."""
-    play_again(truth, seed, path)
-    record = read_record(path)
+def _play(record: Record, models: tuple[Model, Model]) -> _Play:
+    """Predict a further record with both models, the offset from the first tenth."""
     experiment = judging(record)
     y = np.asarray(record.displacement)
     predicted = []
@@ -246,9 +239,12 @@ def run(progress: Progress, quick: bool) -> Outcome:
     if not quick:
         lost = missed(found)
         known = diagnose_all([f.case for f in lost], progress, only=True)
-        tables.append(limits_table(lost, known))
-        tables.append(gain_table(KNOWN, FIRST, progress))
-    return Outcome(tuple(tables), lambda: picture(found, KNOWN, FOREIGN))
+        jobs = [(effect, FIRST + 100 * k) for k, effect in enumerate(KNOWN, start=1)]
+        gains = on_all_cores(
+            covered, jobs, lambda one: f"gain of {one.effect}" if one else "", progress
+        )
+        tables += [limits_table(lost, known), intervals_table([one for one in gains if one])]
+    return Outcome(tables, lambda: picture(found, KNOWN, FOREIGN))
 
 
 def diagnose_all(
@@ -377,20 +373,20 @@ def _summary(found: Sequence[Found]) -> TitledTable:
 
 
 def _by_effect(found: Sequence[Found]) -> TitledTable:
-    rows = []
-    for effect in dict.fromkeys(f.case.effect for f in found if f.case.effect):
-        cells = []
-        for kind in ("known", "weak", "left out", "foreign"):
-            own = [f for f in of_kind(found, kind) if f.case.effect == effect]
-            cells.append("; ".join(_said(f) for f in own))
-        rows.append((effect, *cells))
-    head = ("hidden", "rho 0.3 to 3", "rho 0.1 to 0.3", "own entry left out", "foreign")
-    return TitledTable(
+    def said(kind: str) -> Callable[[str], str]:
+        own = of_kind(found, kind)
+        return lambda effect: "; ".join(_said(f) for f in own if f.case.effect == effect)
+
+    return table_of(
         "What was said of each",
-        Table(head, tuple(rows)),
+        dict.fromkeys(f.case.effect for f in found if f.case.effect),
+        {
+            "hidden": str, "rho 0.3 to 3": said("known"), "rho 0.1 to 0.3": said("weak"),
+            "own entry left out": said("left out"), "foreign": said("foreign"),
+        },
         "+ right name alone, (+) right name in a set of that size, ? unexplained, - adequate; other"
         " names are wrong ones, in brackets where structure remained or others were as likely.",
-    )
+    )  # fmt: skip
 
 
 def _said(f: Found) -> str:
@@ -409,9 +405,11 @@ def _reliability(found: Sequence[Found]) -> TitledTable:
     rows = []
     for low, high in itertools.pairwise(BINS):
         groups = [in_class(found, kinds, low, high) for kinds in RELIABILITY]
-        if groups[-1]:
-            cells = [c for own in groups for c in _right(own)]
-            rows.append((f"{100 * low:.0f} to {100 * high:.0f} %", *cells))
+        cells = [f"{100 * low:.0f} to {100 * high:.0f} %"]
+        for own in groups:
+            means = [f"{100.0 * float(np.mean(x)):.0f} %" for x in zip(*own, strict=True)]
+            cells += [*(means or ["", ""]), f"{len(own)}"]
+        rows += [tuple(cells)] if groups[-1] else []
     head = ("stated probability", "mean", "right", "effects", "mean", "right", "effects")
     return TitledTable(
         "Probability against frequency",
@@ -420,11 +418,3 @@ def _reliability(found: Sequence[Found]) -> TitledTable:
         " First where the hidden effect is in the table, which the probability takes for granted,"
         " then with the cases whose own entry was left out.",
     )
-
-
-def _right(own: Sequence[tuple[float, bool]]) -> tuple[str, str, str]:
-    """Return mean probability, share of true ones and number of effects of one class."""
-    if not own:
-        return ("", "", "0")
-    stated, true = (100.0 * float(np.mean(column)) for column in zip(*own, strict=True))
-    return (f"{stated:.0f} %", f"{true:.0f} %", f"{len(own)}")

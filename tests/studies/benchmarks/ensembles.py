@@ -7,7 +7,7 @@ error is against the reference, which shares no code with any of them.
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib import import_module
@@ -31,18 +31,11 @@ from psa_casadi.simulation import device
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.start import start_on
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
+from tests.studies.benchmarks.identify import rates
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, table_of
 
 #: Sets on the GPU for each one on the cores, and those whose ranges are compared.
 MORE, _COMPARED = 100, 64
-_GPU_HEAD = (
-    "voltage", "sets", "samples", "tolerance", "largest difference of a range from the cores'",
-    "wall [s]", "ns per sample and set",
-)  # fmt: skip
-_GPU_NOTE = (
-    "One set a thread of {}; of each set the range is kept, on the device. The starts of the sets"
-    " are in the times, compiling is not."
-)
 
 
 def on_gpu(
@@ -68,13 +61,23 @@ def on_gpu(
         found = keep(columns, device="cuda")
         wall = time.perf_counter() - begin
         apart = np.max(np.abs(found[: len(ours)] - ours) / ours)
-        rows.append((
-            record.name, str(count), str(record.n), f"{rtol:.0e}", f"{apart:.1e}",
-            number(wall), number(1e9 * wall / count / record.n),
-        ))  # fmt: skip
+        figures = (
+            f"{rtol:.0e}",
+            f"{apart:.1e}",
+            number(wall),
+            number(1e9 * wall / count / record.n),
+        )
+        rows.append((record.name, str(count), str(record.n), *figures))
     name = cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)["name"].decode()
-    table = Table(_GPU_HEAD, tuple(rows))
-    return (TitledTable("Many sets on a GPU", table, _GPU_NOTE.format(name)),), ""
+    head = (
+        "voltage", "sets", "samples", "tolerance", "largest difference of a range from the cores'",
+        "wall [s]", "ns per sample and set",
+    )  # fmt: skip
+    note = (
+        f"One set a thread of {name}; of each set the range is kept, on the device. The starts of"
+        " the sets are in the times, compiling is not."
+    )
+    return (TitledTable("Many sets on a GPU", Table(head, tuple(rows)), note),), ""
 
 
 FloatArray = npt.NDArray[np.float64]
@@ -140,29 +143,6 @@ class Peer:
     sets: int
 
 
-def rates(p: Mapping[str, Any], v: Any, state: Sequence[Any], m: Any) -> tuple[Any, ...]:
-    """Return the rates of (u, f_H, f_out, y, y', x, x') at the command v [V], paper eqs. (4)-(9).
-
-    `m` has the functions: `math`, or jax.numpy for arrays of sets.
-    """
-    u, f_H, f_out, y, v_y, x, v_x = state
-    du = (p["G"] * v - u) / (p["R_s"] * p["C_p"])
-    sign = du / m.sqrt(du * du + p["hold_rate"] ** 2)
-    power = (abs(f_H) / p["h_ref"]) ** p["n"]
-    bend = du * (p["beta"] * sign * m.copysign(power, f_H) + p["gamma"] * power)
-    passed_on = p["c_P"] * v_y + p["k_P"] * y
-    pull = p["c_B"] * (v_x - v_y) + p["k_B"] * (x - y)
-    return (
-        du,
-        p["A"] * du - bend + p["delta"] * u * sign,
-        (p["k_L"] * u + f_H - f_out) / p["tau"],
-        v_y,
-        (f_out - passed_on) / p["m_P"],
-        v_x,
-        (passed_on - pull) / p["m_B"],
-    )
-
-
 def _scipy(work: Work) -> At:
     """LSODA on plain numbers, one set after the other."""
     t, h, scale = work.times, work.step, work.scale
@@ -175,9 +155,8 @@ def _scipy(work: Work) -> At:
             k = min(int(now / h), last)
             return rates(p, v[k] + (now - k * h) * slope[k], x.tolist(), math)
 
-        found = solve_ivp(
-            slopes, (0.0, t[-1]), x0, "LSODA", t, rtol=tolerance, atol=tolerance * scale
-        )
+        how: Any = {"rtol": tolerance, "atol": tolerance * scale}
+        found = solve_ivp(slopes, (0.0, t[-1]), x0, "LSODA", t, **how)
         return found.y[5] if found.success else np.full(len(t), np.nan)
 
     pairs = list(zip(work.models, work.starts, strict=True))
@@ -318,7 +297,7 @@ def measured(
 
     Where there is a GPU, it runs 100 times as many.
     """
-    model, whole, beside, doubts, done = stack_model("P-885.51"), [], [], [], []
+    model, rows, doubts, done = stack_model("P-885.51"), list[Row](), [], []
     sets = drawn(model, max(count, *(way.sets for way in ways)))
     for case in given:
         progress(f"{case.name}: reference")
@@ -328,28 +307,61 @@ def measured(
         apart = np.abs(work.first(1).reference(_CHECK)[0] - truth[0])
         doubts.append(float(np.max(apart) / np.ptp(truth[0])))
         progress(f"{case.name}: {OURS}, {count} sets")
-        ours = loosest(partial(_of_many, model, sets, work), truth)
+        short = Record(name="part", time=work.times, voltage=work.voltage)
+        ours = loosest(partial(_judged, model, sets[:_JUDGED], short), truth)
         done.append((case.record, ours.tolerance))
-        wall, spent = _whole(model, sets[:count], case.record, ours.tolerance)
-        each = spent / count / len(case.times)
-        whole.append((
-            case.name, str(count), str(len(case.times)), f"{ours.tolerance:.0e}",
-            number(ours.error, 2), number(wall), number(spent), number(1e9 * each),
-        ))  # fmt: skip
-        beside.append(_row(case, OURS, count, len(case.times), ours, each, each))
+        how: Any = {"rtol": ours.tolerance, "reduce": np.ptp}
+        wall, spent = least_times(partial(simulate_many, model, sets[:count], case.record, **how))
+        each, size = spent / count / len(case.times), len(case.times)
+        rows.append(Row(case.name, OURS, count, size, ours, each, 1.0, wall))
         for way in ways:
             progress(f"{case.name}: {way.name}")
             found = loosest(way.prepare(work.first(way.sets)), truth)
-            theirs = least_time(found.solve) / way.sets / part
-            beside.append(_row(case, way.name, way.sets, part, found, theirs, each))
+            theirs = least_times(found.solve)[1] / way.sets / part
+            rows.append(Row(case.name, way.name, way.sets, part, found, theirs, theirs / each))
     gpu, missing = on_gpu(progress, model, done, partial(drawn, model), MORE * count)
-    return Outcome((
-        TitledTable("Many sets of parameters of a full stack", Table(_HEAD, tuple(whole)),
-                    _NOTE.format(threads(), _JUDGED, part, number(max(doubts), 2)) + missing),
-        *gpu,
-        TitledTable("Others on a part of the work, at equal error",
-                    Table(_BESIDE, tuple(beside)), _BESIDE_NOTE.format(WANTED) + absent),
-    ))  # fmt: skip
+    start: dict[str, Callable[[Row], str]] = {"voltage": lambda r: r.case}
+    whole = table_of(
+        "Many sets of parameters of a full stack",
+        [r for r in rows if r.way == OURS],
+        start
+        | {
+            "sets": lambda r: str(r.sets),
+            "samples": lambda r: str(r.samples),
+            "tolerance": lambda r: f"{r.reached.tolerance:.0e}",
+            "largest error / range": lambda r: number(r.reached.error, 2),
+            "wall [s]": lambda r: number(r.wall),
+            "processor [s]": lambda r: number(r.each * r.sets * r.samples),
+            "ns per sample and set": lambda r: number(1e9 * r.each),
+        },
+        f"Threads: {threads()}. Of each set the range is kept. The starts of the sets are in the"
+        f" times, compiling is not. The error is the largest of {_JUDGED} sets over {part} samples,"
+        " against the reference at 1e-11, which differs from that at 1e-10 by"
+        f" {number(max(doubts), 2)}.{missing}",
+    )
+    beside = table_of(
+        "Others on a part of the work, at equal error",
+        rows,
+        start
+        | {
+            "way": lambda r: r.way,
+            "sets x samples": lambda r: f"{r.sets} x {r.samples}",
+            "tolerance": lambda r: f"{r.reached.tolerance:.0e}",
+            "largest error / range": lambda r: (
+                number(r.reached.error, 2) + ("" if r.reached.accurate else " (missed)")
+            ),
+            "us per sample and set": lambda r: number(1e6 * r.each),
+            "over simulate_many": lambda r: number(r.over, 2),
+        },
+        "Every way has the loosest of the tolerances 1e-3, 3e-4, 1e-4, ... at which its error is"
+        f" below {WANTED:.0e} of the range. Times are processor time over all threads, building and"
+        " compiling left out. CVODES runs CasADi's virtual machine; LSODA calls Python." + absent,
+    )
+    return Outcome((whole, *gpu, beside))
+
+
+def _judged(model: Model, sets: Sequence[dict[str, float]], record: Record, rtol: float) -> Solve:
+    return lambda: simulate_many(model, sets, record, rtol=rtol)
 
 
 def drawn(model: Model, count: int) -> list[dict[str, float]]:
@@ -373,67 +385,28 @@ def loosest(at: At, truth: FloatArray) -> Reached:
     return found
 
 
-def least_time(solve: Solve) -> float:
-    """Return the least processor time of a run [s] over repeats, of which a slow run has one."""
-    least = inf
-    for _ in range(_REPEATS):
-        begin = time.process_time()
-        solve()
-        least = min(least, time.process_time() - begin)
-        if least > _SLOW:
-            break
-    return least
+@dataclass(frozen=True)
+class Row:
+    """What a way did of a case: sets, samples, seconds of a sample and set, and over ours."""
+
+    case: str
+    way: str
+    sets: int
+    samples: int
+    reached: "Reached"
+    each: float
+    over: float
+    wall: float = 0.0
 
 
-def _of_many(model: Model, sets: Sequence[dict[str, float]], work: Work, tolerance: float) -> Solve:
-    """Return the run of the judged sets by `simulate_many`."""
-    record = Record(name="part", time=work.times, voltage=work.voltage)
-    return lambda: simulate_many(model, sets[:_JUDGED], record, rtol=tolerance)
-
-
-def _whole(
-    model: Model, sets: Sequence[dict[str, float]], record: Record, tolerance: float
-) -> tuple[float, float]:
-    """Return the least wall and processor time [s] of all sets; the range of each is kept.
-
-    A slow run is not repeated.
-    """
+def least_times(solve: Solve) -> tuple[float, float]:
+    """Return the least wall and processor time of a run [s] over repeats; a slow run has one."""
     least = [inf, inf]
     for _ in range(_REPEATS):
         wall, spent = time.perf_counter(), time.process_time()
-        simulate_many(model, sets, record, rtol=tolerance, reduce=np.ptp)
+        solve()
         now = time.perf_counter() - wall, time.process_time() - spent
         least = [min(pair) for pair in zip(least, now, strict=True)]
         if least[1] > _SLOW:
             break
     return least[0], least[1]
-
-
-def _row(
-    case: Case, name: str, sets: int, samples: int, reached: Reached, each: float, ours: float
-) -> tuple[str, ...]:  # fmt: skip
-    error = number(reached.error, 2) + ("" if reached.accurate else " (missed)")
-    return (
-        case.name, name, f"{sets} x {samples}", f"{reached.tolerance:.0e}", error,
-        number(1e6 * each), number(each / ours, 2),
-    )  # fmt: skip
-
-
-_HEAD = (
-    "voltage", "sets", "samples", "tolerance", "largest error / range", "wall [s]",
-    "processor [s]", "ns per sample and set",
-)  # fmt: skip
-_NOTE = (
-    "Threads: {}. Of each set the range is kept. The starts of the sets are in the times,"
-    " compiling is not. The error is the largest of {} sets"
-    " over {} samples, against the reference at 1e-11, which differs from that at 1e-10 by {}."
-)
-_BESIDE = (
-    "voltage", "way", "sets x samples", "tolerance", "largest error / range",
-    "us per sample and set", "over simulate_many",
-)  # fmt: skip
-_BESIDE_NOTE = (
-    "Every way has the loosest of the tolerances 1e-3, 3e-4, 1e-4, ... at which its error is below"
-    " {:.0e} of the range. Times are processor time over all threads, building and compiling left"
-    " out. CVODES runs CasADi's virtual machine; LSODA calls Python."
-)

@@ -3,17 +3,15 @@
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record as Measured
-from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, table_of
 from tests.studies.exam.marks import Answer, Named, mark
 from tests.studies.exam.play import write
 from tests.studies.exam.record import Record
@@ -22,13 +20,10 @@ from tests.studies.exam.records import RECORDS
 #: A quick run takes one of so many records.
 QUICK = 4
 #: The groups of the records by title, in the order of the counts.
-GROUPS = (
-    "clean, Bouc-Wen",
-    "clean, other hysteresis",
-    "one cause",
-    "two causes",
-    "foreign cause",
-)
+GROUPS = {
+    "clean": "clean, Bouc-Wen", "other": "clean, other hysteresis", "one": "one cause",
+    "two": "two causes", "foreign": "foreign cause",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,9 +43,9 @@ class Marked:
     @property
     def group(self) -> str:
         """The group that it counts in."""
-        if self.record.group == "clean":
-            return GROUPS[0 if self.record.stack.hysteresis == "Bouc-Wen" else 1]
-        return {"one": GROUPS[2], "two": GROUPS[3], "foreign": GROUPS[4]}[self.record.group]
+        clean = self.record.group == "clean"
+        other = clean and self.record.stack.hysteresis != "Bouc-Wen"
+        return GROUPS["other" if other else self.record.group]
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -68,56 +63,50 @@ def sat(
 
 def marked(record: Record, method: Method | None = None) -> Marked:
     """Make a record as a file, diagnose the file, and mark what is said."""
-    with tempfile.TemporaryDirectory() as folder:
-        read = read_back(record, Path(folder))
-    begin = time.process_time()
-    answer = _answer(diagnose([read], method=method))
+    read, begin = read_back(record), time.process_time()
+    found = diagnose([read], method=method)
+    causes = (Named(c.effect, c.confidence, tuple(c.cannot_be_told_from)) for c in found.causes)
+    answer = Answer(found.verdict, tuple(causes))
     return Marked(record, answer, mark(record, answer), time.process_time() - begin)
 
 
-def read_back(record: Record, folder: Path) -> Measured:
-    """Make a record as a file in a folder, and read that."""
-    path = folder / f"{record.name}.csv"
-    write(record, path)
-    return read_record(path)
-
-
-def _answer(found: Diagnosis) -> Answer:
-    causes = (Named(c.effect, c.confidence, tuple(c.cannot_be_told_from)) for c in found.causes)
-    return Answer(found.verdict, tuple(causes))
+def read_back(record: Record) -> Measured:
+    """Make a record as a file, and read that."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{record.name}.csv"
+        write(record, path)
+        return read_record(path)
 
 
 def answers(found: Sequence[Marked]) -> TitledTable:
     """Return what was said of each record."""
-    rows = tuple(
-        (
-            one.record.name,
-            one.record.stack.hysteresis,
-            f"{one.record.test.voltage}, {one.record.test.frequency:g} Hz",
-            one.record.says,
-            one.answer.verdict,
-            _names(one.answer) or "-",
-            one.mark,
-        )
-        for one in found
+    return table_of(
+        "Plants of another author",
+        found,
+        {
+            "record": lambda m: m.record.name,
+            "stack": lambda m: m.record.stack.hysteresis,
+            "voltage": lambda m: f"{m.record.test.voltage}, {m.record.test.frequency:g} Hz",
+            "hidden": lambda m: m.record.says,
+            "verdict": lambda m: m.answer.verdict,
+            "names": lambda m: _names(m.answer) or "-",
+            "mark": lambda m: m.mark,
+        },
     )
-    head = ("record", "stack", "voltage", "hidden", "verdict", "names", "mark")
-    return TitledTable("Plants of another author", Table(head, rows))
 
 
 def counts(found: Sequence[Marked]) -> TitledTable:
     """Return how often each mark was given, by group."""
-    rows = []
-    for group in GROUPS:
-        given = Counter(one.mark for one in found if one.group == group)
-        told = "; ".join(f"{count} {name}" for name, count in given.most_common())
-        rows.append((group, str(given.total()), told or "-"))
-    head = ("hidden", "records", "marks")
-    return TitledTable(
-        "Marks by group",
-        Table(head, tuple(rows)),
-        "The marks are explained in tests/studies/exam/marks.py.",
-    )
+    given = {g: Counter(m.mark for m in found if m.group == g) for g in GROUPS.values()}
+
+    def told(group: str) -> str:
+        return "; ".join(f"{n} {name}" for name, n in given[group].most_common()) or "-"
+
+    columns: dict[str, Callable[[str], str]] = {
+        "hidden": str, "records": lambda g: str(given[g].total()), "marks": told
+    }  # fmt: skip
+    note = "The marks are explained in tests/studies/exam/marks.py."
+    return table_of("Marks by group", given, columns, note)
 
 
 def _names(answer: Answer) -> str:

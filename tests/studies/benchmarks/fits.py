@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import resources
 from math import inf
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import NullFormatter
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.start.ordinary import starting_model
@@ -30,63 +30,38 @@ from psa_casadi.simulation.simulate import EXACT, STEPPER, record_inputs
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run as run_stepper
 from tests.studies.benchmarks.fits_ways import diagnosis_table, ways_tables
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled, table_of
 
-_FONT = 10.5
 _STYLES = (("#0072b2", "o"), ("#d55e00", "s"))
 
 
-class Measured(Protocol):
-    """What a run must tell to be drawn."""
-
-    @property
-    def way(self) -> str: ...
-    @property
-    def largest(self) -> float: ...
-    @property
-    def differentiated(self) -> float: ...
-    @property
-    def plain(self) -> float: ...
-
-
-def picture(points: Sequence[Measured]) -> Figure:
+def picture(points: Sequence["Point"]) -> Figure:
     """Return time per sample over largest error, with sensitivities (solid) and without."""
     figure = Figure(figsize=(8.4, 5.2), layout="constrained")
     axes = figure.subplots()
     ways = list(dict.fromkeys(p.way for p in points))
+    kinds = {
+        "differentiated": ("-", f"{len(FREE)} sensitivities"),
+        "plain": ("--", "no sensitivities"),
+    }
     for way, (colour, marker) in zip(ways, _STYLES, strict=False):
         mine = [p for p in points if p.way == way]
-        errors = [p.largest for p in mine]
-        for times, style, face, what in (
-            ([p.differentiated for p in mine], "-", colour, "12 sensitivities"),
-            ([p.plain for p in mine], "--", "white", "no sensitivities"),
-        ):
+        for of, (style, what) in kinds.items():
             axes.loglog(
-                errors, times, style, color=colour, marker=marker, markersize=5.5,
-                markerfacecolor=face, linewidth=1.5, label=f"{way}, {what}",
+                [p.largest for p in mine], [getattr(p, of) for p in mine], style, color=colour,
+                marker=marker, markersize=5.5, linewidth=1.5, label=f"{way}, {what}",
+                markerfacecolor=colour if of == "differentiated" else "white",
             )  # fmt: skip
-    axes.set_xlabel("largest error of the displacement / its range", fontsize=_FONT)
-    axes.set_ylabel("processor time per sample [µs]", fontsize=_FONT)
-    axes.set_title(
-        "One simulation of the demonstration's record, as in a fit", loc="left", fontsize=_FONT
-    )
+    error, took = "largest error of the displacement / its range", "processor time per sample [µs]"
+    styled(axes, error, took, "One simulation of the demonstration's record, as in a fit")
     low, high = axes.get_ylim()
     ticks = [m * 10.0**k for k in range(-3, 5) for m in (1, 2, 5)]
-    axes.yaxis.set_major_locator(FixedLocator([y for y in ticks if low <= y <= high]))
-    axes.yaxis.set_major_formatter(_plain())
+    axes.set_yticks([y for y in ticks if low <= y <= high])
+    axes.yaxis.set_major_formatter("{x:g}")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_minor_formatter(NullFormatter())
-    axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=_FONT - 1.5)
-    figure.legend(fontsize=_FONT - 1, loc="outside lower center", ncols=2, frameon=False)
+    figure.legend(fontsize=9.5, loc="outside lower center", ncols=2, frameon=False)
     return figure
-
-
-def _plain() -> ScalarFormatter:
-    formatter = ScalarFormatter()
-    formatter.set_scientific(False)
-    return formatter
 
 
 FloatArray = npt.NDArray[np.float64]
@@ -99,10 +74,6 @@ STEPPER_TOLERANCES = tuple(10.0 ** (-k / 2) for k in range(8, 19))
 WANTED = 1e-5
 _TRUTH = 1e-11
 _OUTPUT = "measured_displacement"
-_HEAD = (
-    "way", "tolerance of a step", "largest error / range", "rms error / range",
-    f"us per sample, {len(FREE)} sensitivities", "us per sample, none", "steps per sample",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -233,48 +204,43 @@ def time_at(points: Sequence[Point], way: str, of: str, error: float = WANTED) -
     return float(np.exp(np.interp(np.log(error), errors, times, left=np.nan, right=np.nan)))
 
 
-def _at_wanted(between: float) -> str:
-    """Say the ratio at the error itself, where both ways have larger and smaller errors."""
-    if not np.isfinite(between):
-        return ""
-    return f"; read off between tolerances at {WANTED:.0e} itself: 1/{number(between, 2)}"
-
-
 def run_table(points: Sequence[Point], samples: int) -> TitledTable:
     """Return both ways at all tolerances, and the share of the stepper's time at equal error."""
-    rows = tuple(
-        (
-            p.way, f"{p.tolerance:.0e}", number(p.largest, 2), number(p.rms, 2),
-            number(p.differentiated), number(p.plain), number(p.steps),
-        )
-        for p in points
-    )  # fmt: skip
     said = []
     for of, words in (("differentiated", f"with {len(FREE)} sensitivities"), ("plain", "without")):
         ours, theirs = (cheapest(points, way, of) for way in (EXACT, STEPPER))
         ratio = getattr(theirs, of) / getattr(ours, of)
         between = time_at(points, STEPPER, of) / time_at(points, EXACT, of)
+        at_wanted = f"read off between tolerances at {WANTED:.0e} itself: 1/{number(between, 2)}"
         said.append(
             f"{words} 1/{number(ratio, 2)} of the stepper's time (tolerances {ours.tolerance:.0e}"
             f" and {theirs.tolerance:.0e}, errors {number(ours.largest, 2)} and"
-            f" {number(theirs.largest, 2)}{_at_wanted(between)})"
+            f" {number(theirs.largest, 2)}{f'; {at_wanted}' if np.isfinite(between) else ''})"
         )
-    note = (
+    return table_of(
+        f"One run of the demonstration's record ({samples} samples)",
+        points,
+        {
+            "way": lambda p: p.way,
+            "tolerance of a step": lambda p: f"{p.tolerance:.0e}",
+            "largest error / range": lambda p: number(p.largest, 2),
+            "rms error / range": lambda p: number(p.rms, 2),
+            f"us per sample, {len(FREE)} sensitivities": lambda p: number(p.differentiated),
+            "us per sample, none": lambda p: number(p.plain),
+            "steps per sample": lambda p: number(p.steps),
+        },
         f"At errors below {WANTED:.0e} of the range the exact way takes {'; '.join(said)}: of each"
         " way the cheapest tolerance counts. Exact steps asked for at tolerances above 1e-5 run at"
         f" 1e-5. Errors are against the stepper at {_TRUTH:.0e}; times are the least of the"
         " repeats and carry over to other machines as ratios only. The stepper is of second"
-        " order at tolerances of 5e-6 and above, of fourth below: its steps are not all alike."
+        " order at tolerances of 5e-6 and above, of fourth below: its steps are not all alike.",
     )
-    title = f"One run of the demonstration's record ({samples} samples)"
-    return TitledTable(title, Table(_HEAD, rows), note)
 
 
 def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> TitledTable:
     """Return the time of a set among `LANES` in one core's vectors and by itself."""
     progress("lanes")
-    rng = np.random.default_rng(1)
-    values = task.model.values
+    rng, values = np.random.default_rng(1), task.model.values
     sets = [
         {n: values[n] * float(np.exp(0.1 * rng.standard_normal())) for n in FREE if n != "n"}
         for _ in range(LANES)
@@ -282,28 +248,24 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
     models = [task.model.with_values(s) for s in sets]
     t, u = task.time, task.inputs
     starts = [task.start(m)[0] for m in models]
-    p, x0, nominal = (
-        np.array(rows).T
-        for rows in (
-            [m.parameter_vector() for m in models], starts, [m.state_nominals() for m in models],
-        )
-    )  # fmt: skip
+    p, nominal = (
+        np.array([getattr(m, of)() for m in models]).T
+        for of in ("parameter_vector", "state_nominals")
+    )
+    how: Any = {"tolerance": tolerance, "output": _OUTPUT}
 
     def together() -> FloatArray:
-        return run_sets(
-            task.model.structure, t, u, p=p, x0=x0, nominal=nominal, tolerance=tolerance,
-            output=_OUTPUT,
-        )  # fmt: skip
+        x0 = np.array(starts).T
+        return run_sets(task.model.structure, t, u, p=p, x0=x0, nominal=nominal, **how)
 
     def by_itself(k: int) -> FloatArray:
-        return run_exact(models[k], t, u, starts[k], tolerance=tolerance, output=_OUTPUT).shown
+        return run_exact(models[k], t, u, starts[k], **how).shown
 
     singles = [partial(by_itself, k) for k in range(LANES)]
     if not np.array_equal(together().T, np.array([one() for one in singles])):
         raise PsaError("A set has other bits in a lane than by itself.")
-    if not np.array_equal(
-        simulate_many(task.model, sets, task.record, rtol=tolerance).T, together()
-    ):
+    many = simulate_many(task.model, sets, task.record, rtol=tolerance)
+    if not np.array_equal(many.T, together()):
         raise PsaError("simulate_many has other bits than its lanes.")
     side, *alone = least_times([together, *singles], repeats)
     return lanes_table(side / LANES / len(t), sum(alone) / LANES / len(t), tolerance)

@@ -4,14 +4,13 @@ The truth is the stepper at 1e-11. Records with kinks and jumps are the hard one
 rest there within a sample.
 """
 
-import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,13 +27,11 @@ from psa_casadi.records import (
     Record,
     concatenate,
     decaying_triangle,
-    read_record,
     steps,
     time_grid,
     triangle,
 )
 from psa_casadi.report.words.phrases import number, plain
-from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation import simulate as simulate_module
 from psa_casadi.simulation.exact.run import NotExact
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -51,9 +48,8 @@ from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
 from psa_casadi.simulation.timings import timed
 from tests.model.stack_models import at_ordinary_size
-from tests.studies.benchmarks.table import Progress, TitledTable, share
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import make_record
+from tests.studies.benchmarks.records import hidden_record, played_again
+from tests.studies.benchmarks.table import Progress, TitledTable, share, table_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -70,7 +66,6 @@ MIXED = "sine, ramp, hold, step"
 _SAMPLES, _OUTPUT = 1500, "measured_displacement"
 _RTOLS = (1e-4, 1e-5, 1e-6)
 _TRUTH, _CHECK = 1e-11, 1e-10
-_LISTED = 20
 
 
 @dataclass(frozen=True)
@@ -117,7 +112,7 @@ def ways_tables(progress: Progress, quick: bool) -> list[TitledTable]:
     for name in names:
         progress(f"ways: {plain(name)}")
         alone += tried(_RTOLS, 3, Trial("demo", name, MIXED, 1e-3))
-    stacks = tuple(STACKS)[:3] if quick else tuple(STACKS)
+    stacks = tuple(STACKS)[: 3 if quick else None]
     records = ("steps",) if quick else (*KINKED, MIXED)
     sample_times = (1e-3,) if quick else (2e-5, 1e-3)
     everywhere: list[Reached] = []
@@ -126,7 +121,7 @@ def ways_tables(progress: Progress, quick: bool) -> list[TitledTable]:
         trials = [Trial(stack, n, r, h) for n in names for r in records for h in sample_times]
         for found in side_by_side(partial(tried, _RTOLS, 1), trials):
             everywhere += found
-    return [effects_table(alone), errors_table(everywhere), exceeding_table(everywhere)]
+    return [effects_table(alone), errors_table(everywhere)]
 
 
 def voltage(record: str, top: float, sample_time: float) -> tuple[FloatArray, FloatArray]:
@@ -190,90 +185,76 @@ def _error(x: FloatArray, truth: FloatArray) -> float:
 def effects_table(found: Sequence[Reached]) -> TitledTable:
     """Return the ways and errors of the base and of each effect beside it."""
     rtols = sorted({r.rtol for r in found}, reverse=True)
-    rows, tight = [], [r for r in found if r.rtol == rtols[-1]]
-    for r in tight:
-        ways = [o.way for o in found if o.trial == r.trial]
-        figures = (r.error, r.over, r.seconds / r.stepper_seconds)
-        cells = (plain(r.trial.effect), r.fit_way, number(r.fit_error, 2), *ways)
-        rows.append((*cells, *(number(f, 2) for f in figures)))
-    head = (
-        "effect", "in a fit", "its error / range", *(f"way at {rtol:.0e}" for rtol in rtols),
-        "largest error / range", "error / tolerance", "time over the stepper's",
-    )  # fmt: skip
+    ways = {(r.trial, r.rtol): r.way for r in found}
+
+    def way(rtol: float) -> Callable[[Reached], str]:
+        return lambda r: ways[r.trial, rtol]
+
     effects = [r for r in found if r.trial.effect != BASE_NAME]
-    names = {r.trial for r in effects}
     fits = sum(r.fit_way == EXACT for r in effects if r.rtol == rtols[-1])
-    counts = [
-        f"{sum(r.way == EXACT for r in effects if r.rtol == rtol)} at {rtol:.0e}" for rtol in rtols
-    ]
-    return TitledTable(
+    exact = Counter(r.rtol for r in effects if r.way == EXACT)
+    return table_of(
         f"Ways of the effects, one at a time: {MIXED} ({_SAMPLES} samples)",
-        Table(head, tuple(rows)),
-        f"Of {len(names)} effects {fits} take the exact way in a fit (tolerance of a step"
-        f" {FIT_RTOL:.0e}); in `simulate` {', '.join(counts)}. The others fall back on the"
-        f" stepper at {STEP_SHARE:g} of the tolerance, which is also the peer of the last column."
-        f" The last three columns are of `simulate` at {rtols[-1]:.0e}; its time includes the runs"
-        f" that judge the error. Errors are against the stepper at {_TRUTH:.0e}.",
+        [r for r in found if r.rtol == rtols[-1]],
+        {
+            "effect": lambda r: plain(r.trial.effect),
+            "in a fit": lambda r: r.fit_way,
+            "its error / range": lambda r: number(r.fit_error, 2),
+            **{f"way at {rtol:.0e}": way(rtol) for rtol in rtols},
+            "largest error / range": lambda r: number(r.error, 2),
+            "error / tolerance": lambda r: number(r.over, 2),
+            "time over the stepper's": lambda r: number(r.seconds / r.stepper_seconds, 2),
+        },
+        f"Of {len({r.trial for r in effects})} effects {fits} take the exact way in a fit"
+        f" (tolerance of a step {FIT_RTOL:.0e}); in `simulate`"
+        f" {', '.join(f'{exact[rtol]} at {rtol:.0e}' for rtol in rtols)}. The others fall back on"
+        f" the stepper at {STEP_SHARE:g} of the tolerance, which is also the peer of the last"
+        f" column. The last three columns are of `simulate` at {rtols[-1]:.0e}; its time includes"
+        f" the runs that judge the error. Errors are against the stepper at {_TRUTH:.0e}.",
     )
 
 
 def errors_table(found: Sequence[Reached]) -> TitledTable:
     """Return how the errors of `simulate` and of the stepper alone compare with the tolerance."""
-    rows = []
+    groups = {}
     for rtol in sorted({r.rtol for r in found}, reverse=True):
         own = [r for r in found if r.rtol == rtol]
-        exact = [r for r in own if r.way == EXACT]
-        peers = [replace(r, way=STEPPER, error=r.stepper_error) for r in own]
-        for name, group in (("simulate", own), ("its exact runs", exact), ("stepper", peers)):
-            if group:
-                rows.append(_errors_row(f"{rtol:.0e}", name, group))
+        groups[rtol, "simulate"] = own
+        groups[rtol, "its exact runs"] = [r for r in own if r.way == EXACT]
+        groups[rtol, "stepper"] = [replace(r, way=STEPPER, error=r.stepper_error) for r in own]
+    Key = tuple[float, str]
+
+    def counted(holds: Callable[[Reached], bool]) -> Callable[[Key], str]:
+        return lambda key: share(sum(map(holds, groups[key])), len(groups[key]))
+
+    def worst_of(key: Key) -> Reached:
+        return max(groups[key], key=lambda r: r.over)
+
+    def where(key: Key) -> str:
+        t = worst_of(key).trial
+        return f"{t.stack}, {plain(t.effect)}, {t.record}, {1e3 * t.sample_time:g} ms"
+
+    columns: dict[str, Callable[[Key], str]] = {
+        "tolerance": lambda key: f"{key[0]:.0e}",
+        "who": lambda key: key[1],
+        "by exact steps": counted(lambda r: r.way == EXACT),
+        "error / tolerance above 1": counted(lambda r: r.over > 1.0),
+        "worst": lambda key: number(worst_of(key).over, 2),
+        "where": where,
+    }
     trials = {r.trial for r in found}
     counts = [len({getattr(t, of) for t in trials}) for of in ("stack", "effect", "record")]
     worst = max(found, key=lambda r: r.over)
-    above = [r for r in found if r.over > 1.0]
-    note = (
+    return table_of(
+        "Error over tolerance, records with kinks and jumps",
+        [key for key in groups if groups[key]],
+        columns,
         f"{len(trials)} trials: {counts[0]} stacks, {counts[1]} models (the base, and each effect"
         f" alone beside it), {counts[2]} kinds of record. The worst error of `simulate` over its"
-        f" tolerance is {number(worst.over, 3)}; {share(len(above), len(found))} exceed 1. The"
-        f" stepper alone takes the tolerance that `simulate` gives it, {STEP_SHARE:g} of the one"
-        " asked for."
-    )
-    head = ("tolerance", "who", "by exact steps", "error / tolerance above 1", "worst", "where")
-    return TitledTable(
-        "Error over tolerance, records with kinks and jumps", Table(head, tuple(rows)), note
-    )
-
-
-def _errors_row(rtol: str, name: str, group: Sequence[Reached]) -> tuple[str, ...]:
-    worst = max(group, key=lambda r: r.over)
-    exact, above = (sum(r.way == EXACT for r in group), sum(r.over > 1.0 for r in group))
-    of = len(group)
-    return (rtol, name, share(exact, of), share(above, of), number(worst.over, 2), _where(worst))
-
-
-def _where(r: Reached) -> str:
-    t = r.trial
-    return f"{t.stack}, {plain(t.effect)}, {t.record}, {1e3 * t.sample_time:g} ms"
-
-
-def exceeding_table(found: Sequence[Reached]) -> TitledTable:
-    """Return the runs whose error is above the tolerance, the worst first."""
-    above = sorted((r for r in found if r.over > 1.0), key=lambda r: -r.over)
-    rows = tuple(
-        (
-            f"{r.rtol:.0e}", _where(r), r.way, number(r.over, 3),
-            number(r.stepper_error / r.rtol, 2), number(r.doubt / r.rtol, 2),
-        )
-        for r in above[:_LISTED]
-    )  # fmt: skip
-    head = (
-        "tolerance", "where", "way", "error / tolerance", "the stepper's", "doubt of the truth"
-    )  # fmt: skip
-    return TitledTable(
-        "Runs whose error exceeds the tolerance",
-        Table(head, rows),
-        f"The worst {len(rows)} of {len(above)}. The doubt is the difference of the stepper at"
-        f" {_CHECK:.0e} and at {_TRUTH:.0e}, over the tolerance.",
+        f" tolerance is {number(worst.over, 3)}, where the truth at {_CHECK:.0e} and at"
+        f" {_TRUTH:.0e} differ by {number(worst.doubt / worst.rtol, 2)} of it;"
+        f" {share(sum(r.over > 1.0 for r in found), len(found))} exceed 1. The stepper alone takes"
+        f" the tolerance that `simulate` gives it, {STEP_SHARE:g} of the one asked for.",
     )
 
 
@@ -284,14 +265,6 @@ _FIRST_SEED, _NOISE, _SAMPLE_TIME = 271828, 1e-3, 1e-4
 _LONG, _QUICK_LONG = 180_000, 12_000
 #: Samples of a step of the long record; samples of a record of the plants that are diagnosed.
 _HELD, _CUT = 600, 2400
-_HEAD = (
-    "work", "samples", "wall [s]", "processor [s]", "processor, over the stepper's",
-    "simulations", "with derivatives", "found",
-)  # fmt: skip
-_NOTE = (
-    "Models are compiled and cached before the diagnoses that count. Wall times are those of a"
-    " machine that other work may share."
-)
 
 
 @dataclass(frozen=True)
@@ -312,30 +285,54 @@ class Spent:
 
 
 def diagnosis_table(demo: Record, progress: Progress, quick: bool) -> TitledTable:
-    """Diagnose the demonstration and hidden causes, identify a long record."""
-    rows = [*_demonstration(demo, progress)]
-    rows += [_hidden(cause, progress) for cause in (HIDDEN[:1] if quick else HIDDEN)]
-    rows += _long(_QUICK_LONG if quick else _LONG, progress)
+    """Diagnose the demonstration and hidden causes, identify a long record.
+
+    What is diagnosed is so once before it counts: models get compiled.
+    """
+    work = "diagnose, demonstration"
+    for name in (f"{work} (first use)", work):
+        rows = [*_both_ways(name, str(demo.n), partial(_diagnosed, [demo]), progress)]
+    for cause in HIDDEN[: 1 if quick else None]:
+        records, work = six_records(cause), f"diagnose, {_RECORDS} records, hidden {plain(cause)}"
+        for name in (f"{work} (first use)", work):
+            progress(name)
+            spent = _spent(name, f"{_RECORDS} x {_CUT}", partial(_diagnosed, records))
+        rows.append(spent)
+    long = long_record(_QUICK_LONG if quick else _LONG)
+
+    def fit() -> str:
+        rms = identify([long]).fit.rms
+        return f"rms {number(100.0 * rms / long.range_m, 2)} % of range"
+
+    rows += _both_ways("identify, loops and steps", str(long.n), fit, progress)
     return spent_table(rows)
 
 
 def spent_table(rows: Sequence[Spent]) -> TitledTable:
     """Return the work with its times, and its share of the stepper's where that was tried."""
-    cells = tuple(
-        (
-            r.work, r.samples, number(r.wall), number(r.processor),
-            "" if r.peer is None else number(r.processor / r.peer, 2),
-            str(r.runs), str(r.differentiated), r.found,
-        )
-        for r in rows
-    )  # fmt: skip
     said = [
         f"{r.work} takes 1/{number(r.peer / r.processor, 2)} of the stepper's processor time."
         for r in rows
         if r.peer is not None and r.peer != r.processor
     ]
-    note = " ".join((*said, _NOTE))
-    return TitledTable("Whole fits and diagnoses", Table(_HEAD, cells), note)
+    return table_of(
+        "Whole fits and diagnoses",
+        rows,
+        {
+            "work": lambda r: r.work,
+            "samples": lambda r: r.samples,
+            "wall [s]": lambda r: number(r.wall),
+            "processor [s]": lambda r: number(r.processor),
+            "processor, over the stepper's": lambda r: (
+                "" if r.peer is None else number(r.processor / r.peer, 2)
+            ),
+            "simulations": lambda r: str(r.runs),
+            "with derivatives": lambda r: str(r.differentiated),
+            "found": lambda r: r.found,
+        },
+        " ".join(said) + " Models are compiled and cached before the diagnoses that count. Wall"
+        " times are those of a machine that other work may share.",
+    )
 
 
 @contextmanager
@@ -382,41 +379,10 @@ def _both_ways(
     return replace(ours, peer=theirs.processor), replace(theirs, peer=theirs.processor)
 
 
-def _demonstration(record: Record, progress: Progress) -> tuple[Spent, Spent]:
-    """Diagnose the demonstration both ways, once before it counts: models get compiled."""
-
-    def diagnosed() -> str:
-        return _diagnosed([record])
-
-    _both_ways("diagnose, demonstration (first use)", "", diagnosed, progress)
-    return _both_ways("diagnose, demonstration", str(record.n), diagnosed, progress)
-
-
-def _hidden(cause: str, progress: Progress) -> Spent:
-    """Diagnose six records of one device that hides a cause, once before it counts."""
-    records = six_records(cause)
-
-    def diagnosed() -> str:
-        return _diagnosed(records)
-
-    work = f"diagnose, {_RECORDS} records, hidden {plain(cause)}"
-    progress(f"{work} (first use)")
-    diagnosed()
-    progress(work)
-    return _spent(work, f"{_RECORDS} x {_CUT}", diagnosed)
-
-
 def six_records(cause: str) -> list[Record]:
     """Return records of one device of the independent plants, each with a voltage of its own."""
-    records = []
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "record.csv"
-        truth = make_record(cause, _FIRST_SEED, path, visible=(1.0, 3.0))
-        for k in range(_RECORDS):
-            path = Path(folder) / f"record_{k}.csv"
-            play_again(truth, _FIRST_SEED + k, path)
-            records.append(read_record(path).slice(0, _CUT))
-    return records
+    truth, _ = hidden_record(cause, _FIRST_SEED, visible=(1.0, 3.0))
+    return [played_again(truth, _FIRST_SEED + k).slice(0, _CUT) for k in range(_RECORDS)]
 
 
 def long_record(samples: int) -> Record:
@@ -437,13 +403,3 @@ def long_record(samples: int) -> Record:
     return Record(
         name=f"{x.size} samples", time=wave.time, voltage=wave.voltage, displacement=x + noise
     )
-
-
-def _long(samples: int, progress: Progress) -> tuple[Spent, Spent]:
-    record = long_record(samples)
-
-    def fit() -> str:
-        found = identify([record]).fit
-        return f"rms {number(100.0 * found.rms / record.range_m, 2)} % of range"
-
-    return _both_ways("identify, loops and steps", str(record.n), fit, progress)

@@ -6,12 +6,10 @@ the base's parameters cannot absorb, over the rms of the noise.
 """
 
 import itertools
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,13 +17,12 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Diagnosis, Verdict
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.effects import EFFECTS
-from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
+from tests.studies.benchmarks.records import hidden_record, played_again
 from tests.studies.benchmarks.table import TitledTable
-from tests.studies.plants.again import play_again
 from tests.studies.plants.excitations import DesignKind, ExcitationKind, PoorKind
-from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.make import Truth
 from tests.studies.plants.noise import NoiseKind
 from tests.studies.plants.table import called
 
@@ -124,24 +121,20 @@ class Found:
         return self.named == (self.case.right,) == self.within
 
 
-def records_of(case: Case, folder: Path) -> tuple[Truth, list[Record]]:
-    """Make the records of a case as files in a folder, and read them."""
-    path = folder / "record_0.csv"
-    truth = make_record(
-        case.effect,
-        case.seed,
-        path,
-        noise=case.noise,
-        excitation=case.excitation,
-        visible=case.rho if case.effect else None,
-        more=case.more,
-        more_visible=case.rho if case.more else None,
-    )
-    paths = [path]
-    for k in range(1, case.records):
-        paths.append(folder / f"record_{k}.csv")
-        play_again(truth, case.seed + 10_000 * k, paths[-1])
-    records = [read_record(p) for p in paths]
+def how_made(case: Case) -> dict[str, Any]:
+    """Return what `make_record` is told of a case beside effect and seed."""
+    return {
+        "noise": case.noise, "excitation": case.excitation, "more": case.more,
+        "visible": case.rho if case.effect else None,
+        "more_visible": case.rho if case.more else None,
+    }  # fmt: skip
+
+
+def records_of(case: Case) -> tuple[Truth, list[Record]]:
+    """Make the records of a case as files, and read them."""
+    truth, record = hidden_record(case.effect, case.seed, **how_made(case))
+    more = range(1, case.records)
+    records = [record, *(played_again(truth, case.seed + 10_000 * k) for k in more)]
     if case.records > 1:
         records = [r.slice(0, min(_CUT, r.n)) for r in records]
     return truth, records
@@ -152,8 +145,7 @@ def run_case(case: Case, method: Method | None = None, only: bool = False) -> Fo
 
     With `only`, the right effect is the only one in the table.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        truth, records = records_of(case, Path(folder))
+    truth, records = records_of(case)
     left_out = case.right if case.kind == "left out" else None
     table = [e for n, e in EFFECTS.items() if (n == case.right if only else n != left_out)]
     begin = time.process_time()

@@ -7,10 +7,12 @@ parameters with the same residuals, and stop when they will; the time is that at
 has the cost that both reach.
 """
 
+import math
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +21,14 @@ from scipy.optimize import least_squares
 
 from psa_casadi.components import BASE
 from psa_casadi.identification.fitting import fit as fitting
-from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, table_of
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -63,11 +65,6 @@ def _record(samples: int) -> Record:
     )
 
 
-def _wrong() -> dict[str, float]:
-    values = _stack().values
-    return {name: factor * values[name] for name, factor in _WRONG.items()}
-
-
 class _Trace:
     """Cost against time."""
 
@@ -88,30 +85,32 @@ class _Trace:
 
 def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
     record = _record(samples)
-    sigma = _NOISE * record.range_m
-    ours, evaluations = _ours(record, sigma)  # compiles the model once, as on any first use
-    ours, evaluations = _ours(record, sigma)
+    _ours(record)  # compiles the model once, as on any first use
+    ours, evaluations = _ours(record)
     progress(f"least_squares with solve_ivp on {samples} samples (minutes)")
-    theirs = _scipy(record, sigma)
+    theirs = _scipy(record, _NOISE * record.range_m)
     target = _REACHED * max(ours.best, theirs.best)
-    rows = [
-        (name, f"{trace.reached(target):.3g}", str(count), f"{trace.best:.1f}")
-        for name, trace, count in (
-            ("psa_casadi, fit", ours, evaluations),
-            ("scipy, least_squares with solve_ivp", theirs, len(theirs.points)),
-        )
-    ]
-    ratio = theirs.reached(target) / ours.reached(target)
-    return TitledTable(
+    ways = {
+        "psa_casadi, fit": (ours, evaluations),
+        "scipy, least_squares with solve_ivp": (theirs, len(theirs.points)),
+    }
+    return table_of(
         f"One fit of {len(FREE) + 1} parameters to {samples} samples",
-        Table(("who", "CPU time to the final cost [s]", "simulations", "lowest cost"), tuple(rows)),
-        f"The fit here takes 1/{ratio:.0f} of the time. Both search the offset and"
-        f" {', '.join(FREE)} from one start, in one process of one run; a cost of {samples} is pure"
-        " noise. Compiling the model once (cached afterwards) is not counted.",
+        ways,
+        {
+            "who": str,
+            "CPU time to the final cost [s]": lambda n: f"{ways[n][0].reached(target):.3g}",
+            "simulations": lambda n: str(ways[n][1]),
+            "lowest cost": lambda n: f"{ways[n][0].best:.1f}",
+        },
+        f"The fit here takes 1/{theirs.reached(target) / ours.reached(target):.0f} of the time."
+        f" Both search the offset and {', '.join(FREE)} from one start, in one process of one run;"
+        f" a cost of {samples} is pure noise. Compiling the model once (cached afterwards) is not"
+        " counted.",
     )
 
 
-def _ours(record: Record, sigma: float) -> tuple[_Trace, int]:
+def _ours(record: Record) -> tuple[_Trace, int]:
     trace = _Trace()
     objective = fitting.Objective
 
@@ -130,7 +129,7 @@ def _ours(record: Record, sigma: float) -> tuple[_Trace, int]:
     # the fit's own objective is replaced by one that also keeps a trace
     fitting.Objective = traced  # type: ignore[assignment,misc]
     try:
-        found = fit(_stack(), [whole(record)], FREE, sigma=[sigma], start=_wrong())
+        found = _fitted(record)
     finally:
         fitting.Objective = objective  # type: ignore[misc]
     return trace, found.evaluations
@@ -139,7 +138,7 @@ def _ours(record: Record, sigma: float) -> tuple[_Trace, int]:
 def _scipy(record: Record, sigma: float) -> _Trace:
     """Return the trace of least_squares with finite differences around solve_ivp."""
     model, y = _stack(), np.asarray(record.displacement)
-    start = {**model.values, **_wrong()}
+    start = {n: _WRONG.get(n, 1.0) * model.values[n] for n in FREE}
     reference = np.array([model.values[n] for n in FREE])
     positive = np.array([n in ("k_L", "tau", "R_s", "c_P", "c_B", "m_P") for n in FREE])
     trace = _Trace()
@@ -161,30 +160,14 @@ def _scipy(record: Record, sigma: float) -> _Trace:
 def _plain(p: dict[str, float], t: FloatArray, v: FloatArray) -> FloatArray:
     """Return the displacement of eqs. (4), (5), (7)-(9) by solve_ivp, from rest."""
 
-    def rates(now: float, s: FloatArray) -> list[float]:
-        u, f_h, f_out, y, v_y, x, v_x = s.tolist()
-        rate = (p["G"] * float(np.interp(now, t, v)) - u) / (p["R_s"] * p["C_p"])
-        sign = rate / (rate * rate + p["hold_rate"] ** 2) ** 0.5
-        power = (abs(f_h) / p["h_ref"]) ** p["n"]
-        bend = p["beta"] * rate * sign * (power if f_h > 0 else -power) + p["gamma"] * rate * power
-        passed = p["c_P"] * v_y + p["k_P"] * y
-        pull = p["c_B"] * (v_x - v_y) + p["k_B"] * (x - y)
-        return [
-            rate,
-            p["A"] * rate - bend + p["delta"] * u * sign,
-            (p["k_L"] * u + f_h - f_out) / p["tau"],
-            v_y,
-            (f_out - passed) / p["m_P"],
-            v_x,
-            (passed - pull) / p["m_B"],
-        ]
+    def slopes(now: float, s: FloatArray) -> tuple[Any, ...]:
+        return rates(p, float(np.interp(now, t, v)), s.tolist(), math)
 
     stroke = p["k_L"] * p["u_rated"] * (1.0 / p["k_P"] + 1.0 / p["k_B"])
     speed = stroke * (p["k_B"] / p["m_B"]) ** 0.5
     sizes = [p["u_rated"], p["h_ref"], p["k_L"] * p["u_rated"], stroke, speed, stroke, speed]
-    found = solve_ivp(
-        rates, (t[0], t[-1]), np.zeros(7), "LSODA", t, rtol=1e-7, atol=1e-7 * np.array(sizes)
-    )
+    how: Any = {"rtol": 1e-7, "atol": 1e-7 * np.array(sizes)}
+    found = solve_ivp(slopes, (t[0], t[-1]), np.zeros(7), "LSODA", t, **how)
     return np.asarray(found.y[5], dtype=np.float64)
 
 
@@ -192,40 +175,49 @@ def _growth(lengths: tuple[int, ...], progress: Progress) -> TitledTable:
     rows = []
     for samples in lengths:
         progress(f"fit to {samples} samples")
-        record = _record(samples)
-        begin = time.process_time()
-        found = fit(
-            _stack(), [whole(record)], FREE, sigma=[_NOISE * record.range_m], start=_wrong()
-        )
+        record, begin = _record(samples), time.process_time()
+        count = _fitted(record).evaluations
         spent = time.process_time() - begin
-        each = spent / found.evaluations / samples
-        rows.append(
-            (
-                f"{samples}",
-                f"{spent:.2f}",
-                f"{found.evaluations}",
-                f"{1e6 * each:.1f}",
-                f"{_peak_memory() / 2**20:.0f}",
-            )
-        )
+        unit = 1.0 if sys.platform == "darwin" else 1024.0
+        peak = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        each = f"{1e6 * spent / count / samples:.1f}"
+        rows.append((f"{samples}", f"{spent:.2f}", f"{count}", each, f"{peak:.0f}"))
+    head = (
+        "samples", "CPU time [s]", "simulations", "each, per sample [us]", "peak memory [MiB]"
+    )  # fmt: skip
     return TitledTable(
         "The same fit over the length of the record",
-        Table(
-            (
-                "samples",
-                "CPU time [s]",
-                "simulations",
-                "each, per sample [us]",
-                "peak memory [MiB]",
-            ),
-            tuple(rows),
-        ),
+        Table(head, tuple(rows)),
         "Every simulation carries the derivatives by all parameters. Memory is the highest of the"
         " whole process so far, Python and libraries included; nothing was averaged.",
     )
 
 
-def _peak_memory() -> float:
-    """Return the peak resident memory of this process [bytes]."""
-    unit = 1.0 if sys.platform == "darwin" else 1024.0
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def rates(p: Mapping[str, Any], v: Any, state: Sequence[Any], m: Any) -> tuple[Any, ...]:
+    """Return the rates of (u, f_H, f_out, y, y', x, x') at the command v [V], paper eqs. (4)-(9).
+
+    `m` has the functions: `math`, or jax.numpy for arrays of sets.
+    """
+    u, f_H, f_out, y, v_y, x, v_x = state
+    du = (p["G"] * v - u) / (p["R_s"] * p["C_p"])
+    sign = du / m.sqrt(du * du + p["hold_rate"] ** 2)
+    power = (abs(f_H) / p["h_ref"]) ** p["n"]
+    bend = du * (p["beta"] * sign * m.copysign(power, f_H) + p["gamma"] * power)
+    passed_on = p["c_P"] * v_y + p["k_P"] * y
+    pull = p["c_B"] * (v_x - v_y) + p["k_B"] * (x - y)
+    return (
+        du,
+        p["A"] * du - bend + p["delta"] * u * sign,
+        (p["k_L"] * u + f_H - f_out) / p["tau"],
+        v_y,
+        (f_out - passed_on) / p["m_P"],
+        v_x,
+        (passed_on - pull) / p["m_B"],
+    )
+
+
+def _fitted(record: Record) -> Fit:
+    """Fit a record from the wrong values."""
+    model = _stack()
+    start = {name: factor * model.values[name] for name, factor in _WRONG.items()}
+    return fit(model, [whole(record)], FREE, sigma=[_NOISE * record.range_m], start=start)

@@ -7,11 +7,11 @@ the sine, of one amplitude, says of a cause that only the other records show.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from psa_casadi import datasets
-from psa_casadi.component import Component
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out import errors_of
+from psa_casadi.diagnosis.held_out import Errors, errors_of
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -34,30 +34,31 @@ def run(progress: Progress, quick: bool) -> Outcome:
     """
     rows = []
     records = sorted(datasets.micromanipulator(), key=lambda r: r.n)
-    for record in records[:1] if quick else records:
+    for record in records[: 1 if quick else None]:
         experiments = [split(record)]
         progress(f"{record.name}: the paper's model")
         found = search(starting_model([record]), experiments, thorough=True).best
-        rows.append(_row(record.name, "the paper's", found, experiments))
-        names: list[str] = []
+        names, fits = [], {"the paper's": found}
         for name, start in ADDED.items():
             names.append(name)
             progress(f"{record.name}: with {name}")
-            found = _extended(found, name, start, experiments)
-            rows.append(_row(record.name, "with " + ", ".join(names), found, experiments))
+            model, states = found.model.with_effect(EFFECTS[name], start), found.starts()
+            free = [*found.unknowns.names, *(p.name for p in EFFECTS[name].parameters)]
+            how: Any = {"sigma": found.sigma, "start_states": states}
+            found = refit(fit(model, experiments, free, **how), experiments, free)
+            fits["with " + ", ".join(names)] = found
+        for name, fitted in fits.items():
+            e, share = _errors(fitted, experiments), 100.0 / record.range_m
+            rms = (f"{share * x:.3f} %" for x in (e.train_rms_m, e.holdout_rms_m))
+            rows.append((record.name, name, *rms, f"{share * e.holdout_max_m:.2f} %"))
     head = ("record", "model", "fitted, rms", "held out, rms", "held out, largest")
     tables, sine = ([], None) if quick else _diagnoses(progress)
-    return Outcome(
-        (
-            TitledTable(
-                "Micromanipulator of Y. N. Aye, percent of range",
-                Table(head, tuple(rows)),
-                "One of every four of 16 blocks between reversals is held out and never fitted.",
-            ),
-            *tables,
-        ),
-        None if sine is None else partial(narrow_figure, sine),
+    whole = TitledTable(
+        "Micromanipulator of Y. N. Aye, percent of range",
+        Table(head, tuple(rows)),
+        "One of every four of 16 blocks between reversals is held out and never fitted.",
     )
+    return Outcome((whole, *tables), None if sine is None else partial(narrow_figure, sine))
 
 
 def _diagnoses(progress: Progress) -> tuple[list[TitledTable], Diagnosis]:
@@ -90,52 +91,27 @@ def _said_of_others(sine: Diagnosis, others: Mapping[str, Diagnosis]) -> TitledT
     And with its sign turned: where both are as good, the sine does not see the cause.
     """
     own = sine.extended_fit
-    rows = [("as diagnosed", "", *_errors_nm(own, sine.experiments))]
+    fits = [("as diagnosed", "", own)]
+    there = {c.name for c in own.model.components}
     for name, found in others.items():
-        model = found.extended_fit.model
-        for cause in (EFFECTS[c.effect] for c in found.causes):
-            if any(c.name == cause.name for c in own.model.components):
-                continue
+        values = found.extended_fit.model.values
+        for cause in (EFFECTS[c.effect] for c in found.causes if c.effect not in there):
             for sign, told in ((1.0, cause.name), (-1.0, f"{cause.name}, sign turned")):
-                fixed = _with_fixed(own, cause, model.values, sign)
+                given = {p.name: values[p.name] for p in cause.parameters}
+                given |= {p: sign * values[p] for p in given if p == cause.gain}
+                fixed = replace(own, model=own.model.with_effect(cause, given))
                 again = refit(fixed, sine.experiments, own.unknowns.names)
-                rows.append((told, name, *_errors_nm(again, sine.experiments)))
+                fits.append((told, name, again))
+    rows = []
+    for told, name, fitted in fits:
+        e = _errors(fitted, sine.experiments)
+        rows.append(
+            (told, name, f"{1e9 * e.train_rms_m:.2f} nm", f"{1e9 * e.holdout_rms_m:.2f} nm")
+        )
     head = ("the sine, fitted with", "as found in", "fitted, rms", "held out, rms")
-    return TitledTable(
-        "What the sine says of causes of the other records", Table(head, tuple(rows))
-    )
+    title = "What the sine says of causes of the other records"
+    return TitledTable(title, Table(head, tuple(rows)))
 
 
-def _with_fixed(own: Fit, cause: Component, values: Mapping[str, float], sign: float) -> Fit:
-    """Return a fit whose model has one more effect, with parameters found elsewhere."""
-    turned = {cause.gain: sign}
-    given = {p.name: turned.get(p.name, 1.0) * values[p.name] for p in cause.parameters}
-    return replace(own, model=own.model.with_effect(cause, given))
-
-
-def _errors_nm(found: Fit, experiments: Sequence[Experiment]) -> tuple[str, str]:
-    errors = errors_of(experiments, found.predicted(experiments))
-    return f"{1e9 * errors.train_rms_m:.2f} nm", f"{1e9 * errors.holdout_rms_m:.2f} nm"
-
-
-def _extended(
-    before: Fit, name: str, start: dict[str, float], experiments: Sequence[Experiment]
-) -> Fit:
-    """Return the fit with one more effect, all parameters searched together."""
-    model = before.model.with_effect(EFFECTS[name], start)
-    states = before.starts()
-    free = [*before.unknowns.names, *(p.name for p in EFFECTS[name].parameters)]
-    first = fit(model, experiments, free, sigma=before.sigma, start_states=states)
-    return refit(first, experiments, free)
-
-
-def _row(record: str, model: str, found: Fit, experiments: Sequence[Experiment]) -> tuple[str, ...]:
-    errors = errors_of(experiments, found.predicted(experiments))
-    share = 100.0 / experiments[0].record.range_m
-    return (
-        record,
-        model,
-        f"{share * errors.train_rms_m:.3f} %",
-        f"{share * errors.holdout_rms_m:.3f} %",
-        f"{share * errors.holdout_max_m:.2f} %",
-    )
+def _errors(found: Fit, experiments: Sequence[Experiment]) -> Errors:
+    return errors_of(experiments, found.predicted(experiments))

@@ -1,8 +1,7 @@
 """The benchmark `method`: the two pictures of docs/method.md, from one record with two causes."""
 
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,12 +16,11 @@ from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.split import divided
 from psa_casadi.report.words.phrases import length_scale, plain
 from psa_casadi.report.words.tables import Table
+from tests.studies.benchmarks.records import hidden_record
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
-from tests.studies.plants.make import make_record
 
 #: What is hidden, how strongly, and the seed.
 HIDDEN, RHO, SEED = ("slow_creep", "hysteresis_memory"), (1.0, 3.0), 141592
@@ -32,10 +30,8 @@ _BLUE, _GREY, _ORANGE = "#0072b2", "#9aa1a8", "#d55e00"
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Search one record, and say where its error goes."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "record.csv"
-        make_record(HIDDEN[0], SEED, path, visible=RHO, more=HIDDEN[1:], more_visible=RHO)
-        record = read_record(path)
+    how: Any = {"visible": RHO, "more": HIDDEN[1:], "more_visible": RHO}
+    _, record = hidden_record(HIDDEN[0], SEED, **how)
     if quick:
         record = record.slice(0, 3000)
     experiments = divided([record], [])

@@ -17,14 +17,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from scipy.integrate import odeint
 
-from psa_casadi.model.nanopositioner import margins_of, nanopositioner, positioner_plant
-from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
+from psa_casadi.model.nanopositioner import nanopositioner
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled, table_of
 
 FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float]
@@ -152,7 +150,6 @@ def simulate_positioner(
     return Run(time, position, tip, commands, voltage)
 
 
-_FONT = 11.0
 #: Colour and name of a case by (closed loop, compensated).
 LOOKS = {
     (False, False): ("#9a9a9a", "open loop"),
@@ -166,60 +163,32 @@ def picture(cases: Sequence[Case]) -> Figure:
     """Return three panels: loops in open loop, deviation from the line, largest deviation."""
     figure = Figure(figsize=(14.0, 6.2), layout="constrained")
     loops, deviations, sizes = figure.subplots(1, 3, width_ratios=(1.0, 1.15, 1.25))
-    raster = [c for c in cases if c.wave == "triangle" and c.error == "exact"]
-    _loops(loops, [c for c in raster if not c.closed])
-    _deviations(deviations, raster)
-    _sizes(sizes, cases)
-    for axes in (loops, deviations, sizes):
-        axes.grid(visible=True, color="#dddddd", linewidth=0.7)
-        axes.set_axisbelow(True)
-        axes.tick_params(labelsize=_FONT - 2)
+    styled(loops, "reference [um]", "position of the stage [um]", "triangle at 10 Hz, open loop")
+    distance = "% of range (linear within 0.01 %)"
+    styled(deviations, "time in the period [ms]", distance, "distance from the linear loop")
+    styled(sizes, title="nonlinearity [% of range]")
+    groups = list(dict.fromkeys((c.wave, c.error) for c in cases))
+    for c in cases:
+        colour, _ = LOOKS[c.closed, c.compensated]
+        if (c.wave, c.error) == ("triangle", "exact"):
+            if not c.closed:
+                loops.plot(1e6 * c.reference, 1e6 * c.position, color=colour, linewidth=1.6)
+            share = 100.0 * c.deviation / np.ptp(c.position)
+            deviations.plot(1e3 * (c.time - c.time[0]), share, color=colour, linewidth=1.2)
+        at = 0.19 * (list(LOOKS).index((c.closed, c.compensated)) - 1.5)
+        place, height = groups.index((c.wave, c.error)) + at, 100.0 * c.nonlinearity
+        sizes.barh(place, height, 0.18, color=colour)
+        sizes.text(1.12 * height, place, f"{height:.2g}", va="center", fontsize=8)
+    deviations.set_yscale("symlog", linthresh=1e-2)
+    sizes.set_yticks(range(len(groups)), [f"{wave},\n{error}" for wave, error in groups])
+    sizes.invert_yaxis()
+    sizes.set_xscale("log")
+    found = [100.0 * c.nonlinearity for c in cases]
+    sizes.set_xlim(0.5 * min(found), 4.0 * max(found))
     handles = [Patch(color=colour, label=name) for colour, name in LOOKS.values()]
-    figure.legend(handles=handles, fontsize=_FONT, loc="outside lower center", ncols=len(handles))
+    figure.legend(handles=handles, fontsize=11, loc="outside lower center", ncols=len(handles))
     return figure
 
-
-def _loops(axes: Axes, cases: Sequence[Case]) -> None:
-    for c in cases:
-        colour, _ = LOOKS[c.closed, c.compensated]
-        axes.plot(1e6 * c.reference, 1e6 * c.position, color=colour, linewidth=1.6)
-    axes.set_title("triangle at 10 Hz, open loop", fontsize=_FONT, loc="left")
-    axes.set_xlabel("reference [um]", fontsize=_FONT)
-    axes.set_ylabel("position of the stage [um]", fontsize=_FONT)
-
-
-def _deviations(axes: Axes, cases: Sequence[Case]) -> None:
-    for c in cases:
-        colour, _ = LOOKS[c.closed, c.compensated]
-        time = 1e3 * (c.time - c.time[0])
-        share = 100.0 * c.deviation / (c.position.max() - c.position.min())
-        axes.plot(time, share, color=colour, linewidth=1.2)
-    axes.set_yscale("symlog", linthresh=1e-2)
-    axes.set_title("distance from the linear loop", fontsize=_FONT, loc="left")
-    axes.set_xlabel("time in the period [ms]", fontsize=_FONT)
-    axes.set_ylabel("% of range (linear within 0.01 %)", fontsize=_FONT)
-
-
-def _sizes(axes: Axes, cases: Sequence[Case]) -> None:
-    groups = list(dict.fromkeys((c.wave, c.error) for c in cases))
-    for k, (wave, error) in enumerate(groups):
-        there = [c for c in cases if (c.wave, c.error) == (wave, error)]
-        for c in there:
-            colour, _ = LOOKS[c.closed, c.compensated]
-            place = k + 0.19 * (list(LOOKS).index((c.closed, c.compensated)) - 1.5)
-            height = 100.0 * c.nonlinearity
-            axes.barh(place, height, 0.18, color=colour)
-            axes.text(1.12 * height, place, f"{height:.2g}", va="center", fontsize=_FONT - 3)
-    names = [f"{wave},\n{error}" for wave, error in groups]
-    axes.set_yticks(range(len(groups)), names)
-    axes.invert_yaxis()
-    axes.set_xscale("log")
-    found = [100.0 * c.nonlinearity for c in cases]
-    axes.set_xlim(0.5 * min(found), 4.0 * max(found))
-    axes.set_title("nonlinearity [% of range]", fontsize=_FONT, loc="left")
-
-
-Signal = Callable[[float], float]
 
 STACK = "P-885.51"
 #: Peak of the reference [m] and its frequency [Hz]; the period of the controller [s].
@@ -257,7 +226,7 @@ def sine(t: float) -> float:
     return 0.5 * PEAK * (1.0 - float(np.cos(2.0 * np.pi * FREQUENCY * t)))
 
 
-WAVES: dict[str, Signal] = {"triangle": triangle, "sine": sine}
+WAVES: dict[str, Callable[[float], float]] = {"triangle": triangle, "sine": sine}
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -278,30 +247,21 @@ def _cases(progress: Progress, quick: bool) -> Iterator[Case]:
             yield simulate_case(wave, closed=closed, compensated=compensated, error=error)
 
 
-def simulate_case(
-    wave: str, *, closed: bool, compensated: bool, error: str = "exact", periods: int = _PERIODS
-) -> Case:
+def simulate_case(wave: str, *, closed: bool, compensated: bool, error: str = "exact") -> Case:
     """Simulate one case and measure its last period."""
     values = _values(closed=closed, compensated=compensated)
     for name, factor in ERRORS[error].items():
         values["stack"][name] *= factor
-    found, ideal = _positions(values, wave, periods), linear_run(wave, closed, periods)
+    end = _PERIODS / FREQUENCY
+    found = simulate_positioner(values, WAVES[wave], end, PERIOD)
     last = found.time >= found.time[-1] - 1.0 / FREQUENCY
     time, position = found.time[last], found.position[last]
     reference = np.array([WAVES[wave](float(t)) for t in time])
-    deviation = line_deviation(ideal.position[last], position)
-    return Case(
-        closed,
-        compensated,
-        wave,
-        error,
-        time=time,
-        reference=reference,
-        position=position,
-        deviation=deviation,
-        nonlinearity=float(np.abs(deviation).max() / np.ptp(position)),
-        tracking=float(np.abs(position - reference).max() / np.ptp(reference)),
-    )
+    deviation = line_deviation(linear_run(wave, closed).position[last], position)
+    nonlinearity = float(np.abs(deviation).max() / np.ptp(position))
+    tracking = float(np.abs(position - reference).max() / np.ptp(reference))
+    shown = (time, reference, position, deviation, nonlinearity, tracking)
+    return Case(closed, compensated, wave, error, *shown)
 
 
 def _values(*, closed: bool, compensated: bool) -> dict[str, dict[str, float]]:
@@ -314,16 +274,12 @@ def _values(*, closed: bool, compensated: bool) -> dict[str, dict[str, float]]:
     return values
 
 
-def _positions(values: Mapping[str, Mapping[str, float]], wave: str, periods: int) -> Run:
-    return simulate_positioner(values, WAVES[wave], periods / FREQUENCY, PERIOD)
-
-
 @cache
-def linear_run(wave: str, closed: bool, periods: int) -> Run:
+def linear_run(wave: str, closed: bool) -> Run:
     """Simulate the loop with a stack that has no hysteresis, and so nothing to compensate."""
     values = _values(closed=closed, compensated=False)
     values["stack"] |= dict.fromkeys(("A", "beta", "gamma", "delta"), 0.0)
-    return _positions(values, wave, periods)
+    return simulate_positioner(values, WAVES[wave], _PERIODS / FREQUENCY, PERIOD)
 
 
 def line_deviation(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -334,46 +290,21 @@ def line_deviation(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def tables(cases: list[Case]) -> tuple[TitledTable, ...]:
-    """Return the nonlinearity of exact compensators, of wrong ones, and the tuned controller."""
-    head = ("reference", "loop", "compensator", "nonlinearity [% of range]", "tracking error [%]")
-    exact = tuple(_row(c)[:5] for c in cases if c.error == "exact")
-    off = tuple((*_row(c)[:2], c.error, *_row(c)[3:]) for c in cases if c.compensated)
-    wrong = ("reference", "loop", "stack's parameters", *head[3:])
+    """Return the nonlinearity of exact compensators, and of wrong ones."""
+    Columns = dict[str, Callable[[Case], str]]
+    loops: Columns = {
+        "reference": lambda c: c.wave,
+        "loop": lambda c: "closed" if c.closed else "open",
+    }
+    figures: Columns = {
+        "nonlinearity [% of range]": lambda c: f"{100 * c.nonlinearity:.3f}",
+        "tracking error [%]": lambda c: f"{100 * c.tracking:.3f}",
+    }
+    with_it: Columns = {"compensator": lambda c: "with" if c.compensated else "without"}
+    wrong: Columns = {"stack's parameters": lambda c: c.error}
+    exact = [c for c in cases if c.error == "exact"]
+    off = [c for c in cases if c.compensated]
     return (
-        TitledTable("Nonlinearity of the positioner", Table(head, exact), _NOTE),
-        TitledTable("With hysteresis parameters that are off", Table(wrong, off), _WRONG),
-        _controller_table(),
+        table_of("Nonlinearity of the positioner", exact, loops | with_it | figures, _NOTE),
+        table_of("With hysteresis parameters that are off", off, loops | wrong | figures, _WRONG),
     )
-
-
-def _row(c: Case) -> tuple[str, ...]:
-    loop, with_it = "closed" if c.closed else "open", "with" if c.compensated else "without"
-    return (c.wave, loop, with_it, f"{100 * c.nonlinearity:.3f}", f"{100 * c.tracking:.3f}")
-
-
-def _controller_table() -> TitledTable:
-    """Return the margins of the controller, at the steepest slope of the loop and at rest."""
-    controller = nanopositioner(STACK, sample_time=PERIOD).parts["controller"]
-    rows = []
-    for compensated in (True, False):
-        plant = positioner_plant(STACK, compensated=compensated).model()
-        m = margins_of(plant, controller, "stage_position")
-        rows.append(
-            (
-                "with" if compensated else "without, at rest",
-                f"{m.crossover:.0f}",
-                f"{m.sensitivity:.2f}",
-                f"{m.gain:.2f}",
-                f"{np.degrees(m.phase):.0f}",
-                f"{m.resonance:.0f}",
-            )
-        )
-    head = ("compensator", "crossover [Hz]", "largest sensitivity", "gain margin",
-            "phase margin [deg]", "resonance [Hz]")  # fmt: skip
-    p = controller.values
-    note = (
-        f"K_p {p['proportional_gain']:.4g} V/m, K_i {p['integral_gain']:.4g} V/(m.s), notch at"
-        f" {p['notch_frequency']:.0f} Hz (damping {p['notch_floor']:g} over {p['notch_width']:g}):"
-        " the largest integral gain with a sensitivity below 1.6, also with the resonance 10 % off."
-    )
-    return TitledTable("The controller", Table(head, tuple(rows)), note)

@@ -5,7 +5,7 @@ is simulated with them and noise is added; the rank of the truth among the poste
 uniform, and intervals of p % hold the truth in p %.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,8 +31,8 @@ CASES = (
     ("sensor_nonlinearity", 0.03),
     ("saturation_of_strain", 0.03),
 )
-FREE = ("k_L", "A", "n", "tau")
-EVIDENCE_NOISE = 1e-3
+#: Widths of the priors of what is sampled beside a gain.
+FREE = {"k_L": 0.2, "A": 0.2, "n": 0.2, "tau": 0.4}
 LONG, LONG_TUNE, CHAINS = 1000, 500, 2
 #: Rounds of the bridge at most, and the change of ln Z at which they end.
 _ROUNDS, _CLOSE = 200, 1e-8
@@ -53,18 +53,11 @@ def evidence_table(progress: Progress, quick: bool) -> TitledTable:
     rows = []
     for name, size in CASES[: 2 if quick else None]:
         progress(f"evidence: {name}, {size:g} of an ordinary size")
-        record, base, wider = _case(name, size)
-        one, other = (evidence(_task(m, record)) for m in (base, wider))
-        error = float(np.hypot(one.error, other.error))
-        rows.append(
-            (
-                name,
-                f"{size:g}",
-                f"{other.bridge - one.bridge:.2f} ± {error:.2f}",
-                f"{other.laplace - one.laplace:.2f}",
-                f"{other.schwarz - one.schwarz:.2f}",
-            )
-        )
+        record, *models = _case(name, size)
+        one, other = (evidence(task_for(record, m, FREE)) for m in models)
+        bridge = f"{other.bridge - one.bridge:.2f} ± {np.hypot(one.error, other.error):.2f}"
+        rest = (f"{getattr(other, w) - getattr(one, w):.2f}" for w in ("laplace", "schwarz"))
+        rows.append((name, f"{size:g}", bridge, *rest))
     head = ("effect", "gain put in", "bridge sampling", "Laplace", "Schwarz")
     return TitledTable(
         "ln Bayes factor of an effect over the base",
@@ -74,8 +67,12 @@ def evidence_table(progress: Progress, quick: bool) -> TitledTable:
 
 
 def evidence(task: Task) -> Evidence:
-    """Return ln Z of a task up to the constant that models of the same record share."""
-    density = _of_all_samples(task)
+    """Return ln Z of a task up to the constant that models of the same record share.
+
+    Every sample counts, as two models of one record need it.
+    """
+    blocks = tuple(Block(b.rows, float(b.rows.stop - b.rows.start)) for b in task.density.blocks)
+    density = replace(task.density, blocks=blocks)
     with one_thread():
         found = chains_of(density, chains=CHAINS, draws=LONG, tune=LONG_TUNE, seed=1)
     flat = found.u.reshape(-1, density.size)
@@ -86,27 +83,17 @@ def evidence(task: Task) -> Evidence:
     constant = float(np.linalg.slogdet(density.factor)[1])
     constant -= float(np.sum(np.log(known * np.sqrt(2.0 * np.pi))))
     constant -= float(np.sum(np.log(norm.cdf(high) - norm.cdf(low))))  # cut at the bounds
-    counts = sum(b.count for b in density.blocks)
+    counts = sum(b.count for b in blocks)
     level = counts * float(np.log(task.levels[0]))  # residuals are weighted by a fit's own
     constant -= level
     bridge, error = bridge_sampled(density, flat)
     peak, _ = density(np.zeros(density.size))
     laplace = peak + 0.5 * density.size * np.log(2.0 * np.pi)
-    found_rows = density.evaluate(task.theta)
-    assert found_rows is not None
-    fitted = sum(0.5 * b.count * np.log(_power(found_rows[0][b.rows])) for b in density.blocks)
+    rows = density.evaluate(task.theta)
+    assert rows is not None
+    fitted = sum(0.5 * b.count * np.log(float(np.sum(rows[0][b.rows] ** 2))) for b in blocks)
     schwarz = -fitted - level - 0.5 * len(task.unknowns.names) * np.log(counts)
     return Evidence(bridge + constant, error, laplace + constant, schwarz)
-
-
-def _of_all_samples(task: Task) -> Density:
-    """Return the density with every sample counted, as two models of one record need it."""
-    rows = [b.rows for b in task.density.blocks]
-    return replace(task.density, blocks=tuple(Block(r, float(r.stop - r.start)) for r in rows))
-
-
-def _power(values: FloatArray) -> float:
-    return float(values @ values)
 
 
 def bridge_sampled(density: Density, draws: FloatArray, seed: int = 0) -> tuple[float, float]:
@@ -130,38 +117,21 @@ def bridge_sampled(density: Density, draws: FloatArray, seed: int = 0) -> tuple[
         if abs(new - value) < _CLOSE:
             break
         value = new
-    spread = _relative(np.exp(other - np.logaddexp(other, value)))
-    spread += _relative(np.exp(value - np.logaddexp(own, value)))
+    terms = (np.exp(other - np.logaddexp(other, value)), np.exp(value - np.logaddexp(own, value)))
+    spread = sum(float(np.var(x) / np.mean(x) ** 2 / len(x)) for x in terms)  # of both means
     return value, float(np.sqrt(spread))
-
-
-def _relative(terms: FloatArray) -> float:
-    """Return the relative variance of a mean."""
-    return float(np.var(terms) / np.mean(terms) ** 2 / len(terms))
 
 
 def _case(name: str, size: float) -> tuple[psa.Record, psa.Model, psa.Model]:
     """Return a record of the stack with an effect, and the models without and with it."""
-    base = psa.stack_model("P-885.51").with_values({"tau": 1e-3})
-    effect = EFFECTS[name]
+    base, effect = centred_model(), EFFECTS[name]
     gain = str(effect.gain)
     wider = base.with_effect(effect)
     ordinary = wider.parameter(gain).typical({**wider.values, gain: 0.0})
     true = wider.with_values({gain: size * ordinary})
-    time: FloatArray = np.linspace(0.0, 0.399, 400)
-    applied = 60.0 * (1.0 - np.cos(10.0 * np.pi * time)) * np.where(time > 0.2, 1.0, 0.5)
-    x = psa.simulate(true, time, applied, rtol=1e-8).displacement
-    y = x + EVIDENCE_NOISE * np.ptp(x) * np.random.default_rng(7).standard_normal(len(x))
-    record = psa.Record(name="record", time=time, voltage=applied, displacement=y)
+    clean = recorded(true, 0.0, np.random.default_rng(7))
+    record = recorded(true, NOISE * clean.range_m, np.random.default_rng(7))
     return record, base, true if size else wider
-
-
-def _task(model: psa.Model, record: psa.Record) -> Task:
-    gains = tuple(str(c.gain) for c in model.effects)
-    centre = {n: model.values[n] for n in FREE} | dict.fromkeys(gains, 0.0)
-    widths: dict[str, float] = {"k_L": 0.2, "A": 0.2, "n": 0.2, "tau": 0.4}
-    widths |= dict.fromkeys(gains, 1.0)
-    return task_of(model, [record], free=(*FREE, *gains), prior=centre, widths=widths)
 
 
 STACK, NOISE = "P-885.51", 1e-3
@@ -208,26 +178,31 @@ def centred_model() -> psa.Model:
     return psa.stack_model(STACK).with_values(CENTRES)
 
 
-def recorded(model: psa.Model, memory: float, noise: float, rng: np.random.Generator) -> psa.Record:
+def recorded(
+    model: psa.Model, noise: float, rng: np.random.Generator, **memory: float
+) -> psa.Record:
     """Return a record of a model that starts with a hysteresis force [N], with noise [m]."""
     time, applied = voltage()
-    x = psa.simulate(model, time, applied, memory={"f_H": memory}, rtol=1e-8).displacement
+    x = psa.simulate(model, time, applied, memory=memory or None, rtol=1e-8).displacement
     y = x + noise * rng.standard_normal(len(x))
     return psa.Record(name="record", time=time, voltage=applied, displacement=y)
 
 
-def task_for(record: psa.Record) -> Task:
-    """Return the posterior of the sampled parameters, from where a user would begin."""
-    model = centred_model()
-    centre = {n: model.values[n] for n in WIDTHS}
-    return task_of(model, [record], free=tuple(WIDTHS), prior=centre, widths=WIDTHS)
+def task_for(record: psa.Record, model: psa.Model, widths: Mapping[str, float]) -> Task:
+    """Return the posterior of the sampled parameters, from where a user would begin.
+
+    Gains of effects are sampled too, from 0.
+    """
+    gains = tuple(str(c.gain) for c in model.effects)
+    centre = {n: model.values[n] for n in widths} | dict.fromkeys(gains, 0.0)
+    wide = {**widths, **dict.fromkeys(gains, 1.0)}
+    return task_of(model, [record], free=tuple(wide), prior=centre, widths=wide)
 
 
 def _calibration(progress: Progress, count: int) -> tuple[TitledTable, TitledTable]:
-    rng = np.random.default_rng(20261125)
-    clean = recorded(centred_model(), 0.0, 0.0, rng)
-    noise = NOISE * clean.range_m
-    before = task_for(recorded(centred_model(), 0.0, noise, rng))
+    rng, model = np.random.default_rng(20261125), centred_model()
+    noise = NOISE * recorded(model, 0.0, rng, f_H=0.0).range_m
+    before = task_for(recorded(model, noise, rng, f_H=0.0), model, WIDTHS)
     truths = prior_draws(before, count, rng)
     found: list[Replica] = []
     for k, truth in enumerate(truths):
@@ -240,7 +215,8 @@ def _calibration(progress: Progress, count: int) -> tuple[TitledTable, TitledTab
 def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replica:
     u, rng = before.unknowns, np.random.default_rng(seed)
     model = before.model.with_values(u.values(truth))
-    task = task_for(recorded(model, u.start(truth, 0)["f_H"], noise, rng))
+    record = recorded(model, noise, rng, f_H=u.start(truth, 0)["f_H"])
+    task = task_for(record, centred_model(), WIDTHS)
     with one_thread():
         chains = chains_of(task.density, chains=1, draws=DRAWS, tune=TUNE, seed=seed, cores=1)
     draws = np.array([task.density.theta(x) for x in chains.u[0]])

@@ -4,14 +4,21 @@ All begin at rest at 0 V and use the voltage from 0 to u_rated. Times follow the
 twelve times the slowest time constant of drive, creep lag and mechanics.
 """
 
+import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi import reference
-from psa_casadi.records import Record, multisine, sine, time_grid
+from psa_casadi.records import Record, multisine, read_record, sine, time_grid
+from tests.studies.plants.again import play_again
+from tests.studies.plants.make import Truth, make_record
 
 FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float]
@@ -85,16 +92,12 @@ def clean_set(values: Values) -> list[Record]:
 
     Results are kept, because the reference is slow and noise is all that seeds change.
     """
-    return [*_fast_set(_items(values)), *clean_loops(values)]
+    return [*_fast_set(tuple(sorted(values.items()))), *clean_loops(values)]
 
 
 def clean_loops(values: Values) -> list[Record]:
     """Return the loops of `clean_set` alone, which take a small part of its time."""
-    return list(_loop_set(_items(values)))
-
-
-def _items(values: Values) -> tuple[tuple[str, float], ...]:
-    return tuple(sorted(values.items()))
+    return list(_loop_set(tuple(sorted(values.items()))))
 
 
 @lru_cache(maxsize=16)
@@ -110,18 +113,11 @@ def _fast_set(items: tuple[tuple[str, float], ...]) -> tuple[Record, ...]:
 @lru_cache(maxsize=16)
 def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[Record, ...]:
     values, found = dict(items), []
-    for amplitude in LOOP_AMPLITUDES:
-        for frequency in LOOP_FREQUENCIES:
-            name = f"loop {100 * amplitude:.0f} % {frequency:g} Hz"
-            t, v = loop_voltage(values, amplitude, frequency)
-            found.append(
-                Record(
-                    name=name,
-                    time=t,
-                    voltage=v,
-                    displacement=loop_response(values, amplitude, frequency, t),
-                )
-            )
+    for amplitude, frequency in product(LOOP_AMPLITUDES, LOOP_FREQUENCIES):
+        name = f"loop {100 * amplitude:.0f} % {frequency:g} Hz"
+        t, v = loop_voltage(values, amplitude, frequency)
+        x = loop_response(values, amplitude, frequency, t)
+        found.append(Record(name=name, time=t, voltage=v, displacement=x))
     return tuple(found)
 
 
@@ -130,12 +126,24 @@ def with_noise(records: Sequence[Record], share: float, seed: int | Sequence[int
     level = share * max(r.range_m for r in records)
     draw = np.random.default_rng(seed)
     return [
-        Record(
-            name=r.name,
-            time=r.time,
-            voltage=r.voltage,
-            displacement=r.displacement + level * draw.standard_normal(r.n),
-        )
+        replace(r, displacement=r.displacement + level * draw.standard_normal(r.n))
         for r in records
         if r.displacement is not None
     ]
+
+
+def hidden_record(effect: str | None, seed: int, **how: Any) -> tuple[Truth, Record]:
+    """Return a record of an independent plant that hides an effect, and the truth behind it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "record_0.csv"
+        return make_record(effect, seed, path, **how), read_record(path)
+
+
+def played_again(
+    truth: Truth, seed: int, given: tuple[FloatArray, FloatArray] | None = None
+) -> Record:
+    """Return a further record of a device, under a drawn voltage or a given one."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"record_{seed}.csv"
+        play_again(truth, seed, path, given)
+        return read_record(path)

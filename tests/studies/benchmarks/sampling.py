@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 import psa_casadi as psa
 from psa_casadi.posterior.chains import chains_of, sampler_and_arviz
-from psa_casadi.posterior.task import Task, task_of
+from psa_casadi.posterior.task import Task
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread
+from tests.studies.benchmarks.posterior import task_for
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 FloatArray = npt.NDArray[np.float64]
@@ -61,7 +62,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
 
 def run_sized(progress: Progress, count: int) -> Outcome:
     """Return the tables for so many draws of PyMC."""
-    task = task_for(record())
+    task = task_for(record(), stack(), WIDTHS)
     progress("psa.sample's way")
     ours = drawn_by_psa(task, OURS, TUNE)
     progress("PyMC")
@@ -82,13 +83,6 @@ def record() -> psa.Record:
     clean = psa.simulate(stack(), times, applied, rtol=1e-8).displacement
     noise = NOISE * np.ptp(clean) * np.random.default_rng(SEED).standard_normal(SAMPLES)
     return psa.Record(name="triangles", time=times, voltage=applied, displacement=clean + noise)
-
-
-def task_for(given: psa.Record) -> Task:
-    """Return the posterior of the record as `psa.sample` sets it up."""
-    model = stack()
-    centre = {n: model.values[n] for n in WIDTHS}
-    return task_of(model, [given], free=tuple(WIDTHS), prior=centre, widths=WIDTHS)
 
 
 def drawn_by_psa(task: Task, draws: int, tune: int) -> Drawn:
@@ -191,16 +185,11 @@ def speed(found: list[Drawn]) -> TitledTable:
     each = [f.effective / f.seconds for f in found]
     rows = tuple(
         (
-            f.way,
-            str(len(f.theta)),
-            f"{f.gradients:.0f}",
-            number(1e3 * f.seconds / f.gradients),
-            f"{f.effective:.0f}",
-            number(f.seconds),
-            number(rate),
+            f.way, str(len(f.theta)), f"{f.gradients:.0f}", number(1e3 * f.seconds / f.gradients),
+            f"{f.effective:.0f}", number(f.seconds), number(rate),
         )
         for f, rate in zip(found, each, strict=True)
-    )
+    )  # fmt: skip
     head = (
         "way", "draws", "gradients", "a gradient [ms]", "smallest bulk ESS", "processor [s]",
         "ESS per second",
@@ -225,13 +214,7 @@ def _agreement(task: Task, ours: Drawn, theirs: Drawn) -> TitledTable:
         )
         error = float(np.hypot(one, other))
         gap = (np.mean(b) - np.mean(a)) / error
-        rows.append(
-            (
-                name,
-                f"{(np.mean(b) - np.mean(a)) / np.std(a):.2f}",
-                f"{gap:.1f}",
-                f"{np.std(b) / np.std(a):.2f}",
-            )
-        )
+        moved = f"{(np.mean(b) - np.mean(a)) / np.std(a):.2f}"
+        rows.append((name, moved, f"{gap:.1f}", f"{np.std(b) / np.std(a):.2f}"))
     head = ("unknown", "difference of means [sd]", "over its Monte Carlo error", "ratio of sd")
     return TitledTable("Do both posteriors agree?", Table(head, tuple(rows)), "")

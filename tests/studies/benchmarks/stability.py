@@ -4,16 +4,13 @@ Cases of the study, the records of the exam, and the measured micromanipulator.
 """
 
 import itertools
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from psa_casadi import datasets
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.records.record import Record
 from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.exam import read_back
@@ -33,27 +30,16 @@ _KINDS = ("known", "weak", "clean", "foreign", "left out", "two", "poor", "desig
 #: Rows of `docs/measured.md`, and the noise that a diagnosis tells of these records [m].
 MEASURED, _MEASURED_NOISE = ("sine_1hz", "minor_loops", "both files"), 67e-9
 
+#: A case of the study, a record of the exam, or a row of the measured ones.
+Source = Case | ExamRecord | str
 Said = tuple[str, frozenset[str], frozenset[str]]
 
 
 @dataclass(frozen=True)
-class Given:
-    """What is diagnosed: its kind, its name, where its records come from, and a seed.
-
-    The source of a measured row is the row's name.
-    """
+class Repeated:
+    """What was said of records of a kind, and of them with their data changed."""
 
     kind: str
-    name: str
-    source: Case | ExamRecord | str
-    seed: int
-
-
-@dataclass(frozen=True)
-class Repeated:
-    """What was said of records, and of them with their data changed."""
-
-    given: Given
     first: Said
     changed: tuple[Said, ...]
 
@@ -70,27 +56,22 @@ class Repeated:
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Diagnose everything as it is, then with white noise of 1 % of its own added."""
-    jobs = [(g, QUICK_DRAWS if quick else DRAWS) for g in _study(QUICK_CASES if quick else CASES)]
+    jobs: list[tuple[str, Source, int]] = [
+        (c.kind, c, QUICK_DRAWS if quick else DRAWS)
+        for c in chosen_cases(QUICK_CASES if quick else CASES)
+    ]
     exam = RECORDS[::QUICK_EXAM] if quick else RECORDS
-    jobs += [(g, 1 if quick else EXAM_DRAWS) for g in map(_of_exam, exam)]
+    jobs += [("exam", record, 1 if quick else EXAM_DRAWS) for record in exam]
     draws = QUICK_MEASURED_DRAWS if quick else MEASURED_DRAWS
-    jobs += [(Given("measured", row, row, k), draws) for k, row in enumerate(MEASURED)]
-    return Outcome((table(repeated(jobs, progress)),))
+    jobs += [("measured", row, draws) for row in MEASURED]
+    return Outcome([table(repeated(jobs, progress))])
 
 
-def repeated(jobs: Sequence[tuple[Given, int]], progress: Progress) -> list[Repeated]:
+def repeated(jobs: Sequence[tuple[str, Source, int]], progress: Progress) -> list[Repeated]:
     """Return what is said of records, and with their data changed so many times."""
-    draws = [(given, k) for given, n in jobs for k in range(n + 1)]
+    draws = [(source, k) for _, source, n in jobs for k in range(n + 1)]
     said = iter(on_all_cores(said_of, draws, lambda one: f"{one[0]} {', '.join(one[1])}", progress))
-    return [Repeated(g, next(said), tuple(itertools.islice(said, n))) for g, n in jobs]
-
-
-def _study(count: int) -> list[Given]:
-    return [Given(c.kind, c.effect or "nothing", c, c.seed) for c in chosen_cases(count)]
-
-
-def _of_exam(record: ExamRecord) -> Given:
-    return Given("exam", record.name, record, record.seed)
+    return [Repeated(kind, next(said), tuple(itertools.islice(said, n))) for kind, _, n in jobs]
 
 
 def chosen_cases(count: int) -> list[Case]:
@@ -102,56 +83,53 @@ def chosen_cases(count: int) -> list[Case]:
     return [own[k] for k in range(each) for own in spread][:count]
 
 
-def said_of(given: Given, draw: int) -> Said:
+def said_of(source: Source, draw: int) -> Said:
     """Return verdict, names, and the whole set, of records with their data changed; draw 0 is not.
 
     Readings are changed by white noise of `CHANGE` times the rms of their own.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        noise, records = _records(given, Path(folder))
-    rng = np.random.default_rng([given.seed, draw])
+    noise, records = _records(source)
+    seed = MEASURED.index(source) if isinstance(source, str) else source.seed
+    rng = np.random.default_rng([seed, draw])
     size = CHANGE * noise if draw else 0.0
     changed = [
         replace(r, displacement=r.displacement + size * rng.standard_normal(r.n))
         for r in records
         if r.displacement is not None
     ]
-    return _said(diagnose(changed))
-
-
-def _records(given: Given, folder: Path) -> tuple[float, Sequence[Record]]:
-    """Return the rms of the noise of the readings [m], and the records."""
-    if isinstance(given.source, Case):
-        truth, records = records_of(given.source, folder)
-        return truth.sigma, records
-    if isinstance(given.source, ExamRecord):
-        record = read_back(given.source, folder)
-        return 1e-2 * given.source.test.noise * record.range_m, [record]
-    sine, loops = datasets.micromanipulator()
-    rows = dict(zip(MEASURED, ([sine], [loops], [sine, loops]), strict=True))
-    return _MEASURED_NOISE, rows[given.source]
-
-
-def _said(d: Diagnosis) -> Said:
+    d = diagnose(changed)
     named, within = names_of(d)
     return d.verdict, frozenset(named), frozenset(within)
+
+
+def _records(source: Source) -> tuple[float, Sequence[Record]]:
+    """Return the rms of the noise of the readings [m], and the records."""
+    if isinstance(source, Case):
+        truth, records = records_of(source)
+        return truth.sigma, records
+    if isinstance(source, ExamRecord):
+        record = read_back(source)
+        return 1e-2 * source.test.noise * record.range_m, [record]
+    sine, loops = datasets.micromanipulator()
+    rows = dict(zip(MEASURED, ([sine], [loops], [sine, loops]), strict=True))
+    return _MEASURED_NOISE, rows[source]
+
+
+_SAME = ("same_verdict", "same_set")
 
 
 def table(found: Sequence[Repeated]) -> TitledTable:
     """Return how often verdict and names stayed, by kind of case."""
     rows = []
-    for kind in (*dict.fromkeys(r.given.kind for r in found), "all"):
-        own = [r for r in found if kind in (r.given.kind, "all")]
+    for kind in (*dict.fromkeys(r.kind for r in found), "all"):
+        own = [r for r in found if kind in (r.kind, "all")]
         draws = sum(len(r.changed) for r in own)
-        rows.append(
-            (
-                kind,
-                f"{len(own)}",
-                share(sum(r.same_verdict for r in own), draws),
-                share(sum(r.same_set for r in own), draws),
-                f"{sum(r.same_verdict == len(r.changed) for r in own)}",
-            )
+        same = (
+            share(sum(counts), draws)
+            for counts in zip(*((r.same_verdict, r.same_set) for r in own), strict=True)
         )
+        unchanged = sum(r.same_verdict == len(r.changed) for r in own)
+        rows.append((kind, f"{len(own)}", *same, f"{unchanged}"))
     head = ("cases", "number", "same verdict and names", "same verdict, names in the set",
             "cases without a change")  # fmt: skip
     return TitledTable(

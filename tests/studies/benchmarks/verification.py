@@ -231,9 +231,9 @@ def plant_response(
     if plant == "reciprocal":
         return two_masses(p, time, voltage, load)
     v, f = (reference.from_samples(time, x) for x in (voltage, load))
-    kind = "cascade" if plant == "cascade" else "single_mass"
     return reference.simulate(
-        p, v, time, load_force=f, breakpoints=[float(time[1])], mechanics=kind,
+        p, v, time, load_force=f, breakpoints=[float(time[1])],
+        mechanics="cascade" if plant == "cascade" else "single_mass",
         rtol=_FINE_RTOL,
     ).displacement  # fmt: skip
 

@@ -97,50 +97,55 @@ rows;
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Return the tables of sizes, redraw times and errors."""
-    names = list(_MODELS)[:2] if quick else list(_MODELS)
     sizes, times, errors = [], [], []
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as ends:
-        browser = find_browser(Path(folder))
+    with tempfile.TemporaryDirectory() as place, ExitStack() as ends:
+        folder = Path(place)
+        browser, page = find_browser(folder), folder / "page.html"
         tab = ends.enter_context(steered(browser))  # its clock is the machine's
-        for name in names:
+
+        def redrawn(what: str, n: int, text: str, value: float) -> float:
+            """Drag a slider of a page; return the size of the page [kB]."""
+            page.write_text(text, encoding="utf-8")
+            drag = _DRAG.format(times=6 if quick else 25, value=value)
+            rows = _dragged(tab, page, drag)[2:]  # the browser compiles during the first
+            ran, whole = np.array(rows).T
+            shown = (ran.min(), whole.min(), np.median(whole))
+            times.append((what, str(n), *(number(float(x), 2) for x in shown)))
+            return page.stat().st_size / 1e3
+
+        for name in list(_MODELS)[: 2 if quick else None]:
             progress(name)
-            model = _model(_MODELS[name])
-            sizes.append(_size(name, model, Path(folder)))
-            for n in (1000, SAMPLES):
-                page = Path(folder) / "page.html"
-                page.write_text(_page(model, n), encoding="utf-8")
-                drag = _DRAG.format(times=6 if quick else 25, value=model.values["k_L"])
-                times.append(_times(name, n, _dragged(tab, page, drag)))
-            errors.append(_error(name, model, browser))
+            model, began = _model(_MODELS[name]), time.perf_counter()
+            module = web_module(model)
+            spent, value = time.perf_counter() - began, model.values["k_L"]
+            redrawn(name, 1000, _page(model, 1000), value)
+            kb = redrawn(name, SAMPLES, _page(model, SAMPLES), value)
+            small = (len(module) / 1e3, len(gzip.compress(module, 9)) / 1e3)
+            sizes.append((name, *map(number, (*small, kb)), number(spent, 2)))
+            errors.append((name, *_errors(model, browser)))
         progress("playground")
-        whole_page = Path(folder) / "playground.html"
-        whole_page.write_text(playground(), encoding="utf-8")
-        drag = _DRAG.format(times=6 if quick else 25, value=7.3)
-        times.append(_times("playground", 2000, _dragged(tab, whole_page, drag)))
-        sizes.append(("playground", "", "", number(whole_page.stat().st_size / 1e3), ""))
-    return Outcome(
-        (
-            TitledTable(
-                "Sizes",
-                Table(("model", "module [kB]", "gzip [kB]", "page [kB]", "compiled in [s]"),
-                      tuple(sizes)),
-                f"A page of {SAMPLES} samples; plotly is 1,960 kB of it. What was compiled before"
-                " is taken from the cache.",
-            ),
-            TitledTable(
-                "Redraws while a slider moves",
-                Table(("model", "samples", "model, least [ms]", "all, least [ms]",
-                       "all, median [ms]"), tuple(times)),
-                f"Asked at {SAMPLES} samples: below {ALLOWED:g} ms on two cores.",
-            ),
-            TitledTable(
-                "Error over the range",
-                Table(("model", "one run", "as psa.simulate, against it"), tuple(errors)),
-                "One run is what a slider shows; its error is against a tolerance of 1e-8.",
-            ),
+        kb = redrawn("playground", 2000, playground(), 7.3)
+        sizes.append(("playground", "", "", number(kb), ""))
+    return Outcome((
+        TitledTable(
+            "Sizes",
+            Table(("model", "module [kB]", "gzip [kB]", "page [kB]", "compiled in [s]"),
+                  tuple(sizes)),
+            f"A page of {SAMPLES} samples; plotly is 1,960 kB of it. What was compiled before"
+            " is taken from the cache.",
         ),
-        lambda: strip(_page(_as_fitted(_model(_STRIP)), 2000)),
-    )  # fmt: skip
+        TitledTable(
+            "Redraws while a slider moves",
+            Table(("model", "samples", "model, least [ms]", "all, least [ms]",
+                   "all, median [ms]"), tuple(times)),
+            f"Asked at {SAMPLES} samples: below {ALLOWED:g} ms on two cores.",
+        ),
+        TitledTable(
+            "Error over the range",
+            Table(("model", "one run", "as psa.simulate, against it"), tuple(errors)),
+            "One run is what a slider shows; its error is against a tolerance of 1e-8.",
+        ),
+    ), _strip_as_fitted)  # fmt: skip
 
 
 def _dragged(tab: Steered, page: Path, drag: str) -> Sequence[Sequence[float]]:
@@ -181,37 +186,19 @@ def _page(model: Model, n: int) -> str:
     return render("design.html", title, live=live, summary=(), still=None, figures=(), tables=())
 
 
-def _as_fitted(model: Model) -> Model:
-    """Return the model as a fit leaves it: some values are free, each with an interval."""
+def _strip_as_fitted() -> Figure:
+    """Return the strip of a page as a fit leaves it: some values are free, with intervals."""
+    model = _model(_STRIP)
     free = ("k_L", "A", "beta", "tau", *(c.gain or "" for c in model.effects))
     sure = {n: Interval(*sorted((0.9 * model.values[n], 1.1 * model.values[n]))) for n in free}
-    return model.with_values({}, provenance=Provenance(free=free, intervals=sure))
+    fitted = model.with_values({}, provenance=Provenance(free=free, intervals=sure))
+    return strip(_page(fitted, 2000))
 
 
-def _size(name: str, model: Model, folder: Path) -> tuple[str, ...]:
-    began = time.perf_counter()
-    module = web_module(model)
-    spent = time.perf_counter() - began
-    page = folder / "size.html"
-    page.write_text(_page(model, SAMPLES), encoding="utf-8")
-    sizes = (len(module), len(gzip.compress(module, 9)), page.stat().st_size)
-    return (name, *(number(s / 1e3) for s in sizes), number(spent, 2))
-
-
-def _times(name: str, n: int, rows: Sequence[Sequence[float]]) -> tuple[str, ...]:
-    ran, all_of_it = np.array(rows[2:]).T  # the browser compiles in earnest during the first
-    shown = (ran.min(), all_of_it.min(), float(np.median(all_of_it)))
-    return (name, str(n), *(number(float(x), 2) for x in shown))
-
-
-def _error(name: str, model: Model, browser: Browser) -> tuple[str, ...]:
+def _errors(model: Model, browser: Browser) -> list[str]:
     t, v = _voltage(600)
-    quick_one, full = run_in_browser(
-        browser, model, [case(model, t, v, quick=True, rtol=None), case(model, t, v)]
-    )
-    here, tight = (simulate(model, t, v, rtol=r).displacement for r in (1e-6, 1e-8))
-    errors = [
-        float(np.max(np.abs(a - b)) / np.ptp(b))
-        for a, b in ((quick_one["shown"], tight), (full["shown"], here))
-    ]
-    return (name, *(f"{e:.1e}" for e in errors))
+    asked = [case(model, t, v, quick=True, rtol=None), case(model, t, v)]
+    found = run_in_browser(browser, model, asked)
+    here = (simulate(model, t, v, rtol=r).displacement for r in (1e-8, 1e-6))
+    pairs = [(f["shown"], x) for f, x in zip(found, here, strict=True)]
+    return [f"{float(np.max(np.abs(a - b)) / np.ptp(b)):.1e}" for a, b in pairs]

@@ -1,18 +1,15 @@
 """Causes in the sensor and around it, and the noise: from displacement to reading [um]."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import fftconvolve, lfilter
 
-from tests.studies.exam.record import Floats, Record, Run, Values, filtered, lagged, resonant
+from tests.studies.exam.record import Floats, Record, Run, Values, filtered, lagged, named, resonant
 from tests.studies.exam.voltages import triangle
 
-DriveCause = Callable[[Floats, Run, Values], Floats]
 
-
-def _gain(command: Floats, run: Run, values: Values) -> Floats:
+def _amplifier_gain(command: Floats, run: Run, values: Values) -> Floats:
     """v + a_2 v^2/V + a_3 v^3/V^2, V the largest voltage."""
     largest = run.record.test.largest
     return command + values[0] * command**2 / largest + values[1] * command**3 / largest**2
@@ -23,7 +20,7 @@ def _dead_time(command: Floats, run: Run, values: Values) -> Floats:
     return np.interp(run.times - values[0], run.times, command)
 
 
-def _lag(command: Floats, run: Run, values: Values) -> Floats:
+def _amplifier_lag(command: Floats, run: Run, values: Values) -> Floats:
     """Second order: frequency [Hz] and damping."""
     return resonant(command, values[0], values[1], run.step)
 
@@ -77,24 +74,16 @@ def _current_limit(command: Floats, run: Run, values: Values) -> Floats:
 
 
 #: Causes of the amplifier, in the order of the signal.
-AMPLIFIER: dict[str, DriveCause] = {
-    "amplifier gain": _gain,
-    "dead time": _dead_time,
-    "amplifier lag": _lag,
-    "output limit": _output_limit,
-    "slew limit": _slew_limit,
-    "controller": _controller,
-}
+AMPLIFIER = named(
+    _amplifier_gain, _dead_time, _amplifier_lag, _output_limit, _slew_limit, _controller
+)
 #: Causes of the stack's electrical side.
 ELECTRICAL = ("current limit", "leakage")
 
 
 def amplified(command: Floats, run: Run) -> Floats:
     """Return the amplifier's output."""
-    for name, cause in AMPLIFIER.items():
-        if name in run.record.hidden:
-            command = cause(command, run, run.record.hidden[name])
-    return command
+    return run.changed(AMPLIFIER, command)
 
 
 def stack_voltage(output: Floats, run: Run) -> Floats:
@@ -110,10 +99,7 @@ def stack_voltage(output: Floats, run: Run) -> Floats:
     return u
 
 
-StrainCause = Callable[[Floats, Floats, Run, Values], Floats]
-
-
-def _saturation(strain: Floats, voltage: Floats, run: Run, values: Values) -> Floats:
+def _strain_saturation(strain: Floats, voltage: Floats, run: Run, values: Values) -> Floats:
     """Langevin's function q (coth z - 1/z), z = 3 g/q. Source: P. Langevin, 1905."""
     limit = values[0] * run.record.test.largest
     z = 3 * strain / limit
@@ -143,7 +129,7 @@ def _ageing(strain: Floats, voltage: Floats, run: Run, values: Values) -> Floats
     return strain * (1 - values[0] * np.log10(1 + way / (2 * run.record.test.span)))
 
 
-def _heating(strain: Floats, voltage: Floats, run: Run, values: Values) -> Floats:
+def _self_heating(strain: Floats, voltage: Floats, run: Run, values: Values) -> Floats:
     """A gain that follows the power u'^2 with a time constant [s]."""
     gain, time = values
     test = run.record.test
@@ -176,37 +162,21 @@ def _after_changes(strain: Floats, response: Floats) -> Floats:
 
 
 #: Causes that follow the hysteresis at once, and those behind the lag of the strain.
-AT_ONCE: dict[str, StrainCause] = {
-    "strain saturation": _saturation,
-    "field gain": _field_gain,
-    "asymmetry": _asymmetry,
-    "ageing": _ageing,
-    "self-heating": _heating,
-    "temperature": _temperature,
-}
-CREEP: dict[str, StrainCause] = {"log creep": _log_creep, "power creep": _power_creep}
+AT_ONCE = named(_strain_saturation, _field_gain, _asymmetry, _ageing, _self_heating, _temperature)
+CREEP = named(_log_creep, _power_creep)
 
 
 def free_strain(hysteretic: Floats, voltage: Floats, run: Run) -> Floats:
     """Return the free strain of a stack, from what its hysteresis gives [V]."""
-    strain = _with(AT_ONCE, hysteretic, voltage, run)
+    strain = run.changed(AT_ONCE, hysteretic, voltage)
     lag = run.record.stack.strain_lag
-    return _with(CREEP, lagged(strain, lag, run.step) if lag else strain, voltage, run)
-
-
-def _with(causes: dict[str, StrainCause], strain: Floats, voltage: Floats, run: Run) -> Floats:
-    for name, cause in causes.items():
-        if name in run.record.hidden:
-            strain = cause(strain, voltage, run, run.record.hidden[name])
-    return strain
+    strain = lagged(strain, lag, run.step) if lag else strain
+    return run.changed(CREEP, strain, voltage)
 
 
 def temperature(run: Run) -> Floats:
     """Return the temperature of the stack [degC]."""
     return 22 + 3 * np.sin(2 * math.pi * 0.8 * run.share + 1) + 1.5 * run.share
-
-
-MotionCause = Callable[[Floats, Run, Values], Floats]
 
 
 def displacement(strain: Floats, run: Run) -> Floats:
@@ -217,10 +187,7 @@ def displacement(strain: Floats, run: Run) -> Floats:
         frequency, damping, share = modes
         moved = moved + share * resonant(strain, frequency, damping, run.step)
     moved = moved * run.record.stack.stroke / run.record.test.span
-    for name, cause in MOTION.items():
-        if name in run.record.hidden:
-            moved = cause(moved, run, run.record.hidden[name])
-    return moved
+    return run.changed(MOTION, moved)
 
 
 def _vibrating(strain: Floats, run: Run) -> Floats:
@@ -334,18 +301,9 @@ def _stick_slip(x: Floats, run: Run, values: Values) -> Floats:
 
 
 #: Causes that change the displacement [um], in the order of the signal.
-MOTION: dict[str, MotionCause] = {
-    "stiffening load": _stiffening_load,
-    "contact": _contact,
-    "guide friction": _guide_friction,
-    "play": _play,
-    "stick-slip": _stick_slip,
-}
+MOTION = named(_stiffening_load, _contact, _guide_friction, _play, _stick_slip)
 #: Causes within the masses.
 MASSES = ("mode", "reciprocal masses", "amplitude damping")
-
-
-ReadingCause = Callable[[Floats, Run, Values], Floats]
 
 
 def _clock(y: Floats, run: Run, values: Values) -> Floats:
@@ -358,7 +316,7 @@ def _delay(y: Floats, run: Run, values: Values) -> Floats:
     return np.interp(run.times - values[0], run.times, y)
 
 
-def _lag_sensor(y: Floats, run: Run, values: Values) -> Floats:
+def _sensor_lag(y: Floats, run: Run, values: Values) -> Floats:
     """First order, of a time constant [s]."""
     return lagged(y, values[0], run.step)
 
@@ -401,7 +359,7 @@ def _hum(y: Floats, run: Run, values: Values) -> Floats:
     return y
 
 
-def _vibration(y: Floats, run: Run, values: Values) -> Floats:
+def _floor_vibration(y: Floats, run: Run, values: Values) -> Floats:
     """A floor that vibrates: noise through a resonance of frequency [Hz] and damping; its rms."""
     frequency, damping, size = values
     noise = run.record.draws(6).standard_normal(y.size)
@@ -409,7 +367,7 @@ def _vibration(y: Floats, run: Run, values: Values) -> Floats:
     return y + size * run.record.stack.stroke / float(floor.std()) * floor
 
 
-def _bursts(y: Floats, run: Run, values: Values) -> Floats:
+def _interference(y: Floats, run: Run, values: Values) -> Floats:
     """Short bursts of interference at random instants: size and number."""
     size, count = values
     length = run.times[-1]
@@ -428,30 +386,27 @@ def _second_device(y: Floats, run: Run, values: Values) -> Floats:
 
 
 #: Causes that change the reading [um], in the order of the signal; sizes are shares of the stroke.
-READING: dict[str, ReadingCause] = {
-    "clock": _clock,
-    "delay": _delay,
-    "sensor lag": _lag_sensor,
-    "bend": _bend,
-    "ripple": _ripple,
-    "drift": _drift,
-    "gain drift": _gain_drift,
-    "offset step": _offset_step,
-    "hum": _hum,
-    "floor vibration": _vibration,
-    "interference": _bursts,
-    "second device": _second_device,
-}
+READING = named(
+    _clock,
+    _delay,
+    _sensor_lag,
+    _bend,
+    _ripple,
+    _drift,
+    _gain_drift,
+    _offset_step,
+    _hum,
+    _floor_vibration,
+    _interference,
+    _second_device,
+)
 #: Step of the reading, as a share of the noise's rms.
 QUANTUM = 0.2
 
 
 def reading(displacement: Floats, run: Run) -> Floats:
     """Return what the sensor reads of a displacement, without noise."""
-    for name, cause in READING.items():
-        if name in run.record.hidden:
-            displacement = cause(displacement, run, run.record.hidden[name])
-    return displacement
+    return run.changed(READING, displacement)
 
 
 def with_noise(clean: Floats, record: Record) -> Floats:

@@ -1,7 +1,7 @@
 """What defines a record of the exam: stack, voltage, what is hidden, and which names are right."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -11,6 +11,8 @@ from scipy.signal import cont2discrete, lfilter
 
 Floats = NDArray[np.float64]
 Values = tuple[float, ...]
+#: Changes a signal: (signal, further signals, the run, the values of the cause).
+Cause = Callable[..., Floats]
 HysteresisKind = Literal[
     "Bouc-Wen", "Preisach", "relays", "Prandtl-Ishlinskii", "Coleman-Hodgdon", "Duhem"
 ]
@@ -105,6 +107,18 @@ class Run:
     def share(self) -> Floats:
         """Times as shares of the record's length."""
         return np.asarray(self.times / self.times[-1])
+
+    def changed(self, causes: Mapping[str, Cause], signal: Floats, *more: Floats) -> Floats:
+        """Return a signal changed by those of the causes that the record hides, in their order."""
+        for name, cause in causes.items():
+            if name in self.record.hidden:
+                signal = cause(signal, *more, self, self.record.hidden[name])
+        return signal
+
+
+def named(*causes: Cause) -> dict[str, Cause]:
+    """Return causes by the names that records have for them: those of their functions."""
+    return {cause.__name__.strip("_").replace("_", " "): cause for cause in causes}
 
 
 def filtered(

@@ -32,7 +32,7 @@ k03 guide that sticks (Dahl) | Bouc-Wen 50 | decaying sine 2 400 4000 -100 100 0
     | guide friction 0.02 0.05 | backlash, hysteresis_memory
 k04 backlash | Bouc-Wen 20 | triangles 5 1000 4000 0 100 0.15 | play 0.006 | backlash
 k05 self-heating | Bouc-Wen 32 | bursts 30 600 7200 0 100 0.15 steps=10
-    | self-heating 0.16 1.3 | self_heating
+    | self heating 0.16 1.3 | self_heating
 k06 charge leakage | Bouc-Wen 40 | staircase 1.5 300 4500 0 100 0.15 | leakage 50 | charge_leakage
 k07 slew limit | Bouc-Wen 15 lag=0.0003 mechanics=3100,0.12,9000,0.1
     | steps 60 20000 4000 0 100 0.3 steps=10 | slew limit 200000 | current_limit
@@ -101,7 +101,7 @@ t06 log creep + preload | Bouc-Wen 32 | staircase 1 200 5000 0 100 0.12
     | log creep 0.012 0.05; contact 0.05 0.5 0.01 | slow_creep; preload_loss
 f01 amplitude-dependent damping | Bouc-Wen 15 lag=0.0001 mechanics=1600,0.01,9000,0.05
     | steps 80 30000 6000 0 100 0.2 | amplitude damping 0.8
-f02 stick-slip bursts | Bouc-Wen 40 | triangles 3 600 5000 0 120 0.1 | stick-slip 0.004 14
+f02 stick-slip bursts | Bouc-Wen 40 | triangles 3 600 5000 0 120 0.1 | stick slip 0.004 14
 f03 sensor gain drifts | Bouc-Wen 45 | decaying sine 2 300 4500 -100 100 0.12
     | gain drift 0.07 | ageing
 f04 bursts of interference | Bouc-Wen 20 | triangle 4 1000 5000 0 100 0.1 | interference 0.012 25

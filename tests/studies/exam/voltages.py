@@ -62,18 +62,6 @@ def triangle(phase: Floats) -> Floats:
     return np.asarray(2 / math.pi * np.arcsin(np.sin(2 * math.pi * phase)))
 
 
-def _decay(w: Window) -> Floats:
-    return w.middle + w.half * np.exp(-2.2 * w.share) * w.sine
-
-
-def _grow(w: Window) -> Floats:
-    return w.middle + w.half * (0.15 + 0.85 * np.minimum(1, w.share * 1.1)) * w.sine
-
-
-def _triangle(w: Window) -> Floats:
-    return w.middle + w.half * triangle(w.frequency * w.times - 0.25)
-
-
 def _triangles(w: Window) -> Floats:
     """Eight amplitudes in turn, from the lowest voltage."""
     cycle = np.floor(w.frequency * w.times).astype(np.intp) % 8
@@ -132,14 +120,6 @@ def _swept_phase(w: Window, ratio: float) -> Floats:
     return np.asarray(2 * math.pi * cycles)
 
 
-def _sweep(w: Window) -> Floats:
-    return w.middle + 0.95 * w.half * np.sin(_swept_phase(w, 60))
-
-
-def _sweep_from_lowest(w: Window) -> Floats:
-    return w.middle - w.half * np.cos(_swept_phase(w, 40))
-
-
 def _random_reversals(w: Window) -> Floats:
     """Straight lines between random voltages at random times."""
     count = max(8, int(w.frequency * w.times[-1]))
@@ -182,15 +162,17 @@ def _steps(w: Window) -> Floats:
 
 
 VOLTAGES: dict[str, Callable[[Window], Floats]] = {
-    "decaying sine": _decay,
-    "growing sine": _grow,
-    "triangle": _triangle,
+    "decaying sine": lambda w: w.middle + w.half * np.exp(-2.2 * w.share) * w.sine,
+    "growing sine": lambda w: (
+        w.middle + w.half * (0.15 + 0.85 * np.minimum(1, w.share * 1.1)) * w.sine
+    ),
+    "triangle": lambda w: w.middle + w.half * triangle(w.frequency * w.times - 0.25),
     "triangles": _triangles,
     "staircase": _stair,
     "multisine": _multisine,
     "reversal curves": _reversals,
-    "sweep": _sweep,
-    "sweep from lowest": _sweep_from_lowest,
+    "sweep": lambda w: w.middle + 0.95 * w.half * np.sin(_swept_phase(w, 60)),
+    "sweep from lowest": lambda w: w.middle - w.half * np.cos(_swept_phase(w, 40)),
     "random reversals": _random_reversals,
     "rates": _rates,
     "bursts": _bursts,

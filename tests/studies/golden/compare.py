@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from tests.studies.golden.cases import CASES, Row
@@ -38,18 +38,12 @@ def keep(rows: Mapping[str, Row]) -> None:
     ANSWERS.mkdir(exist_ok=True)
     for kind in dict.fromkeys(case.kind for case in CASES.values()):
         own = [c for c in CASES.values() if c.kind == kind and c.id in every]
-        lines = ["\t".join(("case", "hidden", *_head(every[c.id]))) for c in own[:1]]
-        lines += ["\t".join((c.name, c.hidden, *_cells(every[c.id]))) for c in own]
-        if lines:
-            (ANSWERS / f"{kind}.tsv").write_text("\n".join(lines) + "\n", "utf-8")
-
-
-def _head(row: Row) -> list[str]:
-    return [n for n in row if n != "hidden"]
-
-
-def _cells(row: Row) -> list[str]:
-    return [row[n] for n in _head(row)]
+        names = [n for n in every[own[0].id] if n != "hidden"] if own else []
+        table = [("case", "hidden", *names)]
+        table += [(c.name, c.hidden, *(every[c.id][n] for n in names)) for c in own]
+        if own:
+            text = "\n".join("\t".join(row) for row in table) + "\n"
+            (ANSWERS / f"{kind}.tsv").write_text(text, "utf-8")
 
 
 def changes(before: Row, now: Row) -> list[tuple[str, str, str]]:
@@ -106,27 +100,19 @@ def table(
 def totals(before: Mapping[str, Row], now: Mapping[str, Row]) -> list[tuple[str, str, str, str]]:
     """Return right marks by kind, processor time, and held-out errors, of the same cases."""
     both = [case for case in now if case in before]
-    lines = []
+    errors = [c for c in both if "extended" in now[c] and "extended" in before[c]]
+
+    def line(what: str, cases: list[str], name: str, told: Callable[[list[Row]], str]) -> None:
+        if cases:
+            old, new = (told([rows[c] for c in cases]) for rows in (before, now))
+            lines.append((f"{what}, {len(cases)} cases", name, old, new))
+
+    lines: list[tuple[str, str, str, str]] = []
     for kind in dict.fromkeys(case.split("/")[0] for case in both):
         own = [c for c in both if c.startswith(kind) and now[c].get("mark", "-") != "-"]
-        if own:
-            old, new = (_right(rows[c] for c in own) for rows in (before, now))
-            lines.append((f"{kind}, {len(own)} cases", "right", old, new))
-    times = (sum(float(rows[c][SECONDS]) for c in both) for rows in (before, now))
-    old, new = (f"{seconds:.0f} s" for seconds in times)
-    lines.append((f"all, {len(both)} cases", "processor time", old, new))
-    errors = [c for c in both if "extended" in now[c] and "extended" in before[c]]
-    if errors:
-        ratios = (_error_ratio(rows[c] for c in errors) for rows in (before, now))
-        old_ratio, new_ratio = (f"{ratio:.4f}" for ratio in ratios)
-        lines.append(
-            (
-                f"all, {len(errors)} cases",
-                "held-out error, extended over base",
-                old_ratio,
-                new_ratio,
-            )
-        )
+        line(kind, own, "right", _right)
+    line("all", both, "processor time", lambda r: f"{sum(float(x[SECONDS]) for x in r):.0f} s")
+    line("all", errors, "held-out error, extended over base", lambda r: f"{_error_ratio(r):.4f}")
     return lines
 
 

@@ -22,6 +22,7 @@ WEAK = 0.02
 """Where a ratio is asked for, gains go down to this share of the smallest that is plausible: that
 one is worth noticing, a weaker one is no less possible.
 """
+
 ATTEMPTS, ENOUGH = 4, 1.25
 """Base fits for an effect that asks for them, and the factor within which they stop."""
 
@@ -72,25 +73,21 @@ def hide(
         added = hidden.contribution(run, parameters, gain)
         shown = visible_ratio(directions, added, noise_rms)
         return Hidden(hidden, gain, parameters, shown, gain_limited=False, added=added)
-    wanted = strength * float(rng.uniform(*RATIO)) if visible is None else _draw(rng, visible)
+    if isinstance(visible, tuple):
+        low, high = visible
+        wanted = math.exp(float(rng.uniform(math.log(low), math.log(high))))
+    else:
+        wanted = strength * float(rng.uniform(*RATIO)) if visible is None else float(visible)
     weakest = hidden.plausible[0] * (1.0 if visible is None else WEAK)
-    gain, limited = find_gain(
-        hidden, run, parameters, directions, wanted * noise_rms, (weakest, hidden.plausible[1])
-    )
-    if hidden.refit and gain > 0.0:
+    gains = (weakest, hidden.plausible[1])
+    gain, limited = find_gain(hidden, run, parameters, directions, wanted * noise_rms, gains)
+    refit = hidden.refit and gain > 0.0
+    if refit:
         gain, reached = refit_gain(hidden, run, parameters, gain, wanted, noise_rms)
         limited = abs(math.log(reached / wanted)) > math.log(ENOUGH)
     added = hidden.contribution(run, parameters, gain)
-    if not hidden.refit or gain == 0.0:
-        reached = visible_ratio(directions, added, noise_rms)
-    return Hidden(hidden, gain, parameters, reached, limited, added)
-
-
-def _draw(rng: np.random.Generator, visible: Visible) -> float:
-    if isinstance(visible, tuple):
-        low, high = visible
-        return math.exp(float(rng.uniform(math.log(low), math.log(high))))
-    return float(visible)
+    shown = reached if refit else visible_ratio(directions, added, noise_rms)
+    return Hidden(hidden, gain, parameters, shown, limited, added)
 
 
 def find_gain(
@@ -165,7 +162,8 @@ def added_by(run: Run, effects: Sequence[Effect]) -> FloatArray:
     the samples an effect of stack or sensor is a cubic spline.
     """
     total = np.zeros_like(run.times)
-    for effect, parameters, gain in sorted(effects, key=lambda e: _place(e[0])):
+    order = sorted(effects, key=lambda e: (e[0].driven is None, e[0].of_sensor))
+    for effect, parameters, gain in order:
         own = effect.contribution(run, parameters, gain)
         total = total + own
         if effect.driven is not None:
@@ -174,7 +172,3 @@ def added_by(run: Run, effects: Sequence[Effect]) -> FloatArray:
         between = CubicSpline(run.times, own)(run.path.time)
         run = replace(run, fine_displacement=run.fine_displacement + between)
     return total
-
-
-def _place(effect: HiddenEffect) -> int:
-    return 0 if effect.driven is not None else 2 if effect.of_sensor else 1

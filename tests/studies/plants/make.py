@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from tests.studies.plants.base import Run, simulate_base
+from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind, draw_excitation
 from tests.studies.plants.hide import Hidden, Visible, added_by, effect_called, hide
 from tests.studies.plants.noise import NOISES, Noise, NoiseKind, disturb, draw_noise
@@ -83,67 +83,39 @@ def make_record(
     for value, known in ((noise, NOISES), (excitation, EXCITATIONS)):
         if value not in known:
             raise KeyError(f"There is no {value!r}; there are {', '.join(known)}.")
-    chosen = None if effect is None else effect_called(effect)
     further = [effect_called(name) for name in more]
-    base_rng, effect_rng, noise_rng, *more_rng = (
-        np.random.default_rng(child)
-        for child in np.random.SeedSequence(seed).spawn(3 + len(further))
-    )
+    chosen = None if effect is None else effect_called(effect)
+    seeds = np.random.SeedSequence(seed).spawn(3 + len(further))
+    base_rng, effect_rng, noise_rng, *more_rng = (np.random.default_rng(s) for s in seeds)
     stack = draw_stack(base_rng)
     run = simulate_base(stack, *draw_excitation(base_rng, excitation, stack.u_rated))
     kind = draw_noise(noise_rng, noise, float(np.ptp(run.displacement)))
     bare = chosen is None and not further
     directions = np.empty((run.times.size, 0)) if bare else base_directions(run)
-    first = (
-        None
-        if chosen is None
-        else hide(chosen, run, effect_rng, directions, kind.rms, strength, visible, gain)
-    )
+    first = [
+        hide(one, run, effect_rng, directions, kind.rms, strength, visible, gain)
+        for one in (chosen,)
+        if one is not None
+    ]
     others = tuple(
         hide(one, run, rng, directions, kind.rms, 1.0, more_visible)
         for one, rng in zip(further, more_rng, strict=True)
     )
-    every = [found for found in (first, *others) if found is not None]
-    clean = run.displacement + added_by(run, [(h.effect, h.parameters, h.gain) for h in every])
+    every = [(h.effect, h.parameters, h.gain) for h in (*first, *others)]
+    clean = run.displacement + added_by(run, every)
     read, lost = disturb(noise_rng, kind, clean)
-    truth = _truth(run, clean, kind, lost, excitation, first, others)
-    write_csv(path, run.times, run.command, read, truth.temperature)
-    return truth
-
-
-def _truth(
-    run: Run,
-    clean: FloatArray,
-    noise: Noise,
-    lost: npt.NDArray[np.bool_],
-    excitation: ExcitationKind,
-    first: Hidden | None,
-    more: tuple[Hidden, ...],
-) -> Truth:
     temperature = None
-    for found in (first, *more):
-        if found is not None and found.effect.room is not None:
-            temperature = found.effect.room(run.times, found.parameters)
+    for one, parameters, _ in every:
+        if one.room is not None:
+            temperature = one.room(run.times, parameters)
+    write_csv(path, run.times, run.command, read, temperature)
+    shown = (first[0].gain, first[0].parameters) if first else (0.0, {})
+    visibility = (first[0].visible, first[0].gain_limited) if first else (0.0, False)
+    foreign = chosen is not None and chosen.foreign
     return Truth(
-        effect=None if first is None else first.effect.name,
-        foreign=first is not None and first.effect.foreign,
-        gain=0.0 if first is None else first.gain,
-        parameters={} if first is None else first.parameters,
-        stack=run.stack,
-        sigma=noise.rms,
-        quantum=noise.quantum,
-        visible=0.0 if first is None else first.visible,
-        gain_limited=first is not None and first.gain_limited,
-        times=run.times,
-        voltage=run.command,
-        displacement=clean,
-        base_displacement=run.displacement,
-        noise=noise,
-        lost=lost,
-        excitation=excitation,
-        temperature=temperature,
-        more=more,
-    )
+        effect, foreign, *shown, stack, kind.rms, kind.quantum, *visibility, run.times, run.command,
+        clean, run.displacement, kind, lost, excitation, temperature, others,
+    )  # fmt: skip
 
 
 def write_csv(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -66,10 +66,6 @@ class Stack:
         wafers = np.roots([self.m_p, self.c_p, self.k_p])
         layers = np.roots([self.m_b, self.c_b, self.k_b])
         return np.concatenate(([-1.0 / self.tau + 0j], wafers, layers)).astype(np.complex128)
-
-    def as_dict(self) -> dict[str, float]:
-        """All parameters by name."""
-        return {name: float(value) for name, value in asdict(self).items()}
 
 
 def draw_stack(rng: np.random.Generator) -> Stack:

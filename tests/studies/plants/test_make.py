@@ -8,7 +8,6 @@ import pytest
 from tests.studies.plants.base import first_order, follow, simulate_base
 from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind
 from tests.studies.plants.make import HEADER, THERMOMETER, make_record
-from tests.studies.plants.noise import coloured
 from tests.studies.plants.stack import FloatArray
 from tests.studies.plants.visibility import base_directions, refitted_ratio, visible_ratio
 from tests.tiers import slow, slow_but
@@ -16,14 +15,6 @@ from tests.tiers import slow, slow_but
 
 def column(path: Path, number: int) -> FloatArray:
     return np.genfromtxt(path, delimiter=",", skip_header=1)[:, number]
-
-
-def test_coloured_noise_keeps_its_size() -> None:
-    white = np.random.default_rng(1).standard_normal(100_000)
-    noise = coloured(white, 0.7)
-    assert np.std(noise) == pytest.approx(1.0, rel=0.02)
-    assert np.corrcoef(noise[1:], noise[:-1])[0, 1] == pytest.approx(0.7, abs=0.01)
-    assert noise[0] == white[0]
 
 
 def test_autoregressive_record(tmp_path: Path) -> None:
@@ -79,19 +70,6 @@ def test_every_voltage_starts_at_rest_and_stays_in_its_span(
     assert (np.array_equal(truth.voltage, rich.voltage)) == (kind == "rich")
 
 
-def test_poor_voltages_are_poor(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    poor: tuple[ExcitationKind, ...] = ("sine", "triangle")
-    for kind in poor:
-        wave = make_record(None, 3, path, excitation=kind).voltage
-        inner = wave[1:-1]
-        tops = inner[(inner >= wave[:-2]) & (inner > wave[2:])]
-        assert tops.size >= 3
-        assert np.ptp(tops) < 0.1 * wave.max()
-    levels = make_record(None, 3, path, excitation="steps").voltage
-    assert np.count_nonzero(np.diff(levels)) <= 21
-
-
 @pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "backlash"]))
 def test_visible_ratio_is_what_was_asked_for(effect: str, tmp_path: Path) -> None:
     truth = make_record(effect, 4, tmp_path / "a.csv", visible=0.4)
@@ -140,10 +118,3 @@ def test_a_pole_before_the_drive_vanishes_in_a_fit(tmp_path: Path) -> None:
     added = follow(run, late).displacement - run.displacement
     assert visible_ratio(base_directions(run), added, truth.sigma) > 1.0
     assert refitted_ratio(run, added, truth.sigma) < 0.5
-
-
-@pytest.mark.parametrize("option", [{"noise": "pink"}, {"excitation": "chirp"}])
-def test_unknown_options_are_named(option: dict[str, str], tmp_path: Path) -> None:
-    name = next(iter(option.values()))
-    with pytest.raises(KeyError, match=name):
-        make_record(None, 1, tmp_path / "a.csv", **option)  # type: ignore[arg-type]

@@ -3,10 +3,9 @@
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -16,12 +15,12 @@ from psa_casadi.errors import InputError
 from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.causes import score
 from tests.studies.benchmarks.causes.data import write
-from tests.studies.benchmarks.causes.methods import write_answer
+from tests.studies.benchmarks.causes.methods import by_psa, by_sindy, write_answer
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 SEED, CASES, QUICK = 20261126, 60, 10
-#: Who answers, and the module that does.
-METHODS = {"psa": "ours", "sindy": "peer"}
+#: Who answers.
+METHODS = {"psa": by_psa, "sindy": by_sindy}
 Which = Literal["psa", "sindy"]
 
 
@@ -47,17 +46,9 @@ def answer_all(
     names = sorted(p.name for p in (data / "cases").iterdir())
     todo = [n for n in names if not (answers / f"{n}.json").exists()]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        for content in pool.map(_answered, [(data, n, method) for n in todo]):
+        for content in pool.map(METHODS[method], [data] * len(todo), todo):
             write_answer(answers, content)
             progress(f"case {content['case']}: {content['causes'] or 'nothing named'}")
-
-
-def _answered(job: tuple[Path, str, str]) -> dict[str, Any]:
-    data, name, method = job
-    found: dict[str, Any] = import_module(
-        f"tests.studies.benchmarks.causes.{METHODS[method]}"
-    ).answered(data, name)
-    return found
 
 
 def write_command(

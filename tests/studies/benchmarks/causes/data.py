@@ -21,7 +21,15 @@ from psa_casadi.export.modelica.package import export_modelica
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.variables import Parameter
-from tests.studies.benchmarks.hidden_cases import NOISES, ORDINARY, REACHED, STRONG, WEAK, Case
+from tests.studies.benchmarks.hidden_cases import (
+    NOISES,
+    ORDINARY,
+    REACHED,
+    STRONG,
+    WEAK,
+    Case,
+    how_made,
+)
 from tests.studies.plants.again import play_again
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import draw_excitation
@@ -125,15 +133,7 @@ def _later(effect: str | None, steps: int) -> str | None:
 
 
 def _device(case: Case, folder: Path) -> Truth:
-    return make_record(
-        case.effect,
-        case.seed,
-        folder / "record.csv",
-        noise=case.noise,
-        visible=case.rho if case.effect else None,
-        more=case.more,
-        more_visible=case.rho if case.more else None,
-    )
+    return make_record(case.effect, case.seed, folder / "record.csv", **how_made(case))
 
 
 def _made(case: Case, truth: Truth, rho: float, folder: Path) -> Made:
