@@ -271,9 +271,11 @@ def read_records(
             problems.extend(error.problems)
     if failed == len(places) > 1:  # they may hold a channel each
         request = _request(wanted, "", sample_time, displacement=True, excitation=need_excitation)
+        outcome = None
         with suppress(InputError):
-            pair = joined([(p, *apart.text_of(p)) for p in places], request, alone=True)
-            return (_record("+".join(places), *pair),)
+            outcome = joined([(p, *apart.text_of(p)) for p in places], request, alone=True)
+        if outcome is not None:
+            return (_record("+".join(places), *outcome),)
     if not places:
         problems.append("no record was named; name at least one CSV file.")
     if problems:
