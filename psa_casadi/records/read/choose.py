@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -306,7 +307,10 @@ class Choice:
             return given or ""
         unit = own or given or (SI_UNITS.get(name) if source else None)
         check_unit(COLUMNS[name], unit, where, self.problems)
-        if own and given and not _same_unit(own, given):
+        with suppress(InputError):  # an unknown one was told already
+            units = {replace(parse_unit(u), name="", quantity="") for u in (own, given) if u}
+            if len(units) < 2:
+                return unit or ""
             self.problems.add(
                 f"{where}: the header gives the unit '{own}', --columns gives '{given}'; leave the"
                 f" one in --columns out, or say there what 1 in the file is, such as 10{given}."
@@ -398,11 +402,3 @@ def _last(label: str) -> str:
     """Return the name of an array without that of its group and its number in a matrix."""
     name = re.split(r"\.(?=[^\W\d])", label)[-1]
     return re.sub(r"(?<=\w\w)\.\d+(?=$| \[)", "", name)
-
-
-def _same_unit(one: str, other: str) -> bool:
-    try:
-        first, second = parse_unit(one), parse_unit(other)
-    except InputError:
-        return True  # the unknown one was told already
-    return replace(first, name="", quantity="") == replace(second, name="", quantity="")

@@ -25,11 +25,11 @@ from psa_casadi.records.read.table import (
     Cells,
     Columns,
     Table,
+    as_numbers,
     decimal_sign,
     is_missing,
     is_number,
     is_stamp,
-    numbers_in,
     unit_in,
     unit_of_times,
 )
@@ -61,8 +61,7 @@ def laid_out(lines: Sequence[str], mark: str) -> Layout | None:
     start = next((k for k, line in enumerate(lines) if holds(line)), None)
     if start is None:
         return None
-    plain = _named(lines, [start], mark)
-    place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)), mark)
+    place = _named(lines, [start, *range(min(len(lines), _MOST_LINES))], mark)
     if place is None:
         numbers = _numbers(lines[start], mark)
         if numbers:
@@ -363,37 +362,35 @@ def _with_unit(text: str, cells: Cells) -> str:
     """Return a header's cell with the unit that only the cells below it tell.
 
     That is the second for dates and clock times, what stands behind the numbers, or what makes a
-    number the time since 1970.
+    number the time since 1970. In a cell in capitals the unit is written as it is: `TIME(S)`.
     """
     match = _NAME.fullmatch(text.strip())
     unit = match["unit"] if match else None
     if match and unit is not None and unit_named(unit) == "s" and ":" in unit:
         return f"{match['name']} [s]"
-    text = _in_small_letters(text)
+    capitals = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
+    name = understood(capitals["name"]) if capitals else None
+    if capitals and name and not measures(name.column, capitals["unit"]):
+        units = [u for quantity in COLUMNS[name.column].quantities for u in units_of(quantity)]
+        small = [u for u in units if u.lower() == capitals["unit"].lower()]
+        text = f"{capitals['name']} [{small[0]}]" if small else text
     if stated_unit(text) or unit:
         return text
-    name = understood(text)
-    filled = cells if isinstance(cells, np.ndarray) else [c for c in cells if c.strip()]
-    if not isinstance(filled, np.ndarray):
-        if filled and is_stamp(filled[0]):
-            return f"{text.strip()} [s]"
-        own = unit_in(filled)
-        if own:
-            return f"{text.strip()} [{own}]"
-        filled = numbers_in(filled[:9], decimal_sign(filled[:9]), "s")[0]
-    own = unit_of_times(filled[:9]) if name and name.column == "time" else None
+    own = _unit_below(text, cells)
     return f"{text.strip()} [{own}]" if own else text
 
 
-def _in_small_letters(text: str) -> str:
-    """Return a header's cell in capitals with its unit as it is written: `TIME(S)`, `DISP (UM)`."""
-    match = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
-    name = understood(match["name"]) if match else None
-    if match is None or name is None or measures(name.column, match["unit"]):
-        return text
-    units = [u for quantity in COLUMNS[name.column].quantities for u in units_of(quantity)]
-    small = next((u for u in units if u.lower() == match["unit"].lower()), None)
-    return f"{match['name']} [{small}]" if small else text
+def _unit_below(text: str, cells: Cells) -> str | None:
+    """Return the unit that the cells below a header's cell tell, None where they tell none."""
+    if not isinstance(cells, np.ndarray):
+        cells = [c for c in cells if c.strip()]
+        if cells and is_stamp(cells[0]):
+            return "s"
+        if own := unit_in(cells):
+            return own
+    name = understood(text)
+    is_time = name is not None and name.column == "time"
+    return unit_of_times(as_numbers(cells[:9], "s")) if is_time else None
 
 
 def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
