@@ -28,9 +28,8 @@ from psa_casadi.records.read.columns import (
     unit_named,
 )
 from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.instruments import stated_step
 from psa_casadi.records.read.table import Cells, Columns, Table, unit_of_times
-from psa_casadi.records.read.text import text_tables
+from psa_casadi.records.read.text import stated_step, text_tables
 
 #: The attributes and properties that state a unit, in lower case.
 _UNITS = ("units", "unit", "unit_string")
