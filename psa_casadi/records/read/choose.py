@@ -19,6 +19,7 @@ from psa_casadi.records.read.columns import (
     column_named,
     measures,
     mismatch,
+    name_and_unit,
     stated_unit,
     understood,
     unit_for,
@@ -34,7 +35,6 @@ from psa_casadi.units import parse_unit
 QUANTITIES = {"time": "time", "voltage": "voltage", "displacement": "length"}
 #: What `--columns` takes for its own marks in a name, where a unit follows.
 _MARKS = set(",[]")
-_HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 #: Words for what is commanded and for what drives, for what is measured, and for neither.
 _COMMANDED = {
     "command", "commanded", "cmd", "setpoint", "set", "target", "reference", "ref", "demand",
@@ -169,13 +169,11 @@ class Choice:
         first = any(plain(label).replace("_", "") == "displacement1" for label in table.labels)
         last = _last if table.sizes else str
         for index, text in enumerate(table.header):
-            match, asked = _HEADER.fullmatch(text.strip()), index in places
-            own, unit = (match["name"].strip(), match["unit"]) if match else (text, None)
+            asked, (own, unit) = index in places, name_and_unit(text)
             name = places.get(index, plain(own))
             bare = unit is None and (name in self.required or name == "time")
             second = name == "displacement_2" and first
-            known = match is not None and name in COLUMNS
-            if not known or (not asked and (bare or second or name in wanted)):
+            if name not in COLUMNS or (not asked and (bare or second or name in wanted)):
                 self.left.append(_cell_of(last(text), table.labels[index], index))
             elif name in self.fields:
                 self.problems.add(

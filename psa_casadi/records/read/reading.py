@@ -31,6 +31,7 @@ from psa_casadi.records.read.columns import (
     ColumnMap,
     Source,
     columns_of,
+    name_and_unit,
     parse_columns,
     stated_unit,
 )
@@ -44,7 +45,6 @@ from psa_casadi.records.read.table import (
     is_stamp,
     seconds_of,
 )
-from psa_casadi.records.read.text import label_of
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.units import FloatArray, parse_unit, to_si
 
@@ -308,7 +308,7 @@ def record_from(
         return Columns(cells, np.arange(1, 1 + max(map(len, cells), default=0)))
 
     header = [str(text) for text in own]
-    labels = [label_of(text) for text in header]
+    labels = [name_and_unit(text)[0] for text in header]
     held = Table(name, "", header, labels, f"{name}: column names", "row", load)
     outcome = samples_of(name, [held], request)
     digest = hashlib.sha256()

@@ -24,6 +24,7 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
     columns_known,
     measures,
+    name_and_unit,
     stated_unit,
     understood,
     unit_named,
@@ -205,7 +206,6 @@ def _named(
 _MOST_BELOW = 20
 #: A first line that tells Excel what separates the cells.
 _TOLD_MARK = re.compile(r"\s*\"?sep=([^\w\s]|\t)\"?[\s,;]*", re.I)
-_NAME = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 _IN_BRACKETS = re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]+)[\])}]")
 _COMMENTS = ("#", "%", "!", "//", ";")
 
@@ -288,7 +288,7 @@ class _Part:
             told = ",".join(self._cells(first))
             return replace(bare, header=numbered, labels=numbered, headless=told)
         header = [_with_unit(h, c) for h, c in zip(layout.header, bare.glance, strict=True)]
-        return replace(bare, header=header, labels=[label_of(text) for text in header])
+        return replace(bare, header=header, labels=[name_and_unit(text)[0] for text in header])
 
     def _cells(self, row: str) -> list[str]:
         return cells_of(row, self.layout.delimiter)
@@ -361,22 +361,15 @@ class _Part:
         return None if np.any((np.abs(values) > 1e8) & np.isfinite(values)) else values
 
 
-def label_of(text: str) -> str:
-    """Return the name of a column in a header without its unit in brackets."""
-    match = _NAME.fullmatch(text.strip())
-    return (match["name"] if match else text).strip()
-
-
 def _with_unit(text: str, cells: Cells) -> str:
     """Return a header's cell with the unit that only the cells below it tell.
 
     That is the second for dates and clock times, what stands behind the numbers, or what makes a
     number the time since 1970. In a cell in capitals the unit is written as it is: `TIME(S)`.
     """
-    match = _NAME.fullmatch(text.strip())
-    unit = match["unit"] if match else None
-    if match and unit is not None and unit_named(unit) == "s" and ":" in unit:
-        return f"{match['name']} [s]"
+    own, unit = name_and_unit(text)
+    if unit is not None and unit_named(unit) == "s" and ":" in unit:
+        return f"{own} [s]"
     capitals = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
     name = understood(capitals["name"]) if capitals else None
     if capitals and name and not measures(name.column, capitals["unit"]):
@@ -385,8 +378,8 @@ def _with_unit(text: str, cells: Cells) -> str:
         text = f"{capitals['name']} [{small[0]}]" if small else text
     if stated_unit(text) or unit:
         return text
-    own = _unit_below(text, cells)
-    return f"{text.strip()} [{own}]" if own else text
+    below = _unit_below(text, cells)
+    return f"{text.strip()} [{below}]" if below else text
 
 
 def _unit_below(text: str, cells: Cells) -> str | None:
@@ -420,7 +413,7 @@ def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
         end = width if most is None else min(width, most + 1)
         return Columns([cells[k][1:end] for k in asked], np.arange(1, end))
 
-    return Table("", "", header, [label_of(h) for h in header], "", "sample", load)
+    return Table("", "", header, [name_and_unit(h)[0] for h in header], "", "sample", load)
 
 
 def decoded(data: bytes, path: str) -> str:
