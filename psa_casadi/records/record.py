@@ -202,7 +202,7 @@ class Record(Plotted):
             given = getattr(self, column)
             if given is None and column in _OPTIONAL:
                 continue
-            array = frozen(given)
+            array = _frozen(given)
             object.__setattr__(self, column, array)
             if array.ndim != 1 or array.size != self.time.size:
                 problems.add(
@@ -311,8 +311,7 @@ class Record(Plotted):
         return replace(self, name=name, time=self.time[part], voltage=self.voltage[part], **arrays)
 
 
-def frozen(values: ArrayLike) -> FloatArray:
-    """Return numbers that cannot be changed, a copy where they could be."""
+def _frozen(values: ArrayLike) -> FloatArray:
     array = np.asarray(values, dtype=np.float64)
     if array.flags.writeable or not array.flags.c_contiguous:
         array = array.copy()
