@@ -1,8 +1,9 @@
 """One experiment: its columns, what must hold for their numbers, and the record of them."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -40,18 +41,6 @@ class Located:
         own = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
         return replace(self, **own)
 
-    def complain(self, at: NDArray[np.bool_], sentence: str, problems: Problems) -> None:
-        """Add `sentence` for every sample that `at` marks.
-
-        In the sentence {value} is the value found and {place} what holds it.
-        """
-        rows = np.flatnonzero(at & ~self.reported)
-        for row in rows[:LISTED]:
-            found = sentence.format(value=f"{self.values[row]:.6g}", place=self.place)
-            where = f"{self.path}: {self.place} {self.lines[row]}, column '{self.name}'"
-            problems.add(f"{where}: {found}")
-        problems.add_uncounted(max(0, rows.size - LISTED))
-
 
 def check_length(path: str, samples: int, problems: Problems) -> None:
     """Demand at least `FEWEST_SAMPLES` samples."""
@@ -66,7 +55,7 @@ def check_length(path: str, samples: int, problems: Problems) -> None:
 
 def check_time(time: Located, problems: Problems) -> None:
     """Demand finite instants, each later than the one before it."""
-    check_complete(time, problems)
+    check_finite(time, problems, complete=True)
     known = np.flatnonzero(np.isfinite(time.values))
     wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
     if wrong.size > LISTED:
@@ -88,16 +77,6 @@ def check_time(time: Located, problems: Problems) -> None:
             f"instant in every {time.place}; remove repeated {time.place}s or split the file where "
             f"a new record begins."
         )
-
-
-def check_complete(column: Located, problems: Problems) -> None:
-    """Demand a finite number in every row."""
-    column.complain(
-        np.isnan(column.values),
-        "found no value, expected a number; fill the cell or remove the {place}.",
-        problems,
-    )
-    check_finite(column, problems)
 
 
 def check_displacement(column: Located, problems: Problems) -> None:
@@ -122,19 +101,32 @@ def check_excitation(column: Located, problems: Problems) -> None:
         )
 
 
-def check_finite(column: Located, problems: Problems) -> None:
-    """Demand measured numbers where there are any."""
-    column.complain(
-        np.isinf(column.values),
-        "found {value}, expected a finite number; correct the cell or remove the {place}.",
-        problems,
-    )
-    column.complain(
-        np.isfinite(column.values) & (np.abs(column.values) > LARGEST),
-        f"found {{value}}, expected a measured number, below {LARGEST:g}; correct the cell or"
-        " remove the {place}.",
-        problems,
-    )
+def check_finite(column: Located, problems: Problems, *, complete: bool = False) -> None:
+    """Demand measured numbers where there are any, in every row if the column is to be `complete`.
+
+    What was reported already is not told again.
+    """
+    values, place = column.values, column.place
+    for at, told in (
+        (np.isnan(values) & complete, "found no value, expected a number; fill"),
+        (np.isinf(values), "found {}, expected a finite number; correct"),
+        (
+            np.isfinite(values) & (np.abs(values) > LARGEST),
+            f"found {{}}, expected a measured number, below {LARGEST:g}; correct",
+        ),
+    ):
+        rows = np.flatnonzero(at & ~column.reported)
+        for row in rows[:LISTED]:
+            problems.add(
+                f"{column.path}: {place} {column.lines[row]}, column '{column.name}':"
+                f" {told.format(f'{values[row]:.6g}')} the cell or remove the {place}."
+            )
+        problems.add_uncounted(max(0, rows.size - LISTED))
+
+
+Check = Callable[[Located, Problems], None]
+#: Demand a finite number in every row.
+check_complete: Check = partial(check_finite, complete=True)
 
 
 @dataclass(frozen=True)
@@ -210,7 +202,7 @@ class Record(Plotted):
             given = getattr(self, column)
             if given is None and column in _OPTIONAL:
                 continue
-            array = frozen(given)
+            array = _frozen(given)
             object.__setattr__(self, column, array)
             if array.ndim != 1 or array.size != self.time.size:
                 problems.add(
@@ -219,7 +211,7 @@ class Record(Plotted):
                 )
         problems.raise_if_any()
         numbers, unreported = np.arange(self.n, dtype=np.int64), np.zeros(self.n, dtype=np.bool_)
-        checks = {"time": check_time, "displacement": check_finite}
+        checks: dict[str, Check] = {"time": check_time, "displacement": check_finite}
         for column, values in {"time": self.time, **self.recorded}.items():
             located = Located(where, column, values, numbers, unreported, "sample")
             checks.get(column, check_complete)(located, problems)
@@ -319,8 +311,7 @@ class Record(Plotted):
         return replace(self, name=name, time=self.time[part], voltage=self.voltage[part], **arrays)
 
 
-def frozen(values: ArrayLike) -> FloatArray:
-    """Return numbers that cannot be changed, a copy where they could be."""
+def _frozen(values: ArrayLike) -> FloatArray:
     array = np.asarray(values, dtype=np.float64)
     if array.flags.writeable or not array.flags.c_contiguous:
         array = array.copy()

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import why_not_read
-from psa_casadi.records.record import frozen
 from psa_casadi.units import FloatArray
 
 #: What an input does between two samples.
@@ -46,8 +46,8 @@ class Signals:
     sha256: str = ""
 
     def __post_init__(self) -> None:
-        time = frozen(self.time)
-        columns = {str(n): frozen(v) for n, v in self.columns.items()}
+        time = _frozen(self.time)
+        columns = {str(n): _frozen(v) for n, v in self.columns.items()}
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "columns", columns)
         problems, where = Problems(), f"signals '{self.name}'"
@@ -191,3 +191,9 @@ def _read(path: Path) -> Signals:
                 problems.add(f"{path}: row {k + 2}: '{field}' is no number; write it as 1.5e-3.")
     problems.raise_if_any()
     return _of_table(dict(zip(names, values.T, strict=True)), path.stem)
+
+
+def _frozen(values: npt.ArrayLike) -> FloatArray:
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +26,32 @@ def write(path: Path, *lines: str, end: str = "\n", encoding: str = "utf-8") -> 
     return path
 
 
+def text(*head: str, columns: Sequence[Any] = (T, V, X), mark: str = ",", point: str = ".") -> str:
+    """Return a table with these lines above its rows; cells that are texts stand as they are."""
+    rows = (
+        (c if isinstance(c, str) else f"{c:.9g}".replace(".", point) for c in row)
+        for row in zip(*columns, strict=True)
+    )
+    return "\n".join([*head, *map(mark.join, rows), ""])
+
+
+def kept(path: Path, content: str | bytes) -> Path:
+    """Write a file."""
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
 def assert_is(
-    record: Record, t: ArrayLike, v: ArrayLike, x: ArrayLike, accuracy: float = 1e-12
+    record: Record, t: ArrayLike, v: ArrayLike, x: ArrayLike | None, accuracy: float = 1e-12
 ) -> None:
     """Demand the columns of a record in SI units; its time may begin anywhere."""
     begin = np.asarray(t, float)
-    assert record.displacement is not None
     np.testing.assert_allclose(
         record.time - record.time[0], begin - begin[0], rtol=1e-9, atol=1e-12
     )
     np.testing.assert_allclose(record.voltage, np.asarray(v, float), rtol=accuracy)
-    np.testing.assert_allclose(record.displacement, np.asarray(x, float), rtol=accuracy)
+    moved = np.asarray(record.displacement, float)
+    np.testing.assert_allclose(moved, np.asarray(x, float), rtol=accuracy)
 
 
 def problems_of(path: Path, **asked: Any) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """Columns that a person sees at once: told by their units, and never against what a name says."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +10,11 @@ from scipy.io import savemat
 
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.columns import parse_columns
-from tests.records.record_files import T, V, X, assert_is, offered, refused
+from tests.records.record_files import T, V, X, assert_is, kept, offered, refused, text
 
 
-def table(
-    path: Path, *head: str, columns: Sequence[Any] = (T, V, X), mark: str = ",", point: str = "."
-) -> Path:
-    """Write a table; `columns` beyond the three are those that a record has no use for."""
-    rows = zip(*columns, strict=True)
-    lines = [mark.join(f"{v:.6g}".replace(".", point) for v in row) for row in rows]
-    path.write_text("\n".join([*head, *lines, ""]))
-    return path
+def table(path: Path, *head: str, **form: Any) -> Path:
+    return kept(path, text(*head, **form))
 
 
 def is_read(record: Record, t: float = 1.0, v: float = 1.0, x: float = 1e-6) -> None:

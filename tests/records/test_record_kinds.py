@@ -15,7 +15,7 @@ from psa_casadi.records import Record, read_record, read_records
 from tests.records.laboratory_bytes import Cell, hdf5, mat, npz, parquet, tdms, xlsx
 from tests.records.reading_here import here
 from tests.records.record_files import HEADER as HEAD
-from tests.records.record_files import assert_is, offered, refused
+from tests.records.record_files import assert_is, kept, offered, refused, text
 from tests.tiers import slow_but
 
 N = 40
@@ -25,14 +25,11 @@ X = np.round(5 + 4 * np.sin(np.arange(N) / 3.0 - 0.2), 4)
 
 
 def table(*head: str, columns: Sequence[Any] = (T, V, X), mark: str = ",") -> str:
-    rows = (mark.join(str(c) for c in row) for row in zip(*columns, strict=True))
-    return "\n".join([*head, *rows, ""])
+    return text(*head, columns=columns, mark=mark)
 
 
-def written(folder: Path, text: str | bytes, name: str = "a.csv") -> Path:
-    path = folder / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
+def written(folder: Path, content: str | bytes, name: str = "a.csv") -> Path:
+    return kept(folder / name, content)
 
 
 def is_read(record: Record, t: Any = T, v: Any = V, x: Any = X) -> None:

@@ -41,9 +41,8 @@ def test_what_is_written_reads_back_bit_for_bit(
     instants = np.arange(len(values)) / 3.0
     write_record(path, {"time [s]": instants, "voltage [V]": instants, "displacement [m]": values})
     record = read_record(path)
-    assert record.displacement is not None
     np.testing.assert_array_equal(record.time, instants)
-    np.testing.assert_array_equal(record.displacement, values)
+    np.testing.assert_array_equal(np.asarray(record.displacement), values)
 
 
 @slow
@@ -79,7 +78,6 @@ def test_a_slice_keeps_origin_and_all_columns() -> None:
     part = record.slice(1, -1)
     assert (part.name, part.sha256, part.n) == ("r[1:4]", record.sha256, 3)
     np.testing.assert_array_equal(part.time, record.time[1:4])
-    assert part.displacement is not None
     assert part.load_force is None
     np.testing.assert_array_equal(part.mask, [False, True, True])
     with pytest.raises(InputError, match="fewer than two"):

@@ -21,17 +21,12 @@ from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
 from psa_casadi.records.read.choose import Choice
-from psa_casadi.records.read.columns import Field, stated_unit
+from psa_casadi.records.read.columns import MARKS, Field, stated_unit
 from psa_casadi.records.read.file_bytes import check_there, read_text
 from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
 from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Table, parts_of_file
 from psa_casadi.records.read.text import decoded, text_tables
-
-#: The columns that a diagnosis needs; a cell that may be one of them is a guess worth showing.
-NEEDED = ("time", "voltage", "displacement")
-#: What `--columns` reads as its own marks: a column with one of them cannot be named there.
-_MARKS = set(",=:[]")
 
 
 @dataclass(frozen=True)
@@ -80,14 +75,14 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -
         raise InputError(f"{path}: holds no header and no data; export the record again.")
     parts = parts_of_file(tables)
     one = parts.get(table, tables[0])
-    choice = Choice(one, NEEDED, {}, Problems())
+    choice = Choice(one, Request().required, {}, Problems())
     guess = dict(choice.fields)
     labels = list(one.labels)
     for name, source in choice.sources.items() if not one.headless else ():
         if source.array in labels:
             guess[name] = Field(labels.index(source.array), source.unit or "")
     units = tuple(stated_unit(text) or "" for text in one.header)
-    names = tuple("" if set(label) & _MARKS else label for label in one.labels)
+    names = tuple("" if MARKS.search(label) else label for label in one.labels)
     shown = [
         [f"{c:.9g}" for c in cells[:count]]
         if isinstance(cells, np.ndarray) and cells.dtype.kind in "biuf"

@@ -3,6 +3,7 @@
 import difflib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from psa_casadi.records.read.columns import (
     column_named,
     measures,
     mismatch,
+    name_and_unit,
     stated_unit,
     understood,
     unit_for,
@@ -33,7 +35,6 @@ from psa_casadi.units import parse_unit
 QUANTITIES = {"time": "time", "voltage": "voltage", "displacement": "length"}
 #: What `--columns` takes for its own marks in a name, where a unit follows.
 _MARKS = set(",[]")
-_HEADER = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 #: Words for what is commanded and for what drives, for what is measured, and for neither.
 _COMMANDED = {
     "command", "commanded", "cmd", "setpoint", "set", "target", "reference", "ref", "demand",
@@ -168,13 +169,11 @@ class Choice:
         first = any(plain(label).replace("_", "") == "displacement1" for label in table.labels)
         last = _last if table.sizes else str
         for index, text in enumerate(table.header):
-            match, asked = _HEADER.fullmatch(text.strip()), index in places
-            own, unit = (match["name"].strip(), match["unit"]) if match else (text, None)
+            asked, (own, unit) = index in places, name_and_unit(text)
             name = places.get(index, plain(own))
             bare = unit is None and (name in self.required or name == "time")
             second = name == "displacement_2" and first
-            known = match is not None and name in COLUMNS
-            if not known or (not asked and (bare or second or name in wanted)):
+            if name not in COLUMNS or (not asked and (bare or second or name in wanted)):
                 self.left.append(_cell_of(last(text), table.labels[index], index))
             elif name in self.fields:
                 self.problems.add(
@@ -306,7 +305,10 @@ class Choice:
             return given or ""
         unit = own or given or (SI_UNITS.get(name) if source else None)
         check_unit(COLUMNS[name], unit, where, self.problems)
-        if own and given and not _same_unit(own, given):
+        with suppress(InputError):  # an unknown one was told already
+            units = {replace(parse_unit(u), name="", quantity="") for u in (own, given) if u}
+            if len(units) < 2:
+                return unit or ""
             self.problems.add(
                 f"{where}: the header gives the unit '{own}', --columns gives '{given}'; leave the"
                 f" one in --columns out, or say there what 1 in the file is, such as 10{given}."
@@ -398,11 +400,3 @@ def _last(label: str) -> str:
     """Return the name of an array without that of its group and its number in a matrix."""
     name = re.split(r"\.(?=[^\W\d])", label)[-1]
     return re.sub(r"(?<=\w\w)\.\d+(?=$| \[)", "", name)
-
-
-def _same_unit(one: str, other: str) -> bool:
-    try:
-        first, second = parse_unit(one), parse_unit(other)
-    except InputError:
-        return True  # the unknown one was told already
-    return replace(first, name="", quantity="") == replace(second, name="", quantity="")

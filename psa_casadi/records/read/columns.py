@@ -240,6 +240,7 @@ _FORMS = (
     re.compile(r"(?P<name>.*?)\s*(?:[/,]|\bin\b)\s*(?P<unit>\S+)"),
     re.compile(r"(?P<name>.*)[_ ](?P<unit>[^_ ]+)"),
 )
+_BRACKETED = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 _DIGITS = re.compile(r"[0-9.+-]")
 #: The number of a channel at the end of a name; it is never a unit.
 _CHANNEL = re.compile(r"(?<=\w)[ _]?\d+$")
@@ -301,6 +302,12 @@ def stated_unit(text: str, *, loosely: bool = False) -> str | None:
     bare = _unquoted(text)
     is_unit = bare.lower() in _UNIT_OF or (len(bare) > 1 and _is_symbol(bare)) or "/" in bare
     return unit_named(bare) if is_unit else None
+
+
+def name_and_unit(text: str) -> tuple[str, str | None]:
+    """Return the name in a cell and the unit behind it in square brackets, None without these."""
+    match = _BRACKETED.fullmatch(text.strip())
+    return (match["name"], match["unit"]) if match else (text.strip(), None)
 
 
 def unit_for(column: str, text: str) -> str | None:

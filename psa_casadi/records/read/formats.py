@@ -22,19 +22,18 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
     MARKS,
     SI_UNITS,
+    name_and_unit,
     name_without_unit,
     stated_unit,
     understood,
     unit_named,
 )
 from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.instruments import stated_step
 from psa_casadi.records.read.table import Cells, Columns, Table, unit_of_times
-from psa_casadi.records.read.text import text_tables
+from psa_casadi.records.read.text import stated_step, text_tables
 
 #: The attributes and properties that state a unit, in lower case.
 _UNITS = ("units", "unit", "unit_string")
-_BRACKETED = re.compile(r"(?P<name>.+?)\s*\[(?P<unit>[^\[\]]+)\]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +93,10 @@ def array_tables(
     """
     named: dict[str, Series] = {}
     for one in found:
-        match = _BRACKETED.fullmatch(one.name.strip())
-        name = MARKS.sub("_", match["name"] if match else one.name.strip())
+        own, bracketed = name_and_unit(one.name)
+        name = MARKS.sub("_", own or one.name.strip())
         unit = unit_named(one.unit, common=False) if isinstance(one.unit, str) else None
-        unit = unit or (match["unit"].strip() if match else None)
+        unit = unit or (bracketed.strip() if bracketed else None)
         named.setdefault(name, replace(one, name=name, unit=unit))
     series, labels = list(named.values()), list(named)
     scalars = {n.rpartition(".")[2]: s.values() for n, s in named.items() if s.size == 1}

@@ -31,6 +31,7 @@ from psa_casadi.records.read.columns import (
     ColumnMap,
     Source,
     columns_of,
+    name_and_unit,
     parse_columns,
     stated_unit,
 )
@@ -44,7 +45,6 @@ from psa_casadi.records.read.table import (
     is_stamp,
     seconds_of,
 )
-from psa_casadi.records.read.text import label_of
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.units import FloatArray, parse_unit, to_si
 
@@ -271,9 +271,11 @@ def read_records(
             problems.extend(error.problems)
     if failed == len(places) > 1:  # they may hold a channel each
         request = _request(wanted, "", sample_time, displacement=True, excitation=need_excitation)
+        outcome = None
         with suppress(InputError):
-            pair = joined([(p, *apart.text_of(p)) for p in places], request, alone=True)
-            return (_record("+".join(places), *pair),)
+            outcome = joined([(p, *apart.text_of(p)) for p in places], request, alone=True)
+        if outcome is not None:
+            return (_record("+".join(places), *outcome),)
     if not places:
         problems.append("no record was named; name at least one CSV file.")
     if problems:
@@ -306,7 +308,7 @@ def record_from(
         return Columns(cells, np.arange(1, 1 + max(map(len, cells), default=0)))
 
     header = [str(text) for text in own]
-    labels = [label_of(text) for text in header]
+    labels = [name_and_unit(text)[0] for text in header]
     held = Table(name, "", header, labels, f"{name}: column names", "row", load)
     outcome = samples_of(name, [held], request)
     digest = hashlib.sha256()

@@ -1,8 +1,18 @@
-"""Tables in the lines of a text or of a spreadsheet: preamble, header, units in a row, several."""
+"""Tables in the lines of a text or of a spreadsheet: preamble, header, units in a row, several.
+
+LabVIEW measurement files (`.lvm`), the data recorders of PI controllers (GCS arrays) and
+oscilloscopes by Rigol and Tektronix keep the names of the columns and the sample time in a head, or
+beside the numbers. They become a plain table of the same number of lines, so that a mistake is told
+with the line of the file.
+
+Sources: National Instruments, "Specification for the LabVIEW Measurement File (.lvm)"; Physik
+Instrumente, "GCS Array Data Format".
+"""
 
 import csv
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,27 +24,27 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
     columns_known,
     measures,
+    name_and_unit,
     stated_unit,
     understood,
     unit_named,
     units_row,
 )
-from psa_casadi.records.read.instruments import instrument_lines, stated_step
 from psa_casadi.records.read.table import (
     SWAPPED,
     Cells,
     Columns,
     Table,
+    as_numbers,
     decimal_sign,
     is_missing,
     is_number,
     is_stamp,
-    numbers_in,
     unit_in,
     unit_of_times,
 )
 from psa_casadi.records.record import COLUMNS, FEWEST_SAMPLES
-from psa_casadi.units import units_of
+from psa_casadi.units import to_si, units_of
 
 #: Lines in which the first header is looked for, and the most that are asked for further ones.
 _MOST_LINES, _MOST_HEADERS = 500, 20_000
@@ -61,8 +71,7 @@ def laid_out(lines: Sequence[str], mark: str) -> Layout | None:
     start = next((k for k, line in enumerate(lines) if holds(line)), None)
     if start is None:
         return None
-    plain = _named(lines, [start], mark)
-    place = plain if plain is not None else _named(lines, range(min(len(lines), _MOST_LINES)), mark)
+    place = _named(lines, [start, *range(min(len(lines), _MOST_LINES))], mark)
     if place is None:
         numbers = _numbers(lines[start], mark)
         if numbers:
@@ -197,7 +206,6 @@ def _named(
 _MOST_BELOW = 20
 #: A first line that tells Excel what separates the cells.
 _TOLD_MARK = re.compile(r"\s*\"?sep=([^\w\s]|\t)\"?[\s,;]*", re.I)
-_NAME = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 _IN_BRACKETS = re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]+)[\])}]")
 _COMMENTS = ("#", "%", "!", "//", ";")
 
@@ -280,7 +288,7 @@ class _Part:
             told = ",".join(self._cells(first))
             return replace(bare, header=numbered, labels=numbered, headless=told)
         header = [_with_unit(h, c) for h, c in zip(layout.header, bare.glance, strict=True)]
-        return replace(bare, header=header, labels=[label_of(text) for text in header])
+        return replace(bare, header=header, labels=[name_and_unit(text)[0] for text in header])
 
     def _cells(self, row: str) -> list[str]:
         return cells_of(row, self.layout.delimiter)
@@ -353,47 +361,38 @@ class _Part:
         return None if np.any((np.abs(values) > 1e8) & np.isfinite(values)) else values
 
 
-def label_of(text: str) -> str:
-    """Return the name of a column in a header without its unit in brackets."""
-    match = _NAME.fullmatch(text.strip())
-    return (match["name"] if match else text).strip()
-
-
 def _with_unit(text: str, cells: Cells) -> str:
     """Return a header's cell with the unit that only the cells below it tell.
 
     That is the second for dates and clock times, what stands behind the numbers, or what makes a
-    number the time since 1970.
+    number the time since 1970. In a cell in capitals the unit is written as it is: `TIME(S)`.
     """
-    match = _NAME.fullmatch(text.strip())
-    unit = match["unit"] if match else None
-    if match and unit is not None and unit_named(unit) == "s" and ":" in unit:
-        return f"{match['name']} [s]"
-    text = _in_small_letters(text)
+    own, unit = name_and_unit(text)
+    if unit is not None and unit_named(unit) == "s" and ":" in unit:
+        return f"{own} [s]"
+    capitals = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
+    name = understood(capitals["name"]) if capitals else None
+    if capitals and name and not measures(name.column, capitals["unit"]):
+        units = [u for quantity in COLUMNS[name.column].quantities for u in units_of(quantity)]
+        small = [u for u in units if u.lower() == capitals["unit"].lower()]
+        text = f"{capitals['name']} [{small[0]}]" if small else text
     if stated_unit(text) or unit:
         return text
+    below = _unit_below(text, cells)
+    return f"{text.strip()} [{below}]" if below else text
+
+
+def _unit_below(text: str, cells: Cells) -> str | None:
+    """Return the unit that the cells below a header's cell tell, None where they tell none."""
+    if not isinstance(cells, np.ndarray):
+        cells = [c for c in cells if c.strip()]
+        if cells and is_stamp(cells[0]):
+            return "s"
+        if own := unit_in(cells):
+            return own
     name = understood(text)
-    filled = cells if isinstance(cells, np.ndarray) else [c for c in cells if c.strip()]
-    if not isinstance(filled, np.ndarray):
-        if filled and is_stamp(filled[0]):
-            return f"{text.strip()} [s]"
-        own = unit_in(filled)
-        if own:
-            return f"{text.strip()} [{own}]"
-        filled = numbers_in(filled[:9], decimal_sign(filled[:9]), "s")[0]
-    own = unit_of_times(filled[:9]) if name and name.column == "time" else None
-    return f"{text.strip()} [{own}]" if own else text
-
-
-def _in_small_letters(text: str) -> str:
-    """Return a header's cell in capitals with its unit as it is written: `TIME(S)`, `DISP (UM)`."""
-    match = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
-    name = understood(match["name"]) if match else None
-    if match is None or name is None or measures(name.column, match["unit"]):
-        return text
-    units = [u for quantity in COLUMNS[name.column].quantities for u in units_of(quantity)]
-    small = next((u for u in units if u.lower() == match["unit"].lower()), None)
-    return f"{match['name']} [{small}]" if small else text
+    is_time = name is not None and name.column == "time"
+    return unit_of_times(as_numbers(cells[:9], "s")) if is_time else None
 
 
 def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
@@ -414,7 +413,7 @@ def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
         end = width if most is None else min(width, most + 1)
         return Columns([cells[k][1:end] for k in asked], np.arange(1, end))
 
-    return Table("", "", header, [label_of(h) for h in header], "", "sample", load)
+    return Table("", "", header, [name_and_unit(h)[0] for h in header], "", "sample", load)
 
 
 def decoded(data: bytes, path: str) -> str:
@@ -441,3 +440,171 @@ def decoded(data: bytes, path: str) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("cp1252", errors="replace")
+
+
+_END = "***End_of_Header***"
+_ENTRY = re.compile(r"#\s*(?P<key>[A-Z_]+[0-9]*)\s*=\s*(?P<value>.*?)\s*")
+#: How a head states the time between samples, or their rate, with a unit before or behind it.
+_STEP = re.compile(
+    r"""\W*(?P<name>[\w ]*?(?:(?P<rate>rate|freq\w*|\bfs)|interval|period|increment|\bx ?incr?|
+        \bdt|\bts|step|delta[_ ]?[xt]|sample[_ ]?time|sampling[_ ]?time))\s*
+        [\[(]?(?P<before>[A-Za-zµ/]+)?[\])]?[\s:=,;"']+(?P<number>[\d.,]+(?:[eE][+-]?\d+)?)"?
+        [\s,;"\[(]*(?P<unit>[A-Za-zµ]+(?:/s|PS)?)?.*""",
+    re.I | re.X,
+)
+_SAMPLES = ("sampl", "acqui", "record", "scan", "adc", "time", "x", "delta", "dt",
+            "fs", "ts", "wf", "incr")  # fmt: skip
+
+
+Form = tuple[Sequence[str], tuple[str, ...], float | None]
+
+
+def instrument_lines(path: str, lines: Sequence[str]) -> Form:
+    """Return the lines of a table where an instrument wrote them in its form, else the same lines.
+
+    With them come the header of a table that has none among its lines, and the time between samples
+    [s] that the head states.
+
+    Raises:
+        InputError: the head is damaged, or the channels were sampled at different instants.
+    """
+    if lines[0].strip().startswith("LabVIEW Measurement"):
+        return _labview(path, lines), (), None
+    names = [cell.strip() for cell in lines[0].strip().rstrip(",").split(",")]
+    if names[0] == "Record Length" and len(names) > 4:
+        return _tektronix(lines)
+    if names[0] == "X" and names[-2:] == ["Start", "Increment"] and len(lines) > 1:
+        return _rigol(path, lines, names[1:-2])
+    head = lines[:_MOST_LINES]
+    ends = (k for k, line in enumerate(head) if re.fullmatch(r"#\s*END_HEADER\s*", line))
+    end = next(ends, None)
+    return (lines, (), None) if end is None else _data_recorder(path, lines, end)
+
+
+def stated_step(lines: Sequence[str]) -> float | None:
+    """Return the time between samples [s] that the lines above a table state, None without one."""
+    found = set()
+    for line in lines[:_MOST_LINES]:
+        match = _STEP.fullmatch(line)
+        if match is None or not match["name"].lower().lstrip("# ").startswith(_SAMPLES):
+            continue
+        number, is_rate = _number(match["number"].rstrip(",")), match["rate"] is not None
+        unit = unit_named(match["unit"] or "") or unit_named(match["before"] or "")
+        unit = unit or ("Hz" if is_rate else "s")
+        try:
+            value = to_si(number, unit)
+        except InputError:
+            continue
+        if 0.0 < value < 1e12:
+            found.add(1.0 / value if unit.endswith("Hz") or is_rate else value)
+    return found.pop() if len(found) == 1 else None
+
+
+def _tektronix(lines: Sequence[str]) -> Form:
+    """Return the time and the value of a channel, which stand beside the settings."""
+    rows = [[cell.strip() for cell in line.split(",")] for line in lines]
+    told = {row[0]: row[1] for row in rows if len(row) > 1 and row[0]}
+    unit, clock = (unit_named(told.get(f"{axis} Units", "")) for axis in ("Vertical", "Horizontal"))
+    name = told.get("Source") or "value"
+    header = (f"time [{clock or 's'}]", f"{name} [{unit}]" if unit else name)
+    return [",".join(row[3:5]) if len(row) > 4 else "" for row in rows], header, None
+
+
+def _data_recorder(path: str, lines: Sequence[str], end: int) -> Form:
+    """Return a PI data recorder's table: names and sample time stand in comments above it."""
+    head = {m["key"]: m["value"] for line in lines[:end] if (m := _ENTRY.fullmatch(line))}
+    names = tuple(value for key, value in head.items() if re.fullmatch(r"NAME\d+", key) and value)
+    if not names:
+        raise InputError(
+            f"{path}: its head names no columns (NAME0, NAME1, ...); record the data again."
+        )
+    return [*[""] * (end + 1), *lines[end + 1 :]], names, stated_step(lines[:end])
+
+
+def _rigol(path: str, lines: Sequence[str], channels: Sequence[str]) -> Form:
+    """Return the channels of a Rigol oscilloscope, whose rows are counted."""
+    units = [cell.strip() for cell in lines[1].strip().rstrip(",").split(",")]
+    step = _positive(f"{path}: line 2", "Increment", units[-1])
+    named = zip(channels, map(unit_named, units[1:]), strict=False)
+    header = tuple(f"{name} [{unit}]" if unit else name for name, unit in named)
+    rows = [",".join(line.split(",")[1 : 1 + len(channels)]) for line in lines[2:]]
+    return ["", "", *rows], header, step
+
+
+def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
+    """Return the segments of a LabVIEW measurement as one table."""
+    ends = [k for k, line in enumerate(lines) if line.startswith(_END)]
+    if len(ends) < 2:
+        raise InputError(f"{path}: the head of this LabVIEW file does not end; save it again.")
+    head = _entries(lines[: ends[0]], "[\t,]")
+    mark = "," if head.get("Separator", [""])[0].lower() == "comma" else "\t"
+    columns = head.get("X_Columns", ["One"])[0]
+    table, header = [""] * len(lines), ""
+    for start, end, stop in zip(ends, ends[1:], [*ends[2:], len(lines)], strict=False):
+        segment = _entries(lines[start + 1 : end], mark)
+        if end + 1 >= stop:
+            raise InputError(f"{path}: line {end + 1}: no columns follow; save the file again.")
+        names = _labview_names(lines[end + 1].split(mark), segment.get("Y_Unit_Label", ()))
+        if header and names != header:
+            raise InputError(
+                f"{path}: line {end + 2}: this part has other columns than the one before; save"
+                " each part as a file of its own."
+            )
+        if not header:
+            table[end + 1] = header = names
+        for k, row in enumerate(lines[end + 2 : stop], end + 2):
+            if not row.strip() or row.startswith("Channels"):  # the head of the next part
+                break
+            cells = row.split(mark)
+            if columns == "No":
+                cells[0] = _labview_time(f"{path}: line {k + 1}", row, segment, k - end - 2)
+            elif columns == "Multi" and len({c for c in cells[: len(cells) // 2 * 2 : 2] if c}) > 1:
+                raise InputError(
+                    f"{path}: line {k + 1}: the channels were sampled at different instants; save"
+                    " them on one time axis."
+                )
+            cells += [""] * (header.count("\t") + 1 - len(cells))
+            table[k] = "\t".join(cells)
+    return table
+
+
+def _entries(lines: Sequence[str], mark: str) -> dict[str, list[str]]:
+    found = [[cell.strip() for cell in re.split(mark, line)] for line in lines]
+    return {key: values or [""] for key, *values in found}
+
+
+def _labview_names(cells: Sequence[str], units: Sequence[str]) -> str:
+    """Return the header: one time, and the channels with the units that are stated."""
+    names: list[str] = []
+    left = iter(units)
+    for name in map(str.strip, cells):
+        if name == "X_Value":
+            names.append("" if names else "X_Value [s]")
+        else:
+            unit = unit_named(next(left, "")) if name != "Comment" else None
+            names.append(f"{name} [{unit}]" if unit else name)
+    return "\t".join(names)
+
+
+def _labview_time(where: str, row: str, segment: Mapping[str, Sequence[str]], k: int) -> str:
+    """Return the time that steps give to row k of a part, with the decimal sign of its row."""
+    first, step = (segment.get(key, [""])[0] for key in ("X0", "Delta_X"))
+    start = _number(first) if first else 0.0
+    time = f"{start + k * _positive(where, 'Delta_X', step):.12g}"
+    return time.replace(".", ",") if "," in row and "." not in row else time
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return math.nan
+
+
+def _positive(where: str, key: str, text: str) -> float:
+    step = _number(text)
+    if not 0.0 < step < 1e9:
+        raise InputError(
+            f"{where}: the head gives no sample time ({key} is '{text[:40]}'); record it again."
+        )
+    return step
