@@ -2,7 +2,6 @@
 
 import ctypes
 import random
-from collections.abc import Callable
 from functools import cache
 
 import casadi as ca
@@ -217,40 +216,6 @@ def test_c_value_is_the_casadi_value(effects: tuple[Component, ...]) -> None:
             found = c_values(model, name.removeprefix("psa_"), point, sizes)
             for ours, theirs in zip(found, wanted, strict=True):
                 np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=0, err_msg=name)
-
-
-@every_effect
-def test_generated_jacobians_are_the_slopes_of_the_model(effect: Component) -> None:
-    """The Jacobians that go to C against central differences of f, column by column."""
-    generator = np.random.default_rng(5)
-    model = random_model((effect,), generator, gains=True)
-    point = random_point(model, generator)
-    p = model.parameter_vector()
-    functions = functions_of(model.structure, sensitivities=True)
-    at = (point.time, point.x, point.u, p)
-    blocks = [*functions["psa_sensitivity"](*at), *functions["psa_output_sensitivity"](*at)]
-    exact = [np.array(block) for block in blocks]
-
-    def slopes(k: int, vector: FloatArray, call: Callable[[FloatArray], ca.DM]) -> FloatArray:
-        step = 1e-6 * max(abs(vector[k]), 1e-12)
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = vector.copy()
-            moved[k] += sign * step
-            ends.append(np.concatenate([np.array(v).ravel() for v in call(moved)]))
-        return np.asarray((ends[0] - ends[1]) / (2 * step))
-
-    f = model.structure.f
-    for k in range(point.x.size):
-        found = slopes(k, point.x, lambda x: f(point.time, x, point.u, p))
-        wanted = np.concatenate([exact[0][:, k], exact[2][:, k]])
-        size = np.concatenate(values_of(model, point)) / point.x[k]
-        assert np.all(np.abs(found - wanted) <= 1e-5 * np.abs(wanted) + 1e-7 * np.abs(size))
-    for k in range(p.size):
-        found = slopes(k, p, lambda q: f(point.time, point.x, point.u, q))
-        wanted = np.concatenate([exact[1][:, k], exact[3][:, k]])
-        size = np.concatenate(values_of(model, point)) / p[k]
-        assert np.all(np.abs(found - wanted) <= 1e-5 * np.abs(wanted) + 1e-7 * np.abs(size))
 
 
 @each_in_turn

@@ -190,18 +190,6 @@ def test_a_mistake_is_named(expected: str) -> None:
     assert expected in refused(NAMED[expected])
 
 
-def test_several_mistakes_come_together() -> None:
-    def spoil(content: dict[str, Any]) -> None:
-        content["effects"].append("magic")
-        content["parameters"]["tau"]["value"] = None
-        del content["parameters"]["A"]
-        content["notes"] = [1, 2]
-
-    text = refused(spoil)
-    for word in ("'magic'", "tau.value' is None", "'A' [N/V] has no value", "'notes[1]' is 2"):
-        assert word in text
-
-
 def test_a_name_twice_is_no_choice_of_the_last() -> None:
     text = TEXT.replace('"k_L": {', '"k_L": {"value": 1e-3, "unit": "N/V"},\n    "k_L": {', 1)
     (problem,) = sentences(lambda: loads(text))

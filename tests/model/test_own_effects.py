@@ -89,15 +89,6 @@ def test_a_declaration_that_has_changed_is_refused(ripple: Component, tmp_path: 
         loads(text, effects=[other])
 
 
-@pytest.mark.slow
-def test_its_fmu_carries_it_and_passes_the_check(ripple: Component, tmp_path: Path) -> None:
-    path = tmp_path / "stack.fmu"
-    psa.export_fmu(extended(ripple), path, include_sensor=True)
-    assert not psa.check_fmu(path).passed  # the model inside cannot be read without the module
-    report = psa.check_fmu(path, effects=[ripple])
-    assert report.passed, report.rows
-
-
 def install(site: Path, text: str) -> None:
     """Lay a package down as pip does, with the entry point that announces its effects."""
     (site / "gratings-1.dist-info").mkdir(parents=True)

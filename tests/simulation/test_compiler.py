@@ -237,23 +237,6 @@ def test_a_damaged_library_is_made_again(damage: str, calls: list[Path]) -> None
 
 
 @posix
-def test_a_damaged_binary_is_not_exported(
-    calls: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def compiled(command: list[str], directory: Path) -> None:
-        (directory / command[-1]).write_bytes(b"binary" * 2000)
-
-    monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", compiled)
-    linux = PLATFORMS["x86_64-linux"]
-    whole = compile_library({"model.c": ""}, "psa", linux)
-    kept = next((cache.cache_directory() / "binaries").glob("*.so"))
-    for damage in ("the header only", "empty", "a bit in the middle", "text"):
-        DAMAGES[damage](kept)
-        assert compile_library({"model.c": ""}, "psa", linux) == whole, damage
-    assert not calls
-
-
-@posix
 def test_what_killed_runs_left_in_the_cache_goes(calls: list[Path]) -> None:
     room = cache.cache_directory() / "models"
     (room / f"{files.PREFIX}0123abcd").mkdir(parents=True)

@@ -1,10 +1,8 @@
-"""exp and log of exact steps: their tables correctly rounded, their values to the last place."""
+"""Exact steps against the stepper and the reference, and their exp and log to the last place."""
 
 import ctypes
 import re
-import struct
 from collections.abc import Iterator
-from decimal import Decimal, localcontext
 from functools import cache
 
 import casadi as ca
@@ -24,7 +22,6 @@ from psa_casadi.simulation import stepper
 from psa_casadi.simulation.compiler import (
     FLAGS_VARIABLE,
     shared_library,
-    sources_directory,
     vector_flags,
     zig_command,
 )
@@ -386,7 +383,6 @@ def _stepped(name: str) -> list[FloatArray]:
     return [found.y, np.asarray(found.sensitivity)]
 
 
-ENTRIES = 128
 LAST_PLACE = 2.0**-52
 CODE = """
 #include "exact_math.h"
@@ -422,36 +418,6 @@ def arguments(name: str) -> FloatArray:
     if name == "v_exp":
         return np.concatenate([np.linspace(-708.0, 709.0, 100_003), np.linspace(-1, 1, 10_001)])
     return np.concatenate([np.geomspace(1e-300, 1e300, 100_003), np.linspace(0.7, 1.5, 10_001)])
-
-
-def numbers(table: str) -> list[float]:
-    text = (sources_directory() / "exact_tables.h").read_text()
-    body = text[text.index(table) :].split("= {", 1)[1].split("};", 1)[0]
-    return [float.fromhex(q) for q in re.findall(r"-?0x1\.[0-9a-f]+p[+-]\d+|0x0\.0p\+0", body)]
-
-
-def from_bits(bits: int) -> float:
-    return float(struct.unpack("<d", struct.pack("<Q", bits))[0])
-
-
-def test_powers_in_the_table_are_rounded_correctly() -> None:
-    with localcontext() as context:
-        context.prec = 60
-        exact = [float(Decimal(2) ** (Decimal(i) / ENTRIES)) for i in range(ENTRIES)]
-    assert numbers("EXP_TABLE") == exact
-
-
-def test_logarithms_in_the_table_are_rounded_correctly() -> None:
-    found = numbers("LOG_TABLE")
-    assert len(found) == 2 * ENTRIES
-    first = struct.unpack("<Q", struct.pack("<d", float(np.sqrt(0.5))))[0]
-    for i, (inverse, log) in enumerate(zip(found[::2], found[1::2], strict=True)):
-        with localcontext() as context:
-            context.prec = 60
-            assert log == float(-Decimal(inverse).ln())
-        assert inverse * 2.0**12 == round(inverse * 2.0**12)  # 13 bits: m / c is nearly exact
-        for edge in (i, i + 1):
-            assert abs(from_bits(first + (edge << 45)) * inverse - 1.0) < 0.0041
 
 
 @pytest.mark.parametrize("lanes", [1, 4])
