@@ -9,12 +9,12 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import Structure
 from psa_casadi.simulation.compiler import sources_directory
 from psa_casadi.simulation.exact.run import FINEST, MOST_IN_LANES, NotExact, model_text, time_steps
+from psa_casadi.units import FloatArray
 
 #: Options of its compiler: functions without a place are the device's; products and sums are
 #: rounded one by one, as on the CPU.
@@ -40,8 +40,6 @@ def kernel_text(structure: Structure, output: str) -> str:
 
     return text("exact_kernel.cu")
 
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Sets in one launch at most, threads of a block, and the share of free memory that is taken.
 BATCH, _BLOCK, _SHARE = 1 << 17, 128, 0.5

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from psa_casadi import reference
@@ -17,9 +16,9 @@ from psa_casadi.online import (
     identifier_for,
     stack_values,
 )
+from psa_casadi.units import FloatArray
 from tests.tiers import slow
 
-FloatArray = NDArray[np.float64]
 STACK, PERIOD, NOISE = "P-885.51", 5e-4, 2e-8
 #: The last part of a run of 2 s: 0.8 s, four of its periods.
 LAST = slice(-1600, None)

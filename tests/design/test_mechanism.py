@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from psa_casadi.design.mechanism.loop import (
@@ -27,8 +26,8 @@ from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.units import FloatArray
 
-FloatArray = NDArray[np.float64]
 STACK = "PTBS200"
 #: A mechanism of 60 g, 900 N.s/m, 8 N/um: enough to move every pole of the stack.
 HEAVY = Mounting(0.06, 900.0, 8e6)

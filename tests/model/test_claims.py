@@ -7,7 +7,6 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.component import READ_OFF, RECORD_DURATION, Component
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
@@ -17,12 +16,10 @@ from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.compiler import functions_of, generate_c, shared_library
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import convert
+from psa_casadi.units import FloatArray, convert
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 from tests.model.random_models import Point, random_model, random_point
 from tests.tiers import slow, slow_but
-
-FloatArray = NDArray[np.float64]
 
 ALL = tuple(EFFECTS.values())
 _draw = random.Random(20)  # pairs and triples: all of them would take too long

@@ -21,12 +21,11 @@ from psa_casadi.model.parts import PARTS, compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.modelica_runs import simulated
 from tests.studies.benchmarks.nonlinearity import Controller, simulate_positioner
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 STACK = "P-885.51"
 VALUES = {name: figure.value for name, figure in STACKS[STACK].values.items()}

@@ -8,7 +8,6 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi import reference
 from psa_casadi.component import Component, Equations
@@ -30,6 +29,7 @@ from psa_casadi.simulation.exact.run import run_exact, why_not
 from psa_casadi.simulation.exact.split import Split, split_of
 from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, simulate
 from psa_casadi.simulation.start import start_on
+from psa_casadi.units import FloatArray
 from tests.export.c_host.build import tool
 from tests.model.sampled_models import loop
 from tests.model.stack_models import stack
@@ -53,8 +53,6 @@ from tests.simulation.exact_cases import (
 )
 from tests.studies.benchmarks.fits import demonstration
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 RTOL = 1e-6
 SAMPLES = 1500

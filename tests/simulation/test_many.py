@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
@@ -18,12 +17,11 @@ from psa_casadi.simulation import device
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on, starts_on
+from psa_casadi.units import FloatArray
 from tests.model.stack_models import stack
 from tests.simulation.cuda_host import HostCuda, lend
 from tests.simulation.exact_cases import KINK
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 
 def record(uneven: bool = False) -> Record:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from psa_casadi.components import BASE
@@ -20,9 +19,8 @@ from psa_casadi.simulation.compiler import fingerprint, generate_c
 from psa_casadi.simulation.simulate import input_samples, simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import SOURCES, SimulationError, run
+from psa_casadi.units import FloatArray
 from tests.model.stack_models import LINEAR, jacobian, sine, stack
-
-FloatArray = NDArray[np.float64]
 
 
 @pytest.mark.parametrize(
