@@ -116,22 +116,34 @@ def test_the_error_keeps_to_other_tolerances(name: str, rtol: float) -> None:
     assert way == (EXACT if rtol >= 1e-6 else STEPPER)
 
 
-@pytest.mark.parametrize("name", ["base", "backlash", "voltage_saturation"])
-def test_held_inputs_agree(name: str) -> None:
-    """Every sample begins with a jump."""
-    relative = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
-    found, way = compare(with_effect(name), times(600, 1e-4), relative, hold="zero")
-    assert found <= RTOL
-    assert way == EXACT or name == "voltage_saturation"  # a corner of the clip at every jump
+_EVEN, _SLOW = times(600, 1e-4), times(200, 1e-3)
+_UNEVEN = np.cumsum(np.repeat([1e-4, 1e-3, 2.5e-5], 200))
+_JUMPING = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
+#: Effect or component, times, voltage over the rated one, hold.
+CASES: list[tuple[str | Component, FloatArray, FloatArray, str]] = [
+    *((n, _EVEN, _JUMPING, "zero") for n in ("base", "backlash", "voltage_saturation")),
+    *((n, _UNEVEN, voltage("sine", _UNEVEN / _UNEVEN[-1]), "linear") for n in ("base", "backlash")),
+    *(
+        (n, _EVEN, 0.4 * (1.0 - np.cos(300.0 * _EVEN + shift)), "linear")
+        for n in ("base", "slow_creep", "sensor_delay")
+        for shift in (np.pi / 2, np.pi)  # in motion, at the top
+    ),
+    *((c, _SLOW, voltage("sine", _SLOW / _SLOW[-1]), "linear") for c in (LAG, CUBIC, JUMP)),
+]
 
 
-@pytest.mark.parametrize("name", ["base", "backlash"])
-def test_a_few_time_steps_in_one_record(name: str) -> None:
-    t = np.cumsum(np.repeat([1e-4, 1e-3, 2.5e-5], 200))
-    relative = voltage("sine", t / t[-1])
-    found, way = compare(with_effect(name), t, relative)
-    assert found <= RTOL
-    assert way == EXACT
+@pytest.mark.parametrize(("what", "t", "relative", "hold"), CASES, ids=range(len(CASES)))
+def test_held_inputs_few_time_steps_any_start_and_own_components_agree(
+    what: str | Component, t: FloatArray, relative: FloatArray, hold: str
+) -> None:
+    """The stepper is taken for a corner of the clip at every jump, and where equations jump."""
+    if isinstance(what, Component):
+        model, most = compose((*BASE, what), stack("P-885.51").values), 2 * RTOL
+    else:
+        model, most = with_effect(what), RTOL
+    found, way = compare(model, t, relative, hold=hold)
+    assert found <= most  # the stepper does not look for the jump
+    assert way == (STEPPER if what is JUMP else EXACT) or what == "voltage_saturation"
 
 
 def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
@@ -145,28 +157,6 @@ def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
     # clocks tell times to a few digits only: that is no other step
     rounded = np.round(times(300, 1e-3), 9) + 1.0e-3 * 2e-7 * rng.standard_normal(300)
     assert simulate(model, rounded, v).way == EXACT
-
-
-@pytest.mark.parametrize("name", ["base", "slow_creep", "sensor_delay"])
-@pytest.mark.parametrize("shift", [np.pi / 2, np.pi], ids=["in motion", "at the top"])
-def test_a_record_may_start_anywhere(name: str, shift: float) -> None:
-    t = times(600, 1e-4)
-    found, way = compare(with_effect(name), t, 0.4 * (1.0 - np.cos(300.0 * t + shift)))
-    assert found <= RTOL
-    assert way == EXACT
-
-
-@pytest.mark.parametrize(
-    ("component", "expected"),
-    [(LAG, EXACT), (CUBIC, EXACT), (JUMP, STEPPER)],
-    ids=["lag", "spring", "jump"],
-)
-def test_a_component_of_one_s_own_agrees_or_is_stepped(component: Component, expected: str) -> None:
-    model = compose((*BASE, component), stack("P-885.51").values)
-    t = times(200, 1e-3)
-    found, way = compare(model, t, voltage("sine", t / t[-1]))
-    assert found <= 2 * RTOL  # the stepper does not look for the jump
-    assert way == expected
 
 
 TONES = [2.5e-4, *(pytest.param(q, marks=slow) for q in (3.1e-4, 1.25e-4, 6.25e-5))]
