@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -46,7 +46,10 @@ class Block:
     Raises InputError for a value that is out of bounds.
     """
 
-    def __init__(self, component: Component, values: Mapping[str, float]) -> None:
+    _component: ClassVar[Component]
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        component = self._component
         own = {p.name: values[p.name] for p in component.parameters}
         model = compose([component], own, name=component.name, description=component.description)
         self._begin(model, [state.start for state in component.sampled])
@@ -167,8 +170,7 @@ class HysteresisObserver(Block):
     `values` are those of `stack_values`.
     """
 
-    def __init__(self, values: Mapping[str, float]) -> None:
-        super().__init__(HYSTERESIS_OBSERVER, values)
+    _component = HYSTERESIS_OBSERVER
 
     def step(self, voltage: float) -> float:
         """Take one sample of the voltage [V] and return the hysteresis force [N]."""
@@ -185,8 +187,7 @@ class FeedForward(Following):
     of `stack_values`.
     """
 
-    def __init__(self, values: Mapping[str, float]) -> None:
-        super().__init__(FEED_FORWARD, values)
+    _component = FEED_FORWARD
 
     def step(self, wanted: float) -> float:
         """Return the voltage [V] for a wanted displacement [m].
@@ -264,8 +265,7 @@ class OnlineIdentification(_Learning):
     voltage stands still.
     """
 
-    def __init__(self, values: Mapping[str, float]) -> None:
-        super().__init__(ONLINE_IDENTIFICATION, values)
+    _component = ONLINE_IDENTIFICATION
 
     def step(self, voltage: float, displacement: float) -> float:
         """Take one sample [V], [m] and return the estimated hysteresis force [N]."""
@@ -282,8 +282,7 @@ class AdaptiveFeedForward(_Learning, Following):
     stiffness, so that the gain from wish to displacement is held too while k_L drifts.
     """
 
-    def __init__(self, values: Mapping[str, float]) -> None:
-        super().__init__(ADAPTIVE_FEED_FORWARD, values)
+    _component = ADAPTIVE_FEED_FORWARD
 
     def step(self, wanted: float, measured: float) -> float:
         """Return the voltage [V] for the next wanted displacement [m].

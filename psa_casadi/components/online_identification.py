@@ -7,6 +7,7 @@ steps. Every sample takes the same operations.
 """
 
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
@@ -130,7 +131,8 @@ _PARAMETERS = (
     Parameter("spread", 0.3, "1", (1e-6, 10.0), "how far the starts may be off, as a share"),
 )
 
-ONLINE_IDENTIFICATION = Component(
+_block = partial(Component, belongs_to="drive", sample_period="period")
+ONLINE_IDENTIFICATION = _block(
     name="online_identification",
     description="recursive least squares of the hysteresis parameters, one sample in, one out",
     source="Yang and Zhu 2015, eq. 38; Ljung and Soderstrom 1983, chapter 3",
@@ -138,11 +140,9 @@ ONLINE_IDENTIFICATION = Component(
         "e = K x - (k_L u_lag + f_lag + offset);  z+ = z + P d e/(noise^2 + d'P d);"
         "  P+ = S (P - P d d'P/(noise^2 + d'P d)) S;  d: derivatives of the prediction"
     ),
-    belongs_to="drive",
     equations=_online_identification,
     parameters=_PARAMETERS,
     sampled=SAMPLED,
-    sample_period="period",
     inputs=(_VOLTAGE_IN, _POSITION),
     outputs=(
         *_ESTIMATES,
@@ -215,40 +215,35 @@ def _adaptive(s: Symbols) -> Equations:
     )
 
 
-HYSTERESIS_OBSERVER = Component(
+HYSTERESIS_OBSERVER = _block(
     name="hysteresis_observer",
     description="observer of the hysteresis force on the known voltage, one sample in, one out",
     source=f"{_PAPER} observer (37)",
     equation_text="f_H+ = f_H by (8) along the line from u- to u",
-    belongs_to="drive",
     equations=_observer,
     parameters=_OBSERVING,
     sampled=_LAST,
-    sample_period="period",
     inputs=(_VOLTAGE_IN,),
     outputs=(_FORCE, _CORRECTION),
 )
 
-FEED_FORWARD = Component(
+FEED_FORWARD = _block(
     name="feed_forward",
     description="voltage for a wanted displacement of a stack, its hysteresis taken off, sampled",
     source=f"{_PAPER} observer (37), compensation (39) to (41)",
     equation_text="k_L u + f_H(u) = K w for u;  f_H(u) by (8) along the line from u-",
-    belongs_to="drive",
     equations=_feed_forward,
     parameters=_OBSERVING,
     sampled=(*_LAST, _WANTED_LAST),
-    sample_period="period",
     inputs=(_WANTED,),
     outputs=(_VOLTAGE, _FORCE),
 )
 
-ADAPTIVE_FEED_FORWARD = Component(
+ADAPTIVE_FEED_FORWARD = _block(
     name="adaptive_feed_forward",
     description="feed-forward whose hysteresis parameters follow the measured displacement",
     source=f"{_PAPER} equations (37) to (41)",
     equation_text="as feed_forward, with A, beta, gamma, delta, n, k_L of online_identification",
-    belongs_to="drive",
     equations=_adaptive,
     parameters=ONLINE_IDENTIFICATION.parameters,
     sampled=(
@@ -256,7 +251,6 @@ ADAPTIVE_FEED_FORWARD = Component(
         State("applied", "V", "voltage that was returned last", voltage_scale),
         _WANTED_LAST,
     ),
-    sample_period="period",
     inputs=(_WANTED, _POSITION),
     outputs=(_VOLTAGE, *_ESTIMATES, _FORCE),
 )

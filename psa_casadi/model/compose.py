@@ -166,11 +166,8 @@ class Model(Celled):
 
     def with_declared_starts(self) -> "Model":
         """Return the model with the start values that its components declare."""
-        return (
-            self
-            if not self.own_starts()
-            else replace(self, structure=structure_of(self.components))
-        )
+        own = self.own_starts()
+        return replace(self, structure=structure_of(self.components)) if own else self
 
     def with_starts(self, starts: Mapping[str, float]) -> "Model":
         """Return the model with other start values of states and inputs (SI units).
@@ -191,9 +188,7 @@ class Model(Celled):
         ]
         if problems:
             raise InputError(problems)
-        states = tuple(replace(q, start=float(starts.get(q.name, q.start))) for q in s.states)
-        inputs = tuple(replace(q, start=float(starts.get(q.name, q.start))) for q in s.inputs)
-        return replace(self, structure=replace(s, states=states, inputs=inputs))
+        return replace(self, structure=s.started(starts))
 
     def with_effect(self, effect: Component, values: Mapping[str, float] | None = None) -> "Model":
         """Return the model with one more effect, at its default gain of 0 unless given."""

@@ -12,8 +12,8 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.parts import compensator_for, part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.model.system import System
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 #: A mode that is better damped needs no notch.

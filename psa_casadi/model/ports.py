@@ -63,7 +63,7 @@ def ports_of(model: Model) -> tuple[Port, ...]:
         *(
             Port("rate", q.name, rate_unit(_si(q.unit)))
             for q in states
-            if not _is_definition(s.der[q.name])
+            if not ca.SX(s.der[q.name]).is_symbolic()
         ),
         *(Port("output", o.name, _si(o.unit)) for c in base for o in c.outputs),
     )
@@ -89,7 +89,13 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
     own = [p for p in sorted(ports, key=lambda p: p.balance) if p.variable in names[p.kind]]
     if component.gain is not None or not own:
         return component
-    balances = [b for p in own for b in _balances(p)]
+    about = {"input": "what acts in the place of ", "rate": "", "output": "what is shown of "}
+    balances = []
+    for p in own:
+        if p.kind == "output":
+            true = true_output(p.variable)
+            balances.append(Balance(true, p.unit, f"{p.words} before its sensor"))
+        balances.append(Balance(p.balance, p.unit, about[p.kind] + p.words))
     return replace(component, equations=_opened(component, own), balances=tuple(balances))
 
 
@@ -100,19 +106,6 @@ def state_unit(model: Model, name: str) -> str:
 
 def _si(unit: str) -> str:
     return si_unit(unit) if unit else "1"
-
-
-def _balances(port: Port) -> list[Balance]:
-    about = {
-        "input": f"what acts in the place of {port.words}",
-        "rate": port.words,
-        "output": f"what is shown of {port.words}",
-    }
-    found = [Balance(port.balance, port.unit, about[port.kind])]
-    if port.kind == "output":
-        words = f"{port.words} before its sensor"
-        found.insert(0, Balance(true_output(port.variable), port.unit, words))
-    return found
 
 
 def _opened(component: Component, ports: list[Port]) -> Callable[[Symbols], Equations]:
@@ -147,7 +140,3 @@ class _Replaced(Symbols):
     def __getattr__(self, name: str) -> Expression:
         table = self.__dict__["_table"]
         return table[name] if name in table else getattr(self.__dict__["_symbols"], name)
-
-
-def _is_definition(rate: Expression) -> bool:
-    return bool(ca.SX(rate).is_symbolic())

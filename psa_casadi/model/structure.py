@@ -123,7 +123,14 @@ class Structure:
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle the components and the starts: the equations are composed again from them."""
         starts = {q.name: q.start for q in self.states} | {i.name: i.start for i in self.inputs}
-        return _with_starts, (self.components, starts)
+        return _composed, (self.components, starts)
+
+    def started(self, starts: Mapping[str, float]) -> "Structure":
+        """Return the same with other starts of states and inputs; itself where none differs."""
+        states = tuple(replace(q, start=float(starts.get(q.name, q.start))) for q in self.states)
+        inputs = tuple(replace(q, start=float(starts.get(q.name, q.start))) for q in self.inputs)
+        same = (states, inputs) == (self.states, self.inputs)
+        return self if same else replace(self, states=states, inputs=inputs)
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
@@ -252,13 +259,8 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     )
 
 
-def _with_starts(components: tuple[Component, ...], starts: Mapping[str, float]) -> Structure:
-    s = structure_of(components)
-    states = tuple(replace(q, start=starts[q.name]) for q in s.states)
-    inputs = tuple(replace(q, start=starts[q.name]) for q in s.inputs)
-    return (
-        s if (states, inputs) == (s.states, s.inputs) else replace(s, states=states, inputs=inputs)
-    )
+def _composed(components: tuple[Component, ...], starts: Mapping[str, float]) -> Structure:
+    return structure_of(components).started(starts)
 
 
 def _column(parts: Iterable[Expression]) -> Expression:

@@ -131,17 +131,12 @@ def run_compiler(command: Sequence[str], directory: Path) -> None:
     if done.returncode and full in complaint:
         raise OSError(errno.ENOSPC, full, str(directory))
     if done.returncode:
+        killed = f", killed by signal {-done.returncode}; too little memory is the likely cause"
         raise MachineError(
-            f"The C compiler failed ({' '.join(command[:3])} ...){_how(done.returncode)}:\n"
+            f"The C compiler failed ({' '.join(command[:3])} ...)"
+            f"{killed if done.returncode < 0 else ''}:\n"
             f"{complaint[-4000:]}\n{_CURE[0].upper()}{_CURE[1:]}"
         )
-
-
-def _how(code: int) -> str:
-    """Say what stopped a compiler that was killed."""
-    if code >= 0:
-        return ""
-    return f", killed by signal {-code}; too little memory is the likely cause"
 
 
 def shared_library(
@@ -163,7 +158,14 @@ def generated_library(
     """
     folder = sources_directory()
     command = compiler_command()
-    flags = (*flags, *_wanted_flags())
+    wanted = os.environ.get(FLAGS_VARIABLE, "")
+    try:
+        flags = (*flags, *shlex.split(wanted))
+    except ValueError as error:
+        raise MachineError(
+            f"{FLAGS_VARIABLE} is {wanted!r}, which is no row of flags ({error}); set it to flags"
+            " of the C compiler, such as -Og, or unset it."
+        ) from error
     digest = hashlib.sha256(
         repr((command, OPTIMISE, flags, platform.machine(), sys.platform)).encode()
     )
@@ -172,7 +174,9 @@ def generated_library(
     suffix = {"Windows": ".dll", "Darwin": ".dylib"}.get(platform.system(), ".so")
     name = digest.hexdigest()[:32] + suffix
     files = [str(folder / s) for s in sources]
-    with _turn_of(name):
+    with _TURNS_LOCK:
+        turn = _TURNS[name]  # of threads that want the same one, the first makes it
+    with turn:
         try:
             return cached(
                 "models", name, lambda work: _compile(work, suffix, generate(), files, flags), _load
@@ -198,30 +202,12 @@ _TURNS: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 _TURNS_LOCK = threading.Lock()
 
 
-def _turn_of(name: str) -> threading.Lock:
-    """Return the lock of a library: of threads that want the same one, the first makes it."""
-    with _TURNS_LOCK:
-        return _TURNS[name]
-
-
 def _load(path: Path) -> None:
     """Load a library; raise OSError where the system refuses it."""
     try:
         ctypes.CDLL(str(path))
     except OSError as error:
         raise OSError(errno.ENOEXEC, str(error), str(path.parent)) from error
-
-
-def _wanted_flags() -> list[str]:
-    """Return the user's own flags; raise MachineError where their quotes have no end."""
-    wanted = os.environ.get(FLAGS_VARIABLE, "")
-    try:
-        return shlex.split(wanted)
-    except ValueError as error:
-        raise MachineError(
-            f"{FLAGS_VARIABLE} is {wanted!r}, which is no row of flags ({error}); set it to flags"
-            " of the C compiler, such as -Og, or unset it."
-        ) from error
 
 
 def _compile(
@@ -300,24 +286,20 @@ def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.F
     s = structure
     arguments = c_arguments(s)
     x, xdot = arguments[1], c_slopes(s)
-    jacobian = ca.densify(s.jacobian(xdot, x))
-    switches: Expression = ca.vertcat(ca.SX(0, 1), *s.switches.values())
+    jacobian = s.jacobian(xdot, x)
     table = {
-        "psa_ode": [ca.densify(xdot)],
+        "psa_ode": [xdot],
         "psa_jacobian": [jacobian],
-        "psa_outputs": [ca.densify(s.y)],
-        "psa_switches": [ca.densify(switches)],
+        "psa_outputs": [s.y],
+        "psa_switches": [ca.vertcat(ca.SX(0, 1), *s.switches.values())],
     }
     if s.sampled:
-        table["psa_sample"] = [ca.densify(s.znext)]
+        table["psa_sample"] = [s.znext]
     if sensitivities:
-        table["psa_sensitivity"] = [jacobian, ca.densify(s.jacobian(xdot, s.p))]
-        table["psa_output_sensitivity"] = [
-            ca.densify(s.jacobian(s.y, x)),
-            ca.densify(s.jacobian(s.y, s.p)),
-        ]
+        table["psa_sensitivity"] = [jacobian, s.jacobian(xdot, s.p)]
+        table["psa_output_sensitivity"] = [s.jacobian(s.y, x), s.jacobian(s.y, s.p)]
     return {
-        name: ca.Function(name, arguments, ca.cse(outputs), {"cse": True})
+        name: ca.Function(name, arguments, ca.cse([ca.densify(e) for e in outputs]), {"cse": True})
         for name, outputs in table.items()
     }
 
@@ -365,7 +347,7 @@ def fingerprint(structure: Structure) -> str:
     """Return text that differs where the generated files differ, in a thirtieth of their time."""
     s = structure
     switches: Expression = ca.vertcat(ca.SX(0, 1), *s.switches.values())
-    period = [q.name for q in s.parameters].index(s.period) if s.period else None
+    period = s.parameter_names.index(s.period) if s.period else None
     equations = ca.Function("f", c_arguments(s), [c_slopes(s), s.y, switches, s.znext])
     sizes = (len(s.states), len(s.parameters), len(s.sampled), period)
     generator = Path(__file__).read_text(encoding="utf-8")
@@ -381,9 +363,7 @@ def _config(structure: Structure, functions: list[ca.Function], sensitivities: b
         "PSA_NY": len(structure.outputs),
         "PSA_NZ": len(structure.switches),
         "PSA_NS": len(structure.sampled),
-        "PSA_PERIOD": next(
-            (i for i, p in enumerate(structure.parameters) if p.name == structure.period), 0
-        ),
+        "PSA_PERIOD": structure.parameter_names.index(structure.period) if structure.period else 0,
         "PSA_SZ_ARG": max(4, *(f.sz_arg() for f in functions)),
         "PSA_SZ_RES": max(2, *(f.sz_res() for f in functions)),
         "PSA_SZ_IW": max(1, *(f.sz_iw() for f in functions)),

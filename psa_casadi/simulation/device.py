@@ -9,12 +9,12 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.model.compose import Structure
 from psa_casadi.simulation.compiler import sources_directory
 from psa_casadi.simulation.exact.run import FINEST, MOST_IN_LANES, NotExact, model_text, time_steps
+from psa_casadi.units import FloatArray
 
 #: Options of its compiler: functions without a place are the device's; products and sums are
 #: rounded one by one, as on the CPU.
@@ -40,8 +40,6 @@ def kernel_text(structure: Structure, output: str) -> str:
 
     return text("exact_kernel.cu")
 
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Sets in one launch at most, threads of a block, and the share of free memory that is taken.
 BATCH, _BLOCK, _SHARE = 1 << 17, 128, 0.5
@@ -118,19 +116,50 @@ def run_on_device(
     model and record are not for exact steps, MachineError where the device fails.
     """
     with _failures():
-        launch = _Launch(device_module(), task, whole=whole)
+        cupy = device_module()
+        try:
+            lengths, which_step = time_steps(task.t)
+            kernels = _kernels(cupy, task.structure, task.output)
+        except NotExact as error:
+            raise InputError(
+                f"device='cuda' is for models and records that exact steps fit: {error}; choose"
+                f" another, {_INSTEAD}"
+            ) from error
+        n, s = len(task.t), task.structure
+        record = [cupy.asarray(np.ascontiguousarray(a)) for a in (task.t, task.u)]
+        steps = [np.int32(len(lengths)), cupy.asarray(lengths), cupy.asarray(which_step)]
+        meant, size = cupy.asarray(task.meant), cupy.empty(1, np.int64)
+        measure = kernels.get_function("psa_exact_room")
+        measure((1,), (1,), (steps[0], np.int32(FINEST), size))
+        room = int(cupy.asnumpy(size)[0])
+        each = 8 * (len(s.parameters) + 2 * len(s.states) + 4 + (2 * n if whole else 0)) + room
+        batch = int(max(1, min(BATCH, _SHARE * cupy.cuda.Device().mem_info[0] / each)))
+    rooms: Any = None
     waiting: tuple[Any, Any] | None = None
-    for which in parts(launch.batch):
-        given = numbers(which)
+    for which in (*parts(batch), None):
+        given = None if which is None else numbers(which)
         with _failures():
-            found = launch.fetched(*waiting) if waiting is not None else None
-            waiting = launch(given)
+            found = None
+            if waiting is not None:
+                summary, shown = waiting
+                kept = Summary(*cupy.asnumpy(summary))
+                found = kept, cupy.asnumpy(shown).T if whole else None
+            if given is not None:
+                sets = given.p.shape[1]
+                if rooms is None:  # the first batch is the largest
+                    rooms = cupy.empty(max(1, sets * room), np.int8)
+                waiting = cupy.empty((4, sets)), cupy.empty((n, sets)) if whole else np.intp(0)
+                arguments = (
+                    np.int64(sets), np.int64(n), *record, np.int32(0), *steps,
+                    *(cupy.asarray(np.ascontiguousarray(a)) for a in given),
+                    np.float64(task.tolerance), np.int32(FINEST),
+                    np.int64(min(MOST_IN_LANES * n, 2**31 - 1)), meant, rooms, np.int64(room),
+                    *waiting,
+                )  # fmt: skip
+                launch = kernels.get_function("psa_exact_sets")
+                launch((-(-sets // _BLOCK),), (_BLOCK,), arguments)
         if found is not None:
             yield found
-    if waiting is not None:
-        with _failures():
-            found = launch.fetched(*waiting)
-        yield found
 
 
 @contextmanager
@@ -144,59 +173,6 @@ def _failures() -> Iterator[None]:
             " a CuPy without CUDA's compiler (`pip install 'psa-casadi[gpu]'` brings it) is the"
             f" likely cause: mend it, {_INSTEAD}"
         ) from error
-
-
-class _Launch:
-    """A task on the device: what all batches share, and one launch of the kernel a batch."""
-
-    def __init__(self, cupy: Any, task: Task, *, whole: bool) -> None:
-        self._cupy, self._whole, self._task = cupy, whole, task
-        try:
-            lengths, which_step = time_steps(task.t)
-            self._kernels = _kernels(cupy, task.structure, task.output)
-        except NotExact as error:
-            raise InputError(
-                f"device='cuda' is for models and records that exact steps fit: {error}; choose"
-                f" another, {_INSTEAD}"
-            ) from error
-        self._record = [cupy.asarray(np.ascontiguousarray(a)) for a in (task.t, task.u)]
-        self._steps = [cupy.asarray(lengths), cupy.asarray(which_step)]
-        self._meant = cupy.asarray(task.meant)
-        size = cupy.empty(1, np.int64)
-        measure = self._kernels.get_function("psa_exact_room")
-        measure((1,), (1,), (np.int32(len(lengths)), np.int32(FINEST), size))
-        self._room = int(cupy.asnumpy(size)[0])
-        states, rows = len(task.structure.states), len(task.structure.parameters)
-        each = self._room + 8 * (rows + 2 * states + 4 + (2 * len(task.t) if whole else 0))
-        free = cupy.cuda.Device().mem_info[0]
-        self.batch = int(max(1, min(BATCH, _SHARE * free / each)))
-        self._rooms: Any = None
-
-    def __call__(self, numbers: Numbers) -> tuple[Any, Any]:
-        """Launch the kernel for a batch; return the summary (4, m) and (n, m) on the device."""
-        cupy, task, sets, n = self._cupy, self._task, numbers.p.shape[1], len(self._task.t)
-        if self._rooms is None:  # the first batch is the largest
-            self._rooms = cupy.empty(max(1, sets * self._room), np.int8)
-        summary = cupy.empty((4, sets))
-        shown = cupy.empty((n, sets)) if self._whole else np.intp(0)  # NULL
-        self._kernels.get_function("psa_exact_sets")(
-            (-(-sets // _BLOCK),),
-            (_BLOCK,),
-            (
-                np.int64(sets), np.int64(n), *self._record, np.int32(0),
-                np.int32(len(self._steps[0])), *self._steps,
-                *(cupy.asarray(np.ascontiguousarray(a)) for a in numbers),
-                np.float64(task.tolerance), np.int32(FINEST),
-                np.int64(min(MOST_IN_LANES * n, 2**31 - 1)), self._meant, self._rooms,
-                np.int64(self._room), summary, shown,
-            ),
-        )  # fmt: skip
-        return summary, shown
-
-    def fetched(self, summary: Any, shown: Any) -> tuple[Summary, FloatArray | None]:
-        """Wait for a batch; return what it left."""
-        kept = Summary(*self._cupy.asnumpy(summary))
-        return kept, self._cupy.asnumpy(shown).T if self._whole else None
 
 
 @cache

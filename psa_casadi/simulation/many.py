@@ -16,9 +16,8 @@ from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Way, output_of, record_inputs, trace
 from psa_casadi.simulation.start import start_on, starts_on
 from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
-
-FloatArray = npt.NDArray[np.float64]
 
 ReductionName = Literal["range", "peak", "last", "misfit"]
 _Reduce = Callable[[FloatArray], npt.ArrayLike]

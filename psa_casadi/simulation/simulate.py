@@ -15,8 +15,7 @@ from psa_casadi.shown import Shown, frame, with_units
 from psa_casadi.simulation.exact.run import NotExact, run_exact
 from psa_casadi.simulation.start import start_on, start_state
 from psa_casadi.simulation.stepper import Steps, run
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Outputs that are the displacement a model shows, the first that it has.
 SHOWN = ("measured_displacement", "displacement")

@@ -16,8 +16,8 @@ import numpy.typing as npt
 from psa_casadi.component import Expression
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model, Structure
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 _NEWTON_STEPS = 30

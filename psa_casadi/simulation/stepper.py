@@ -19,8 +19,7 @@ from psa_casadi.interruption import flag_address
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import fingerprint, generate_c, generated_library
 from psa_casadi.simulation.timings import count_run
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: The files of `fmu_src` that integrate a model.
 SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")

@@ -68,18 +68,15 @@ class Timings:
     def count(self, *, differentiated: bool) -> None:
         """Count one simulation."""
         with self._lock:
-            now = self._present()
+            now = self._spent[self._within[-1]]
             more = now.differentiated + differentiated
             self._spent[now.name] = replace(now, runs=now.runs + 1, differentiated=more)
-
-    def _present(self) -> Stage:
-        return self._spent[self._within[-1]]
 
     def _settle(self) -> None:
         """Add the time since the last change to the present stage."""
         with self._lock:
             now, since = (time.perf_counter(), time.process_time()), self._since
-            stage, self._since = self._present(), now
+            stage, self._since = self._spent[self._within[-1]], now
             wall, processor = (b - a for a, b in zip(since, now, strict=True))
             self._spent[stage.name] = replace(
                 stage, wall=stage.wall + wall, processor=stage.processor + processor

@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Parameters that the identification tracks, in its order.
 TRACKED = ("A", "beta", "gamma", "delta", "n", "k_L", "offset")

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
 from psa_casadi.design.experiment.experiment import usual_records
-from psa_casadi.design.experiment.limits import Limits, excess
+from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record, write_record
@@ -16,25 +16,6 @@ from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow
 
 STACK = "P-885.51"
-
-
-@slow
-def test_the_command_writes_a_voltage_that_can_be_played(tmp_path: Path) -> None:
-    output, page = tmp_path / "voltage.csv", tmp_path / "page.html"
-    arguments = [
-        "design", "experiment", "--stack", STACK, "--duration", "0.5", "--samples", "60",
-        "--high", "60", "--current", "0.01", "--family", "triangles", "--starts", "1",
-        "--separate", "sensor_nonlinearity", "slow_creep", "-o", str(output), "--report", str(page),
-        "--still",
-    ]  # fmt: skip
-    found = CliRunner().invoke(app, arguments)
-    assert found.exit_code == 0, found.output
-    assert "sensor nonlinearity" in found.output
-    record = read_record(output, need_displacement=False)
-    limits = Limits(0.0, 60.0, 0.5, 60, current=0.01)
-    assert record.n == 60
-    assert excess(record, limits, stack_model(STACK).values["C_p"]) == ()
-    assert "The voltage to apply" in page.read_text(encoding="utf-8")
 
 
 @slow

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from psa_casadi import reference
 from psa_casadi.errors import InputError
-from psa_casadi.examples.linearisation_trial import DriftingStack, Drive, ageing, driven, off_values
-from psa_casadi.model.parts import compensator_for, part_model
+from psa_casadi.examples.linearisation_trial import DriftingStack, ageing, driven, off_values
+from psa_casadi.model.parts import part_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.online import (
     AdaptiveFeedForward,
@@ -17,12 +16,9 @@ from psa_casadi.online import (
     identifier_for,
     stack_values,
 )
-from psa_casadi.simulation.stepper import run
-from tests.studies.plants.base import simulate_base
-from tests.studies.plants.stack import draw_stack
+from psa_casadi.units import FloatArray
 from tests.tiers import slow
 
-FloatArray = NDArray[np.float64]
 STACK, PERIOD, NOISE = "P-885.51", 5e-4, 2e-8
 #: The last part of a run of 2 s: 0.8 s, four of its periods.
 LAST = slice(-1600, None)
@@ -100,49 +96,6 @@ def test_an_ageing_stack_is_followed() -> None:
     assert figures[1] < 0.2 * figures[0]
 
 
-def test_feed_forward_on_an_independent_stack() -> None:
-    """The plant of `studies/plants` (partial fractions, other shapes) is made linear as well."""
-    stack = draw_stack(np.random.default_rng(5))
-    names = {"A": stack.a, "beta": stack.beta, "gamma": stack.gamma, "delta": stack.delta}
-    model = stack_model(STACK).with_values(
-        {
-            **names, "n": stack.n, "h_ref": stack.h_ref, "hold_rate": stack.hold_rate,
-            "u_rated": stack.u_rated, "k_L": stack.k_l, "tau": stack.tau, "R_s": stack.r_s,
-            "C_p": stack.c_p_el, "m_P": stack.m_p, "c_P": stack.c_p, "k_P": stack.k_p,
-            "m_B": stack.m_b, "c_B": stack.c_b, "k_B": stack.k_b,
-        }
-    )  # fmt: skip
-    time = np.arange(0.0, 1.0, 1e-3)
-    wanted = 0.4 * stack.u_rated * (1.0 - np.cos(2.0 * np.pi * 3.0 * time)) * (1.0 - 0.4 * time)
-    forward = FeedForward(stack_values(model, 1e-3))
-    applied = np.array([forward.step_voltage(w) for w in wanted.tolist()])
-    rest = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
-    bare = DriftingStack({**model.values, **rest}, 1e-3)
-    line = np.array([bare.step(w) for w in wanted.tolist()])
-
-    def nonlinearity(voltage: FloatArray) -> float:
-        x = simulate_base(stack, time, voltage, 12).displacement
-        return Drive(time, wanted, voltage, x, line).nonlinearity()
-
-    before, after = nonlinearity(wanted), nonlinearity(applied)
-    assert before > 0.04
-    assert after < 0.02 * before
-
-
-def test_feed_forward_agrees_with_the_compensator_part() -> None:
-    """The continuous compensator, which lags by its drive, gives the voltage of the stream."""
-    model = stack_model(STACK)
-    part, time = compensator_for(model), np.arange(0.0, 0.2, PERIOD)
-    part = part.with_values({"drive_time": 1e-6})
-    wanted = 50.0 * (1.0 - np.cos(2.0 * np.pi * 10.0 * time)) * (1.0 - 2.0 * time)
-    steps = run(part, time, wanted[:, None], np.zeros(len(part.state_names)), rtol=1e-8)
-    command = steps.y[:, part.output_names.index("compensated_command")]
-    forward = FeedForward(stack_values(model, PERIOD))
-    found = np.array([forward.step_voltage(w) for w in wanted.tolist()])
-    assert np.abs(found - wanted).max() > 3.0
-    assert np.abs(found - command).max() < 0.005
-
-
 def test_what_is_no_stack_is_refused() -> None:
     with pytest.raises(InputError, match="no stack"):
         stack_values(part_model("flexure_stage"), PERIOD)
@@ -151,15 +104,6 @@ def test_what_is_no_stack_is_refused() -> None:
         stack_values(model.with_values({"gamma": model.values["beta"]}), PERIOD)
     with pytest.raises(InputError, match="noise"):
         identifier_for(model, PERIOD, noise=0.0)
-
-
-def test_tracked_feed_forward_starts_as_the_plain_one() -> None:
-    """Before it has learnt anything it returns the voltage of the plain feed-forward."""
-    model = stack_model(STACK)
-    values = identifier_for(model, PERIOD, noise=1.0).values
-    plain, tracked = FeedForward(stack_values(model, PERIOD)), AdaptiveFeedForward(values)
-    for w in np.linspace(0.0, 80.0, 200).tolist():
-        assert tracked.step_voltage(w, 0.0) == pytest.approx(plain.step_voltage(w), abs=1e-3)
 
 
 def test_a_wanted_motion_in_metres_is_where_the_stack_goes() -> None:

@@ -1,13 +1,11 @@
-"""The design of prestress mechanisms: closed forms, goals, limits, and the coupled FMUs."""
+"""The design of prestress mechanisms: closed forms, goals and limits."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from psa_casadi.design.mechanism.loop import (
@@ -22,18 +20,14 @@ from psa_casadi.design.mechanism.mechanism import (
     design_mechanism,
     mechanism_model,
     mounted_model,
-    port_model,
     root_locus,
 )
 from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.model.stacks import stack_model
-from tests.tiers import slow
+from psa_casadi.units import FloatArray
 
-FloatArray = NDArray[np.float64]
 STACK = "PTBS200"
 #: A mechanism of 60 g, 900 N.s/m, 8 N/um: enough to move every pole of the stack.
 HEAVY = Mounting(0.06, 900.0, 8e6)
@@ -96,15 +90,6 @@ def test_closed_loop_poles_are_those_of_the_assembled_masses(acts_on: str, share
     order = np.lexsort((expected.imag, np.round(np.abs(expected), 3)))
     mine = np.lexsort((found.imag, np.round(np.abs(found), 3)))
     assert found[mine] == pytest.approx(expected[order], rel=1e-8)
-
-
-def test_a_mechanism_at_the_tip_leaves_the_wafers_alone() -> None:
-    p = stack_model(STACK).values
-    wafers = np.roots([p["m_P"], p["c_P"], p["k_P"]])
-    poles = mechanical_poles(mechanics_of(stack_model(STACK), "tip"), HEAVY)
-    assert all(np.abs(poles - w).min() < 1e-9 * abs(w) for w in wafers)
-    around_all = mechanical_poles(mechanics_of(stack_model(STACK)), HEAVY)
-    assert min(np.abs(around_all - w).min() / abs(w) for w in wafers) > 0.1
 
 
 def test_step_response_is_the_matrix_exponential_of_the_whole_chain() -> None:
@@ -212,45 +197,3 @@ def test_bad_wishes_are_all_told_at_once() -> None:
         assert part in text
     with pytest.raises(InputError, match="two masses"):
         design_mechanism(mechanism_model(designed(damping=0.7)), damping=0.7)
-
-
-def coupled(first: Path, second: Path, voltage: float, step: float, end: float) -> FloatArray:
-    """Step stack and mechanism in turn, values held; the voltage jumps at the start. Return x."""
-    motion = ("displacement", "tip_velocity", "tip_acceleration")
-    count = round(end / step)
-    x = np.zeros(count + 1)
-    with Fmu(first) as one, Fmu(second) as two:
-        a = one.start(CO_SIMULATION, tolerance=1e-8)
-        b = two.start(CO_SIMULATION, tolerance=1e-8)
-        with a, b:
-            a.set({"voltage": voltage})
-            for k in range(count):
-                position, speed, acceleration = a.get(motion)
-                b.set({"tip_position": position, "tip_velocity": speed,
-                       "tip_acceleration": acceleration})  # fmt: skip
-                a.set({"prestress_force": float(b.get(["reaction_force"])[0])})
-                a.step(k * step, step)
-                b.step(k * step, step)
-                x[k + 1] = a.get(["displacement"])[0]
-    return x
-
-
-@slow
-def test_coupled_fmus_do_what_the_closed_form_says(tmp_path: Path) -> None:
-    """Stack FMU and mechanism FMU approach the designed step response, to first order."""
-    linear = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
-    model = stack_model(STACK).with_values(linear)
-    d = design_mechanism(model, damping=0.3, limits=Limits(mass=(0.0, 0.06)), starts=2)
-    assert d.attained
-    fmus = [
-        export_fmu(part, tmp_path / f"{part.name}.fmu")
-        for part in (port_model(model), mechanism_model(d))
-    ]
-    errors = []
-    for step in (2e-7, 1e-7):
-        x = coupled(fmus[0], fmus[1], model.values["u_rated"], step, 2e-4)
-        time = np.linspace(0.0, step * (len(x) - 1), len(x))
-        expected = step_response(d.mechanics, d.mounting, time).displacement
-        errors.append(float(np.abs(x - expected).max() / np.ptp(expected)))
-    assert errors[1] < 2e-3
-    assert 1.7 < errors[0] / errors[1] < 2.4

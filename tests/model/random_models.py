@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.model.compose import Model, compose
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True)

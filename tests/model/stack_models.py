@@ -1,14 +1,12 @@
 """Named stacks as models, what their linear part is, and a voltage that starts at rest."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: The paper's stacks: the others are identified and have no published stroke.
 PAPER_STACKS = ("P-885.51", "PTBS200", "WYDS0808020")

@@ -7,7 +7,6 @@ from math import cos, exp, pi, sin
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi import reference
 from psa_casadi.components import BASE, SIMPLIFIED
@@ -16,8 +15,6 @@ from psa_casadi.model.stacks import STACKS
 from psa_casadi.reference import Mechanics
 from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow_but
-
-FloatArray = NDArray[np.float64]
 
 #: Samples of the stepper's input, linear in between; a sine's error between them is 5e-9 of it.
 SAMPLES = 30001

@@ -2,13 +2,11 @@
 
 import ctypes
 import random
-from collections.abc import Callable
 from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.component import READ_OFF, RECORD_DURATION, Component
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
@@ -18,12 +16,10 @@ from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.compiler import functions_of, generate_c, shared_library
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import convert
+from psa_casadi.units import FloatArray, convert
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 from tests.model.random_models import Point, random_model, random_point
 from tests.tiers import slow, slow_but
-
-FloatArray = NDArray[np.float64]
 
 ALL = tuple(EFFECTS.values())
 _draw = random.Random(20)  # pairs and triples: all of them would take too long
@@ -217,40 +213,6 @@ def test_c_value_is_the_casadi_value(effects: tuple[Component, ...]) -> None:
             found = c_values(model, name.removeprefix("psa_"), point, sizes)
             for ours, theirs in zip(found, wanted, strict=True):
                 np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=0, err_msg=name)
-
-
-@every_effect
-def test_generated_jacobians_are_the_slopes_of_the_model(effect: Component) -> None:
-    """The Jacobians that go to C against central differences of f, column by column."""
-    generator = np.random.default_rng(5)
-    model = random_model((effect,), generator, gains=True)
-    point = random_point(model, generator)
-    p = model.parameter_vector()
-    functions = functions_of(model.structure, sensitivities=True)
-    at = (point.time, point.x, point.u, p)
-    blocks = [*functions["psa_sensitivity"](*at), *functions["psa_output_sensitivity"](*at)]
-    exact = [np.array(block) for block in blocks]
-
-    def slopes(k: int, vector: FloatArray, call: Callable[[FloatArray], ca.DM]) -> FloatArray:
-        step = 1e-6 * max(abs(vector[k]), 1e-12)
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = vector.copy()
-            moved[k] += sign * step
-            ends.append(np.concatenate([np.array(v).ravel() for v in call(moved)]))
-        return np.asarray((ends[0] - ends[1]) / (2 * step))
-
-    f = model.structure.f
-    for k in range(point.x.size):
-        found = slopes(k, point.x, lambda x: f(point.time, x, point.u, p))
-        wanted = np.concatenate([exact[0][:, k], exact[2][:, k]])
-        size = np.concatenate(values_of(model, point)) / point.x[k]
-        assert np.all(np.abs(found - wanted) <= 1e-5 * np.abs(wanted) + 1e-7 * np.abs(size))
-    for k in range(p.size):
-        found = slopes(k, p, lambda q: f(point.time, point.x, point.u, q))
-        wanted = np.concatenate([exact[1][:, k], exact[3][:, k]])
-        size = np.concatenate(values_of(model, point)) / p[k]
-        assert np.all(np.abs(found - wanted) <= 1e-5 * np.abs(wanted) + 1e-7 * np.abs(size))
 
 
 @each_in_turn

@@ -1,9 +1,6 @@
 """Composition, values, and MODEL.json."""
 
-import json
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +10,11 @@ from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.model_file import dumps, load_model, loads, save_model
+from psa_casadi.model.compose import compose
+from psa_casadi.model.model_file import loads
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Interval, Output, Parameter, Provenance, State
-from tests.model.random_models import random_model
+from psa_casadi.variables import Output, Parameter, State
 from tests.tiers import slow_but
 
 CREEP, DRIFT = EFFECTS["slow_creep"], EFFECTS["offset_drift"]
@@ -113,82 +109,6 @@ def test_velocity_is_the_rate_of_the_displacement(name: str) -> None:
     np.testing.assert_allclose(slope[5:], v[7:-2], rtol=0, atol=1e-6 * np.ptp(v))
 
 
-def identified(components: tuple[Component, ...] = SETS["all"]) -> Model:
-    """A model with awkward values in every field of its file."""
-    model = random_model(components[len(BASE) :], np.random.default_rng(7), gains=True)
-    names = model.parameter_names
-    origin = Provenance(
-        identified_from=(("minor loops, µm.csv", "0f" * 32), ('a "b".csv', "1e" * 32)),
-        package_version="0.1.0",
-        free=(names[4], names[6], names[-1]),
-        intervals={names[4]: Interval(-1 / 3, 2 / 3), names[-1]: Interval(-1e-300, 5e-324)},
-        force_scale="given",
-        notes=("the stiffness is the data sheet's", "k_P: 480 N/µm"),
-    )
-    return replace(model, name="stage", description="Spannung → Weg", provenance=origin)
-
-
-@pytest.mark.parametrize("components", [SETS["base"], SETS["all"]], ids=["base", "all"])
-def test_model_file_round_trip_is_exact(components: tuple[Component, ...], tmp_path: Path) -> None:
-    model = identified(components)
-    path = tmp_path / "MODEL.json"
-    save_model(model, path)
-    read = load_model(path)
-    assert read.structure is model.structure
-    assert dict(read.values) == dict(model.values)
-    assert (read.name, read.description) == (model.name, model.description)
-    assert read.provenance == model.provenance
-    assert dumps(read) == path.read_text(encoding="utf-8") == dumps(model)
-
-
-def changed(change: Callable[[dict[str, Any]], object]) -> str:
-    content = json.loads(dumps(identified()))
-    change(content)
-    return message(lambda: loads(json.dumps(content), "m.json"))
-
-
-def test_each_mistake_in_a_file_is_named() -> None:
-    parameters = "parameters"
-    cases: dict[str, Callable[[dict[str, Any]], object]] = {
-        "its format is 'x/2', expected 'psa_casadi.model/1'": lambda c: c.update(format="x/2"),
-        "'components' is missing": lambda c: c.pop("components"),
-        "unknown name 'engine' in components": lambda c: c["components"].append("engine"),
-        "'effects[27]' is [1]": lambda c: c["effects"].append([1]),
-        "unknown name 'slow_creep' in components": lambda c: c["components"].append("slow_creep"),
-        "'linear_force' is listed 2 times": lambda c: c["components"].append("linear_force"),
-        "'parameters' is missing": lambda c: c.pop(parameters),
-        "parameter 'k_L' [N/V] has no value": lambda c: c[parameters].pop("k_L"),
-        "'parameters.tau.value' is 'fast'": lambda c: c[parameters]["tau"].update(value="fast"),
-        "'parameters.m_P.value' is True": lambda c: c[parameters]["m_P"].update(value=True),
-        "'tau' is given in 'ms'; convert it to 's'": lambda c: c[parameters]["tau"].update(
-            unit="ms"
-        ),
-        "'n' is 17 1, outside its bounds": lambda c: c[parameters]["n"].update(value=17),
-        "NaN is no number": lambda c: c[parameters]["n"].update(value=float("nan")),
-        "unknown parameters ['warp']": lambda c: c[parameters].update(warp={"value": 1}),
-        "'parameters.n.interval' is [1]": lambda c: c[parameters]["n"].update(interval=[1]),
-        "'identified_from[0].sha256' is missing": lambda c: c.update(
-            identified_from=[{"record": "a"}]
-        ),
-        "'notes' is 'one'": lambda c: c.update(notes="one"),
-        "'name' is 3": lambda c: c.update(name=3),
-        "'u'": lambda c: c["components"].remove("drive") or [
-            c[parameters].pop(n) for n in ("G", "R_s", "C_p", "u_rated")
-        ],
-    }  # fmt: skip
-    for expected, change in cases.items():
-        text = changed(change)
-        assert expected in text, text
-        assert all(line.startswith("m.json") for line in text.splitlines())
-
-
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"x"', "null"])
 def test_what_is_no_model_file_says_so(text: str) -> None:
     assert message(lambda: loads(text, "m.json")).startswith("m.json is not ")
-
-
-def test_a_file_that_cannot_be_read_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "m.json"
-    assert "cannot be read" in message(lambda: load_model(path))
-    path.write_bytes(b"\xff\xfe\x00")
-    assert "cannot be read" in message(lambda: load_model(path))

@@ -1,9 +1,7 @@
 """Any CasADi ODE as a model: against scipy, in fmpy, in rumoca, and what is refused in words."""
 
 import math
-import tempfile
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ from psa_casadi.export.modelica.package import modelica_text
 from tests.export.modelica_runs import load, simulated
 
 SPAN, MU = 10.0, 3.0
-_FOLDER = tempfile.TemporaryDirectory()
 
 
 def _oscillation(times: Any) -> Any:
@@ -31,25 +28,6 @@ def _oscillation(times: Any) -> Any:
     )  # fmt: skip
     assert found.success
     return found.y[0]
-
-
-@cache
-def _oscillator(fmi: int) -> Path:
-    return psa.export_fmu(van_der_pol(), Path(_FOLDER.name) / f"oscillator{fmi}.fmu", fmi=fmi)
-
-
-@pytest.mark.parametrize(
-    ("fmi", "kind"), [(3, "CoSimulation"), pytest.param(2, "ModelExchange", marks=pytest.mark.slow)]
-)
-def test_the_oscillator_runs_in_fmpy(fmi: int, kind: str) -> None:
-    fmu = _oscillator(fmi)
-    assert read_model_description(str(fmu)).fmiVersion.startswith(str(fmi))
-    found = simulate_fmu(
-        str(fmu), fmi_type=kind, stop_time=SPAN, output_interval=0.05, relative_tolerance=1e-10,
-        start_values={"mu": MU}, output=["position"],
-    )  # fmt: skip
-    assert len(found) > 190
-    assert found["position"] == pytest.approx(_oscillation(found["time"]), abs=1e-6)
 
 
 def test_the_oscillator_runs_in_a_modelica_compiler() -> None:

@@ -65,16 +65,6 @@ def extended(ripple: Component) -> psa.Model:
     return psa.stack_model("P-885.51").with_effect(ripple, {"ripple": 5e-8})
 
 
-def test_the_file_names_the_module_and_reading_it_needs_that(ripple: Component) -> None:
-    text = dumps(extended(ripple))
-    assert '"module": "gratings"' in text
-    again = loads(text, effects=[ripple])
-    assert again.values == extended(ripple).values
-    assert again.effects == (ripple,)
-    with pytest.raises(psa.InputError, match=r"encoder_ripple.*gratings.*--effects gratings"):
-        loads(text)
-
-
 def test_a_declaration_that_has_changed_is_refused(ripple: Component, tmp_path: Path) -> None:
     text = dumps(extended(ripple))
     source = tmp_path / "gratings.py"
@@ -87,15 +77,6 @@ def test_a_declaration_that_has_changed_is_refused(ripple: Component, tmp_path: 
     other = own_effects("gratings")["encoder_ripple"]
     with pytest.raises(psa.InputError, match="declared in another way"):
         loads(text, effects=[other])
-
-
-@pytest.mark.slow
-def test_its_fmu_carries_it_and_passes_the_check(ripple: Component, tmp_path: Path) -> None:
-    path = tmp_path / "stack.fmu"
-    psa.export_fmu(extended(ripple), path, include_sensor=True)
-    assert not psa.check_fmu(path).passed  # the model inside cannot be read without the module
-    report = psa.check_fmu(path, effects=[ripple])
-    assert report.passed, report.rows
 
 
 def install(site: Path, text: str) -> None:

@@ -5,20 +5,15 @@ And each as FMU 2 and 3 and in Modelica, by Python and by name.
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from typer.testing import CliRunner
 
 from psa_casadi import reference
-from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.check.check import check_fmu
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model
 from psa_casadi.model.nanopositioner import nanopositioner
@@ -26,12 +21,11 @@ from psa_casadi.model.parts import PARTS, compensator_for, part_model
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.modelica_runs import simulated
 from tests.studies.benchmarks.nonlinearity import Controller, simulate_positioner
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 STACK = "P-885.51"
 VALUES = {name: figure.value for name, figure in STACKS[STACK].values.items()}
@@ -215,15 +209,6 @@ def test_what_is_no_part_of_a_stack_is_refused(made: Callable[[], Model], said: 
         made()
 
 
-@slow
-@pytest.mark.usefixtures("code_runs_here")
-@pytest.mark.parametrize(("name", "fmi"), [(n, 2 + k % 2) for k, n in enumerate(PARTS)])
-def test_a_part_passes_the_check_as_an_fmu(name: str, fmi: int, tmp_path: Path) -> None:
-    path = export_fmu(part_model(name), tmp_path / f"{name}.fmu", fmi=fmi)
-    report = check_fmu(path, part_model(name))
-    assert report.passed, report
-
-
 @pytest.mark.parametrize("name", PARTS)
 def test_a_part_is_the_same_in_modelica(name: str) -> None:
     """The first input is a sine of half its usual size, the others rest; all outputs."""
@@ -248,12 +233,3 @@ def test_a_part_is_the_same_in_modelica(name: str) -> None:
         at = np.interp(t[between], got["time"], got[f"part.{variable}"])
         error = np.abs(at - wanted[between]).max()
         assert error < 1e-4 * max(np.ptp(wanted), 1e-12), variable
-
-
-@pytest.mark.parametrize("name", PARTS)
-def test_a_part_is_exported_by_its_name(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "part.mo"
-    result = CliRunner().invoke(app, ["export", "modelica", "--part", name, "-o", str(path)])
-    assert result.exit_code == 0, result.stderr
-    assert path.read_text(encoding="utf-8") == modelica_text(part_model(name))
-    assert f"inside: {', '.join(PARTS[name].components)}" in result.stdout

@@ -4,15 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.reference import Trajectory, from_samples, simulate
+from psa_casadi.units import FloatArray
 from tests.model.stack_models import PAPER_STACKS
-
-FloatArray = NDArray[np.float64]
 
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
 SINGLE = {"m": 7e-3, "c": 90.0, "k": 9.6e7}

@@ -1,16 +1,13 @@
-"""exp and log of exact steps: their tables correctly rounded, their values to the last place."""
+"""Exact steps against the stepper and the reference, and their exp and log to the last place."""
 
 import ctypes
 import re
-import struct
 from collections.abc import Iterator
-from decimal import Decimal, localcontext
 from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi import reference
 from psa_casadi.component import Component, Equations
@@ -24,7 +21,6 @@ from psa_casadi.simulation import stepper
 from psa_casadi.simulation.compiler import (
     FLAGS_VARIABLE,
     shared_library,
-    sources_directory,
     vector_flags,
     zig_command,
 )
@@ -33,6 +29,7 @@ from psa_casadi.simulation.exact.run import run_exact, why_not
 from psa_casadi.simulation.exact.split import Split, split_of
 from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, simulate
 from psa_casadi.simulation.start import start_on
+from psa_casadi.units import FloatArray
 from tests.export.c_host.build import tool
 from tests.model.sampled_models import loop
 from tests.model.stack_models import stack
@@ -56,8 +53,6 @@ from tests.simulation.exact_cases import (
 )
 from tests.studies.benchmarks.fits import demonstration
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 RTOL = 1e-6
 SAMPLES = 1500
@@ -121,22 +116,34 @@ def test_the_error_keeps_to_other_tolerances(name: str, rtol: float) -> None:
     assert way == (EXACT if rtol >= 1e-6 else STEPPER)
 
 
-@pytest.mark.parametrize("name", ["base", "backlash", "voltage_saturation"])
-def test_held_inputs_agree(name: str) -> None:
-    """Every sample begins with a jump."""
-    relative = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
-    found, way = compare(with_effect(name), times(600, 1e-4), relative, hold="zero")
-    assert found <= RTOL
-    assert way == EXACT or name == "voltage_saturation"  # a corner of the clip at every jump
+_EVEN, _SLOW = times(600, 1e-4), times(200, 1e-3)
+_UNEVEN = np.cumsum(np.repeat([1e-4, 1e-3, 2.5e-5], 200))
+_JUMPING = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
+#: Effect or component, times, voltage over the rated one, hold.
+CASES: list[tuple[str | Component, FloatArray, FloatArray, str]] = [
+    *((n, _EVEN, _JUMPING, "zero") for n in ("base", "backlash", "voltage_saturation")),
+    *((n, _UNEVEN, voltage("sine", _UNEVEN / _UNEVEN[-1]), "linear") for n in ("base", "backlash")),
+    *(
+        (n, _EVEN, 0.4 * (1.0 - np.cos(300.0 * _EVEN + shift)), "linear")
+        for n in ("base", "slow_creep", "sensor_delay")
+        for shift in (np.pi / 2, np.pi)  # in motion, at the top
+    ),
+    *((c, _SLOW, voltage("sine", _SLOW / _SLOW[-1]), "linear") for c in (LAG, CUBIC, JUMP)),
+]
 
 
-@pytest.mark.parametrize("name", ["base", "backlash"])
-def test_a_few_time_steps_in_one_record(name: str) -> None:
-    t = np.cumsum(np.repeat([1e-4, 1e-3, 2.5e-5], 200))
-    relative = voltage("sine", t / t[-1])
-    found, way = compare(with_effect(name), t, relative)
-    assert found <= RTOL
-    assert way == EXACT
+@pytest.mark.parametrize(("what", "t", "relative", "hold"), CASES, ids=range(len(CASES)))
+def test_held_inputs_few_time_steps_any_start_and_own_components_agree(
+    what: str | Component, t: FloatArray, relative: FloatArray, hold: str
+) -> None:
+    """The stepper is taken for a corner of the clip at every jump, and where equations jump."""
+    if isinstance(what, Component):
+        model, most = compose((*BASE, what), stack("P-885.51").values), 2 * RTOL
+    else:
+        model, most = with_effect(what), RTOL
+    found, way = compare(model, t, relative, hold=hold)
+    assert found <= most  # the stepper does not look for the jump
+    assert way == (STEPPER if what is JUMP else EXACT) or what == "voltage_saturation"
 
 
 def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
@@ -150,28 +157,6 @@ def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
     # clocks tell times to a few digits only: that is no other step
     rounded = np.round(times(300, 1e-3), 9) + 1.0e-3 * 2e-7 * rng.standard_normal(300)
     assert simulate(model, rounded, v).way == EXACT
-
-
-@pytest.mark.parametrize("name", ["base", "slow_creep", "sensor_delay"])
-@pytest.mark.parametrize("shift", [np.pi / 2, np.pi], ids=["in motion", "at the top"])
-def test_a_record_may_start_anywhere(name: str, shift: float) -> None:
-    t = times(600, 1e-4)
-    found, way = compare(with_effect(name), t, 0.4 * (1.0 - np.cos(300.0 * t + shift)))
-    assert found <= RTOL
-    assert way == EXACT
-
-
-@pytest.mark.parametrize(
-    ("component", "expected"),
-    [(LAG, EXACT), (CUBIC, EXACT), (JUMP, STEPPER)],
-    ids=["lag", "spring", "jump"],
-)
-def test_a_component_of_one_s_own_agrees_or_is_stepped(component: Component, expected: str) -> None:
-    model = compose((*BASE, component), stack("P-885.51").values)
-    t = times(200, 1e-3)
-    found, way = compare(model, t, voltage("sine", t / t[-1]))
-    assert found <= 2 * RTOL  # the stepper does not look for the jump
-    assert way == expected
 
 
 TONES = [2.5e-4, *(pytest.param(q, marks=slow) for q in (3.1e-4, 1.25e-4, 6.25e-5))]
@@ -386,7 +371,6 @@ def _stepped(name: str) -> list[FloatArray]:
     return [found.y, np.asarray(found.sensitivity)]
 
 
-ENTRIES = 128
 LAST_PLACE = 2.0**-52
 CODE = """
 #include "exact_math.h"
@@ -422,36 +406,6 @@ def arguments(name: str) -> FloatArray:
     if name == "v_exp":
         return np.concatenate([np.linspace(-708.0, 709.0, 100_003), np.linspace(-1, 1, 10_001)])
     return np.concatenate([np.geomspace(1e-300, 1e300, 100_003), np.linspace(0.7, 1.5, 10_001)])
-
-
-def numbers(table: str) -> list[float]:
-    text = (sources_directory() / "exact_tables.h").read_text()
-    body = text[text.index(table) :].split("= {", 1)[1].split("};", 1)[0]
-    return [float.fromhex(q) for q in re.findall(r"-?0x1\.[0-9a-f]+p[+-]\d+|0x0\.0p\+0", body)]
-
-
-def from_bits(bits: int) -> float:
-    return float(struct.unpack("<d", struct.pack("<Q", bits))[0])
-
-
-def test_powers_in_the_table_are_rounded_correctly() -> None:
-    with localcontext() as context:
-        context.prec = 60
-        exact = [float(Decimal(2) ** (Decimal(i) / ENTRIES)) for i in range(ENTRIES)]
-    assert numbers("EXP_TABLE") == exact
-
-
-def test_logarithms_in_the_table_are_rounded_correctly() -> None:
-    found = numbers("LOG_TABLE")
-    assert len(found) == 2 * ENTRIES
-    first = struct.unpack("<Q", struct.pack("<d", float(np.sqrt(0.5))))[0]
-    for i, (inverse, log) in enumerate(zip(found[::2], found[1::2], strict=True)):
-        with localcontext() as context:
-            context.prec = 60
-            assert log == float(-Decimal(inverse).ln())
-        assert inverse * 2.0**12 == round(inverse * 2.0**12)  # 13 bits: m / c is nearly exact
-        for edge in (i, i + 1):
-            assert abs(from_bits(first + (edge << 45)) * inverse - 1.0) < 0.0041
 
 
 @pytest.mark.parametrize("lanes", [1, 4])

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.component import Component
 from psa_casadi.components import BASE
@@ -16,14 +15,13 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.records.record import Record
 from psa_casadi.simulation import device
 from psa_casadi.simulation.many import simulate_many
-from psa_casadi.simulation.simulate import record_inputs, simulate_record
+from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on, starts_on
+from psa_casadi.units import FloatArray
 from tests.model.stack_models import stack
 from tests.simulation.cuda_host import HostCuda, lend
 from tests.simulation.exact_cases import KINK
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 
 def record(uneven: bool = False) -> Record:
@@ -64,14 +62,6 @@ def test_a_set_has_the_same_bits_alone_and_beside_others(effect: str) -> None:
     assert np.array_equal(simulate_many(model, given[::-1], record()), together[::-1])
 
 
-def test_each_set_is_what_simulate_gives() -> None:
-    model = stack("P-885.51")
-    given = sets(model, 4)
-    for row, values in zip(simulate_many(model, given, record()), given, strict=True):
-        alone = simulate_record(model.with_values(values), record())
-        assert np.max(np.abs(row - alone.displacement)) < 2e-5 * np.ptp(row)
-
-
 def test_a_set_that_cannot_be_simulated_leaves_the_others_alone() -> None:
     model = stack("PTBS200")
     lost = {"A": -5.0, "beta": -4000.0, "gamma": 0.0, "n": 3.0}
@@ -108,23 +98,6 @@ def test_sets_by_the_names_of_parameters() -> None:
         simulate_many(model, {"stiffness": [1.0]}, record())
     with pytest.raises(InputError, match="outside its bounds"):
         simulate_many(model, {"n": [1.5, -1.0]}, record())
-
-
-def test_uneven_records_run_in_the_stepper() -> None:
-    model = stack("P-885.51")
-    found = simulate_many(model, [{}, {"k_L": 1.1 * model.values["k_L"]}], record(uneven=True))
-    even = simulate_many(model, [{}], record())
-    assert np.isfinite(found).all()
-    assert np.max(np.abs(found[0] - even[0])) < 0.05 * np.ptp(even)
-
-
-def test_mistakes_are_told() -> None:
-    model = stack("P-885.51")
-    assert simulate_many(model, [], record()).shape == (0, 600)
-    with pytest.raises(InputError, match="no parameter 'stiffness'"):
-        simulate_many(model, [{"stiffness": 1.0}], record())
-    with pytest.raises(InputError, match="outside its bounds"):
-        simulate_many(model, [{"n": -1.0}], record())
 
 
 def _effect(name: str) -> Component:

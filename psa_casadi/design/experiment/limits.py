@@ -174,8 +174,6 @@ def draw(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) 
         )
     if kind == "multisine":
         return _multisine(limits, steepest, rng)
-    if kind == "free":
-        return _free(limits, steepest, rng)
     return _timed(kind, limits, steepest, rng)
 
 
@@ -209,70 +207,58 @@ def _reachable(levels: FloatArray, durations: FloatArray, per_second: float) -> 
     return found
 
 
-def _free(limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
-    """Levels at fixed corners; the corners' distances are drawn over a decade or more."""
-    count = _count(limits, CORNERS)
-    durations = _durations(rng.uniform(0.0, _SPREAD, count), limits)
-    corners = np.concatenate([[0.0, rest_of(limits)], rest_of(limits) + np.cumsum(durations)])
-    per_second = steepest / limits.span
-
-    def voltage(p: FloatArray, time: FloatArray) -> FloatArray:
-        levels = np.concatenate([[0.0, 0.0], p])
-        inside: FloatArray = limits.low + limits.span * np.interp(time, corners, levels)
-        return inside
-
-    def slack(p: FloatArray) -> FloatArray:
-        change = np.diff(p, prepend=0.0)
-        return np.concatenate([per_second * durations - change, per_second * durations + change])
-
-    start = _reachable(rng.uniform(0.0, 1.0, count), durations, per_second)
-    bounded = slack if np.isfinite(per_second) else _nothing
-    return Waveform("free", start, np.zeros(count), np.ones(count), voltage, bounded)
-
-
 def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
-    """Levels and their durations: triangles ramp from one to the next, steps jump and hold."""
-    count = _count(limits, TURNS if kind == "triangles" else LEVELS)
-    per_second = steepest / limits.span
-    sample = limits.duration / limits.samples
-    ramp = max(sample, 1.0 / per_second if np.isfinite(per_second) else 0.0)
+    """Levels and their durations: ramps lead from one to the next, steps jump and hold.
+
+    Free-form voltages have ramps between fixed corners, whose distances are drawn over a decade or
+    more; of triangles and steps the durations change too.
+    """
+    count = _count(limits, {"free": CORNERS, "triangles": TURNS, "steps": LEVELS}[kind])
+    per_second, first = steepest / limits.span, rest_of(limits)
+    limited = bool(np.isfinite(per_second))
+    ramp = max(limits.duration / limits.samples, 1.0 / per_second if limited else 0.0)
+    shares = rng.uniform(0.0, _SPREAD, count)
+    drawn = _durations(shares, limits)
+
+    def durations_of(p: FloatArray) -> FloatArray:
+        return drawn if kind == "free" else _durations(p[count:], limits)
+
+    def moving(durations: FloatArray) -> FloatArray:
+        return np.minimum(durations, ramp) if kind == "steps" else durations
 
     def voltage(p: FloatArray, time: FloatArray) -> FloatArray:
-        levels, durations = p[:count], _durations(p[count:], limits)
-        ends = rest_of(limits) + np.cumsum(durations)
-        if kind == "triangles":
-            nodes = np.concatenate([[0.0, rest_of(limits)], ends])
-            heights = np.concatenate([[0.0, 0.0], levels])
-        else:
+        levels, durations = p[:count], durations_of(p)
+        ends = first + np.cumsum(durations)
+        if kind == "steps":
             begins = ends - durations
-            tops = begins + np.minimum(ramp, durations)
+            tops = begins + moving(durations)
             nodes = np.concatenate([[0.0], np.column_stack([begins, tops]).ravel(), ends[-1:]])
             before = np.concatenate([[0.0], levels[:-1]])
             heights = np.column_stack([before, levels]).ravel()
             heights = np.concatenate([[0.0], heights, levels[-1:]])
+        else:
+            nodes = np.concatenate([[0.0, first], ends])
+            heights = np.concatenate([[0.0, 0.0], levels])
         inside: FloatArray = limits.low + limits.span * np.interp(time, nodes, heights)
         return inside
 
     def slack(p: FloatArray) -> FloatArray:
-        durations = _durations(p[count:], limits)
         change = np.diff(p[:count], prepend=0.0)
-        room = per_second * (durations if kind == "triangles" else np.minimum(durations, ramp))
+        room = per_second * moving(durations_of(p))
         return np.concatenate([room - change, room + change])
 
-    shares = rng.uniform(0.0, _SPREAD, count)
     levels = rng.uniform(0.0, 1.0, count)
     if kind == "triangles":
         levels = np.where(np.arange(count) % 2 == 0, 0.5 + 0.5 * levels, 0.5 * levels)
         if rng.integers(2):  # loops in the lower half of the range, then in the upper one
             levels = 0.5 * levels + np.where(2 * np.arange(count) < count, 0.0, 0.5)
-    if np.isfinite(per_second):
-        durations = _durations(shares, limits)
-        usable = durations if kind == "triangles" else np.minimum(durations, ramp)
-        levels = _reachable(levels, usable, per_second)
-    lower = np.concatenate([np.zeros(count), np.full(count, -_SPREAD)])
-    upper = np.concatenate([np.ones(count), np.full(count, 2.0 * _SPREAD)])
-    bounded = slack if np.isfinite(per_second) else _nothing
-    return Waveform(kind, np.concatenate([levels, shares]), lower, upper, voltage, bounded)
+    if limited or kind == "free":
+        levels = _reachable(levels, moving(drawn), per_second)
+    start, low, high = levels, np.zeros(count), np.ones(count)
+    if kind != "free":
+        start, low = np.append(levels, shares), np.append(low, np.full(count, -_SPREAD))
+        high = np.append(high, np.full(count, 2.0 * _SPREAD))
+    return Waveform(kind, start, low, high, voltage, slack if limited else _nothing)
 
 
 def _multisine(limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:

@@ -10,7 +10,6 @@ one-way cascade it then moves the bonding layers' poles and leaves the wafers' a
 and Zhu 2015, eqs. 10, 44, 45; eqs. 39 to 43 print m_P/4 for two different masses, a misprint.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,24 +89,19 @@ def mechanics_of(model: Model, acts_on: str = "wafers") -> Mechanics:
             " or --stack NAME."
         )
     p = model.values
-    a, d, n = _polynomials(p, p.get("reciprocal_gain", 0.0))
+    g = p.get("reciprocal_gain", 0.0)  # share of the reaction on the wafers, 0: the paper
+    a = np.array([p["m_P"], p["c_P"] + g * p["c_B"], p["k_P"] + g * p["k_B"]])
+    b = np.array([p["m_B"], p["c_B"], p["k_B"]])
+    n = np.array([p["c_B"] + (1.0 - g) * p["c_P"], p["k_B"] + (1.0 - g) * p["k_P"]])
+    back = g * np.array([p["c_B"], p["k_B"]])
     return Mechanics(
         numerator=n,
-        denominator=d,
+        denominator=np.polysub(np.polymul(a, b), np.polymul(back, n)),
         path=n if acts_on == "wafers" else a,
         lag=p["tau"],
         drive=p["R_s"] * p["C_p"],
         force=abs(p["k_L"]) * p["u_rated"],
     )
-
-
-def _polynomials(p: Mapping[str, float], g: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the wafers' polynomial a, D and N with the share g of the reaction (0: the paper)."""
-    a = np.array([p["m_P"], p["c_P"] + g * p["c_B"], p["k_P"] + g * p["k_B"]])
-    b = np.array([p["m_B"], p["c_B"], p["k_B"]])
-    n = np.array([p["c_B"] + (1.0 - g) * p["c_P"], p["k_B"] + (1.0 - g) * p["k_P"]])
-    back = g * np.array([p["c_B"], p["k_B"]])
-    return a, np.polysub(np.polymul(a, b), np.polymul(back, n)), n
 
 
 def closed_polynomial(mechanics: Mechanics, mounting: Mounting) -> FloatArray:

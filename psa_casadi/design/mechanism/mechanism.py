@@ -31,12 +31,9 @@ from psa_casadi.variables import Provenance
 
 
 def check_goals(
-    damping: float | None,
-    width: float | None,
-    poles: Sequence[complex],
-    limits: Limits,
+    damping: float | None, width: float | None, poles: Sequence[complex], limits: Limits,
     starts: int,
-) -> None:
+) -> None:  # fmt: skip
     """Raise an InputError that names every goal and limit that makes no sense."""
     problems = Problems()
     if poles and (damping is not None or width is not None):
@@ -80,10 +77,8 @@ def _check_limits(limits: Limits, problems: Problems) -> None:
         problems.add(
             f"The largest force is {limits.force:g} N; give a positive one, or leave it out."
         )
-    for what, (low, high), unit in (
-        ("mass", limits.mass, "kg"),
-        ("damping", limits.damping, "N.s/m"),
-    ):
+    ranges = {"mass": (*limits.mass, "kg"), "damping": (*limits.damping, "N.s/m")}
+    for what, (low, high, unit) in ranges.items():
         if not 0.0 <= low < high < inf:
             problems.add(
                 f"The {what} may lie between {low:g} and {high:g} {unit}, which is no range; give"

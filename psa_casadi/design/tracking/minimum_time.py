@@ -60,25 +60,25 @@ class LinearMove:
     limits: AmplifierLimits
     n: int
 
-    def forces(self, time: float, state: FloatArray, voltage: float) -> Offsets:
-        """Return what is left of the model's rates and displacement without the linear part."""
-        m = self.model
-        u = [voltage if i.name == "voltage" else i.start for i in m.structure.inputs]
-        xdot, y = m.structure.f(time, state, u, m.parameter_vector())
-        size = m.state_nominals()[self.fast]
-        x = state[self.fast] / size
-        rates = np.array(xdot).ravel()[self.fast] / size - self.a @ x - self.b * voltage
-        shown = float(y[m.output_names.index("displacement")])
-        return Offsets(np.zeros(len(x)), rates, shown - float(self.c @ x))
-
     def offsets(
-        self, length: float, voltage: FloatArray, arrival: FloatArray, forces: Offsets
+        self, length: float, voltage: FloatArray, time: float, arrival: FloatArray
     ) -> Offsets:
-        """Return the offsets for which the program arrives (nf,) where the simulator did."""
+        """Return the offsets for which the program arrives where the simulator did.
+
+        What is left of the model's rates and displacement at the `arrival` (nx,), at a time [s], is
+        what the linear part does not know.
+        """
+        m, rows = self.model, self.fast
+        size = m.state_nominals()[rows]
         gain, free = self._march(length)
-        size = self.model.state_nominals()[self.fast]
-        state = arrival / size - gain @ voltage[1:] - free
-        return Offsets(state, forces.rates, forces.position)
+        state = arrival[rows] / size - gain @ voltage[1:] - free
+        last = float(voltage[-1])
+        u = [last if i.name == "voltage" else i.start for i in m.structure.inputs]
+        xdot, y = m.structure.f(time, arrival, u, m.parameter_vector())
+        x = arrival[rows] / size
+        rates = np.array(xdot).ravel()[rows] / size - self.a @ x - self.b * last
+        shown = float(y[m.output_names.index("displacement")])
+        return Offsets(state, rates, shown - float(self.c @ x))
 
     def shortest(self, offsets: Offsets) -> tuple[float, FloatArray]:
         """Return the least length [s] by halving, and its voltage (n + 1,) [V]."""
@@ -290,7 +290,8 @@ def _plays(
         plays.append(_play(model, linear, length, voltage, linear.end))
         if count >= _FREE and plays[-1].distance < _GOOD:
             break
-        offsets = linear.offsets(length, voltage, plays[-1].arrival, plays[-1].memory)
+        last, n = plays[-1].response, linear.n + 1
+        offsets = linear.offsets(length, voltage, float(last.time[n]), last.states[n])
         if count < _FREE:
             length, voltage = linear.shortest(offsets)
             continue
@@ -306,15 +307,13 @@ def _plays(
 
 @dataclass(frozen=True, eq=False)
 class _Play:
-    """What the simulator says: the response, the state on arrival, how far that is from rest.
+    """What the simulator says: the response, and how far its end is from rest.
 
     `distance` is the larger of the hold's swing and its offset, over the move.
     """
 
     length: float
     response: Response
-    arrival: FloatArray
-    memory: Offsets
     position: float
     swing: float
     distance: float
@@ -331,7 +330,5 @@ def _play(
     held, hold = found.displacement[n + 1 :], time[n + 1 :]
     slow = np.polynomial.Polynomial.fit(hold, held, 2)(hold)
     swing, position = float(np.max(np.abs(held - slow))), float(slow[0])
-    state = found.states[n + 1]
-    forces = linear.forces(float(time[n + 1]), state, float(voltage[-1]))
     distance = max(swing, abs(position - end)) / abs(linear.travel)
-    return _Play(length, found, state[linear.fast], forces, position, swing, distance)
+    return _Play(length, found, position, swing, distance)

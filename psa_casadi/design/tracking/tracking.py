@@ -454,7 +454,3 @@ def _solve(
         guess, inner = found.voltage, found.inner
         shown = path - (reached - found.displacement)
     return solutions
-
-
-def _size(error: FloatArray, largest: bool) -> float:
-    return float(np.max(np.abs(error)) if largest else np.sqrt(np.mean(error**2)))

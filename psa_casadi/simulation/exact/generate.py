@@ -73,14 +73,13 @@ def of_linear_part(
 
     Rows are those of the whole step and then those `needed` inside it; `reach` says which entries
     of a row are not zero, `linear` which state each is of.
+
+        out = x + F x: F by columns `f`, and by the rows `half` of the half of the step
+        out += dF l + the other matrices' derivatives times the tail, a chunk of rows a time
+
+    `d` holds for each chunk the tail's factors, then those of L by its columns.
     """
-    rows = [*range(len(linear)), *needed]
-    return sensitive("\n".join([*_product(reach, rows, linear), *_own(reach, rows), ""]))
-
-
-def _product(reach: npt.NDArray[np.bool_], rows: Sequence[int], linear: Sequence[int]) -> list[str]:
-    """Return out = x + F x: F by columns `f`, and by the rows `half` of the half of the step."""
-    lines = []
+    rows, product, own = [*range(len(linear)), *needed], [], []
     for place, i in enumerate(rows):
         inside = place - len(linear)
         factors = [
@@ -88,32 +87,22 @@ def _product(reach: npt.NDArray[np.bool_], rows: Sequence[int], linear: Sequence
             for j in np.flatnonzero(reach[i]).tolist()
         ]
         terms = [f"x[{linear[i]}]", *(f"{q} * x[{linear[j]}]" for q, j in factors)]
-        lines.append(f"    out[{place}] = {' + '.join(terms)};")
-    given = "const real *f, const real *const *half, const column *x, column *out"
-    return [f"static inline void ex_linear_columns({given}) {{", "    (void)half;", *lines, "}"]
-
-
-def _own(reach: npt.NDArray[np.bool_], rows: Sequence[int]) -> list[str]:
-    """Return out += dF l + the other matrices' derivatives times the tail, a chunk of rows a time.
-
-    `d` holds for each chunk the tail's factors, then those of L by its columns.
-    """
-    lines = []
+        product.append(f"    out[{place}] = {' + '.join(terms)};")
     for first in range(0, len(rows), CHUNK):
         chunk = range(first, min(first + CHUNK, len(rows)))
         entries = [(r, j) for j in range(len(reach)) for r in chunk if reach[rows[r], j]]
-        lines += ["    {", *(f"        column a{r} = {{0.0}};" for r in chunk)]
-        lines += [f"        for (int k = 0; k < tails; ++k, d += {len(chunk)}) {{"]
-        lines += [f"            a{r} += tail[k] * d[{r - first}];" for r in chunk]
-        lines += ["        }"]
-        lines += [f"        a{r} += l[{j}] * d[{k}];" for k, (r, j) in enumerate(entries)]
-        lines += [
-            f"        d += {len(entries)};",
-            *(f"        out[{r}] += a{r};" for r in chunk),
-            "    }",
-        ]
-    given = "const real *l, const double *tail, int tails, const column *d, column *out"
-    return [f"static inline void ex_own_columns({given}) {{", *lines, "}"]
+        own += ["    {", *(f"        column a{r} = {{0.0}};" for r in chunk)]
+        own += [f"        for (int k = 0; k < tails; ++k, d += {len(chunk)}) {{"]
+        own += [f"            a{r} += tail[k] * d[{r - first}];" for r in chunk]
+        own += ["        }"]
+        own += [f"        a{r} += l[{j}] * d[{k}];" for k, (r, j) in enumerate(entries)]
+        own += [f"        d += {len(entries)};"]
+        own += [*(f"        out[{r}] += a{r};" for r in chunk), "    }"]
+    given = "const real *f, const real *const *half, const column *x, column *out"
+    last = "const real *l, const double *tail, int tails, const column *d, column *out"
+    lines = [f"static inline void ex_linear_columns({given}) {{", "    (void)half;", *product, "}"]
+    lines += [f"static inline void ex_own_columns({last}) {{", *own, "}"]
+    return sensitive("\n".join([*lines, ""]))
 
 
 _KINDS = {"group": "EX_GROUP", "port": "EX_PORT", "loop": "EX_LOOP"}
@@ -142,7 +131,8 @@ def generate(split: Split, output: str) -> str:
     kept, prepare = printer.kept()
     place = {state: k for k, state in enumerate(split.linear)}
     chords = [k for k, q in enumerate(split.ports) if q.chord >= 0]
-    reach = _linear_reach(split)
+    # [k, j]: a change of the linear state j reaches k through M, in the order of L
+    reach = closure(ca.DM(ca.sparsify(m).sparsity(), 1).full() != 0)
     sizes = {
         "EX_NX": len(s.states), "EX_NL": len(split.linear), "EX_NU": len(s.inputs),
         "EX_NP": len(s.parameters), "EX_NY": len(s.outputs), "EX_NG": len(split.groups),
@@ -171,6 +161,9 @@ def generate(split: Split, output: str) -> str:
         "ex_group_size": [len(g.states) for g in split.groups],
         "ex_group_states": split.along,
     }
+    # for every port which groups' drivers or states it reads
+    read = [_read(split, q.value) for q in split.ports]
+    along = [[int(bool(r & {g.driver, *g.states})) for g in split.groups] or [0] for r in read]
     feeds = [
         [j for j, q in enumerate(split.ports) if reach[place[split.ports[k].chord], place[q.state]]]
         for k in chords
@@ -182,6 +175,10 @@ def generate(split: Split, output: str) -> str:
     sizes |= {"EX_NEED": len(needed), "EX_NPATH": len(path), "EX_CHUNK": CHUNK}
     sizes["EX_NOWN"] = int(reach.sum()) + int(reach[lists["ex_need"]].sum())
     printer.functions.append(of_linear_part(reach, lists["ex_need"], split.linear))
+    items = ", ".join(
+        f"{{{_KINDS[kind]}, {len(members)}, ex_members_{k}}}"
+        for k, (kind, members) in enumerate(split.order)
+    )
     head = ["#ifndef PSA_EXACT_MODEL_H", "#define PSA_EXACT_MODEL_H", '#include "exact_math.h"']
     head += [f"#define {name} {value}" for name, value in sizes.items()]
     head += ["#define EX_ROWS ((EX_NL + COLUMNS - 1) / COLUMNS * COLUMNS)"]
@@ -191,10 +188,11 @@ def generate(split: Split, output: str) -> str:
         *(_integers(name, values) for name, values in lists.items()),
         _table("ex_reach", reach.astype(int).tolist(), len(split.linear)),
         _table("ex_feed", feeds, sizes["EX_NFEED"] + 1),
-        _table("ex_port_along", _along(split), max(1, len(split.groups))),
+        _table("ex_port_along", along, max(1, len(split.groups))),
         *(_table(f"ex_group_{name}", *rows) for name, rows in _behind(split).items()),
         *tables,
-        *_items(split),
+        *(_integers(f"ex_members_{k}", members) for k, (_, members) in enumerate(split.order)),
+        f"static const psa_item ex_items[{max(1, len(split.order))}] = {{{items or '{0, 0, 0}'}}};",
     ]  # fmt: skip
     return "\n".join([*head, *printer.functions, prepare, "#endif", ""])
 
@@ -209,15 +207,6 @@ def _table(name: str, rows: Sequence[Sequence[int]], width: int) -> str:
     filled = [[*row, *[-1] * (width - len(row))] for row in rows] or [[-1] * width]
     text = ", ".join("{" + ", ".join(str(v) for v in row) + "}" for row in filled)
     return f"static const int {name}[{len(filled)}][{width}] = {{{text}}};"
-
-
-def _items(split: Split) -> list[str]:
-    lines, rows = [], []
-    for k, (kind, members) in enumerate(split.order):
-        lines.append(_integers(f"ex_members_{k}", members))
-        rows.append(f"{{{_KINDS[kind]}, {len(members)}, ex_members_{k}}}")
-    listed = ", ".join(rows) or "{0, 0, 0}"
-    return [*lines, f"static const psa_item ex_items[{max(1, len(rows))}] = {{{listed}}};"]
 
 
 def _partials(
@@ -242,23 +231,28 @@ def _partials(
 _OF_RATE = "real w, real *k"
 
 
+def _printed(
+    split: Split, printer: Printer, name: str, k: int, rows: Sequence[Expression],
+    rate: Expression | None = None, last: Sequence[int] = (),
+) -> tuple[list[Entry], str]:  # fmt: skip
+    """Print the k-th function of a name and its slopes; return their entries and the chain."""
+    partials, entries = _partials(split, rows, rate)
+    printer.function(f"{name}_{k}", rows)
+    printer.function(f"{name}_slopes_{k}", [*rows, *partials])
+    return entries, chain(f"{name}_chain_{k}", entries, len(rows), last)
+
+
 def _groups(split: Split, printer: Printer, rate: Expression) -> tuple[int, int]:
     s, texts, rate_texts, largest, rate_size = split.structure, [], [], 1, 1
     for k, group in enumerate(split.groups):
         slopes = ca.substitute(group.slopes, group.rate, rate)
         rows = [slopes[i] for i in range(len(group.states))]
-        partials, entries = _partials(split, rows, rate)
-        printer.function(f"ex_group_{k}", rows)
-        printer.function(f"ex_group_slopes_{k}", [*rows, *partials])
+        entries, text = _printed(split, printer, "ex_group", k, rows, rate, group.states)
         printer.of_rate(f"ex_group_rate_{k}")
-        driver = s.xdot[group.driver]
-        moved, rate_entries = _partials(split, [driver], None)
-        printer.function(f"ex_rate_{k}", [driver])
-        printer.function(f"ex_rate_slopes_{k}", [driver, *moved])
-        rate_size = max(rate_size, 1 + len(moved))
-        largest = max(largest, len(rows) + len(partials))
-        texts.append(chain(f"ex_group_chain_{k}", entries, len(rows), group.states))
-        rate_texts.append(chain(f"ex_rate_chain_{k}", rate_entries))
+        moved, rate_text = _printed(split, printer, "ex_rate", k, [s.xdot[group.driver]])
+        largest, rate_size = max(largest, len(rows) + len(entries)), max(rate_size, 1 + len(moved))
+        texts.append(text)
+        rate_texts.append(rate_text)
     for name in ("ex_group", "ex_group_slopes", "ex_rate", "ex_rate_slopes"):
         printer.functions.append(dispatch(name, len(split.groups)))
     printer.functions.append(dispatch("ex_group_rate", len(split.groups), _OF_RATE))
@@ -270,16 +264,14 @@ def _groups(split: Split, printer: Printer, rate: Expression) -> tuple[int, int]
 def _ports(split: Split, printer: Printer, tables: list[str]) -> int:
     texts, by_state, largest = [], [], 1
     for k, port in enumerate(split.ports):
-        partials, entries = _partials(split, [port.value], None)
-        printer.function(f"ex_port_{k}", [port.value])
-        printer.function(f"ex_port_slopes_{k}", [port.value, *partials])
-        texts.append(chain(f"ex_port_chain_{k}", entries))
+        entries, text = _printed(split, printer, "ex_port", k, [port.value])
+        texts.append(text)
         at = [-1] * len(split.linear)
         for place, entry in enumerate(entries):
             if entry.kind == 0 and entry.index in split.linear:
                 at[split.linear.index(entry.index)] = 1 + place
         by_state.append(at)
-        largest = max(largest, 1 + len(partials))
+        largest = max(largest, 1 + len(entries))
     tables.append(_table("ex_port_by_linear", by_state, max(1, len(split.linear))))
     for name in ("ex_port", "ex_port_slopes"):
         printer.functions.append(dispatch(name, len(split.ports)))
@@ -304,12 +296,6 @@ def _needed(split: Split) -> tuple[list[int], list[int]]:
     return sorted((inside | path) - set(split.along)), sorted(path)
 
 
-def _along(split: Split) -> list[list[int]]:
-    """Return for every port which groups' drivers or states it reads."""
-    read = [_read(split, q.value) for q in split.ports]
-    return [[int(bool(r & {g.driver, *g.states})) for g in split.groups] or [0] for r in read]
-
-
 def _behind(split: Split) -> dict[str, tuple[list[list[int]], int]]:
     """Return for every group which parameters and states it, or its driver's way, depends on."""
     s = split.structure
@@ -321,9 +307,3 @@ def _behind(split: Split) -> dict[str, tuple[list[list[int]], int]]:
         "behind": ([row.astype(int).tolist() for row in states], len(s.states)),
         "by": ([row.astype(int).tolist() for row in parameters], max(1, len(s.parameters))),
     }
-
-
-def _linear_reach(split: Split) -> npt.NDArray[np.bool_]:
-    """Return [k, j]: a change of the linear state j reaches k through M, in the order of L."""
-    m, _, _ = split.matrices
-    return closure(ca.DM(ca.sparsify(m).sparsity(), 1).full() != 0)

@@ -18,28 +18,15 @@ Node = tuple[Any, ...]
 _Affine = tuple[int | None, float, float]
 
 BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
-_CALLS = {
-    ca.OP_SQRT: "v_sqrt",
-    ca.OP_EXP: "v_exp",
-    ca.OP_LOG: "v_log",
-    ca.OP_FABS: "v_fabs",
-    ca.OP_FMIN: "v_fmin",
-    ca.OP_FMAX: "v_fmax",
-    ca.OP_SIN: "v_sin",
-    ca.OP_COS: "v_cos",
-    ca.OP_TAN: "v_tan",
-    ca.OP_ATAN: "v_atan",
-    ca.OP_TANH: "v_tanh",
-    ca.OP_SIGN: "v_sign",
-    ca.OP_LT: "v_less",
-    ca.OP_LE: "v_less_equal",
-    ca.OP_EQ: "v_equal",
-    ca.OP_NE: "v_unequal",
-    ca.OP_NOT: "v_not",
-    ca.OP_AND: "v_and",
-    ca.OP_OR: "v_or",
+#: Functions of exact_math.h: those of CasADi's names, and others.
+_SAME = (
+    "sqrt", "exp", "log", "fabs", "fmin", "fmax", "sin", "cos", "tan", "atan", "tanh", "sign",
+    "not", "and", "or",
+)  # fmt: skip
+_CALLS = {getattr(ca, f"OP_{name.upper()}"): f"v_{name}" for name in _SAME} | {
+    ca.OP_LT: "v_less", ca.OP_LE: "v_less_equal", ca.OP_EQ: "v_equal", ca.OP_NE: "v_unequal",
     ca.OP_IF_ELSE_ZERO: "v_if",
-}
+}  # fmt: skip
 _POWERS = (ca.OP_POW, ca.OP_CONSTPOW)
 LEAVES = ("x", "v", "t", "w", "p", "c")
 
@@ -152,16 +139,11 @@ class Graph:
                 return self._halves(base, halves)
             halves = math.floor(2.0 * shift) if abs(shift) <= 16.0 else 0
             reduced = self.constant(shift - 0.5 * halves) if halves else exponent
-            first = self.add("v_exp", self.add("*", self.add("v_log_of_base", base), reduced))
-            return self._shifted(first, base, halves)
-        rest = shift - 0.5 * halves
-        scaled = symbol if factor == 1.0 else self.add("*", symbol, self.constant(factor))
-        reduced = scaled if rest == 0.0 else self.add("+", scaled, self.constant(rest))
-        first = self.add("v_exp", self.add("*", self.add("v_log_of_base", base), reduced))
-        return self._shifted(first, base, halves)
-
-    def _shifted(self, power: int, base: int, halves: int) -> int:
-        """Return power base^(halves/2)."""
+        else:
+            rest = shift - 0.5 * halves
+            scaled = symbol if factor == 1.0 else self.add("*", symbol, self.constant(factor))
+            reduced = scaled if rest == 0.0 else self.add("+", scaled, self.constant(rest))
+        power = self.add("v_exp", self.add("*", self.add("v_log_of_base", base), reduced))
         return self.add("*", power, self._halves(base, halves)) if halves else power
 
     def _halves(self, base: int, halves: int) -> int:

@@ -22,8 +22,7 @@ from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import doubles, which_of
 from psa_casadi.simulation.timings import count_run
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: A sample is halved so many times at most; what then misses the tolerance is counted as forced.
 FINEST = 12

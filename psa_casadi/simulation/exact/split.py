@@ -95,20 +95,12 @@ def _rate_name(s: Structure, i: int) -> str | None:
 
 
 def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expression:
-    """Return an expression with all balances but those kept substituted."""
-    names = [n for n in s.balances if n not in keep]
-    symbols, sums = [s.symbols[n] for n in names], [s.balances[n] for n in names]
-    unused = [q for n, q in s.symbols.items() if n not in s.balances and _is_balance(s, n)]
-    result = ca.substitute([ca.SX(expression)], unused, [ca.SX(0)] * len(unused))[0]
+    """Return an expression with all balances but those kept substituted, by 0 where none is."""
+    sums = {n: s.balances.get(n, ca.SX(0)) for n in s.balance_table if n not in keep}
+    symbols, result = [s.symbols[n] for n in sums], ca.SX(expression)
     while any(ca.depends_on(result, q) for q in symbols):
-        result = ca.substitute([result], symbols, sums)[0]
-        result = ca.substitute([result], unused, [ca.SX(0)] * len(unused))[0]
+        result = ca.substitute([result], symbols, list(sums.values()))[0]
     return result
-
-
-def _is_balance(s: Structure, name: str) -> bool:
-    tables = (s.states, s.inputs, s.parameters, s.sampled)
-    return name != "time" and all(name not in [q.name for q in table] for table in tables)
 
 
 def groups_along(found: Mapping[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
@@ -157,8 +149,17 @@ def order_of(
         else:
             items.append(("port", (k,)))
     items += [("loop", tuple(ks)) for ks in loops.values()]
-    feeds = [_feeds(groups, ports, item) for item in items]
-    reads = [_reads(s, groups, ports, item) for item in items]
+    feeds, reads = [], []
+    for kind, members in items:
+        if kind == "group":
+            group = groups[members[0]]
+            inside, own = np.any(dependence(group.slopes, s.x), axis=0), list(group.states)
+            read = [*(j for j in np.flatnonzero(inside).tolist() if j not in own), group.driver]
+        else:
+            inside = np.any([dependence(ports[k].value, s.x)[0] for k in members], axis=0)
+            own, read = [ports[k].state for k in members], np.flatnonzero(inside).tolist()
+        feeds.append(own)
+        reads.append(read)
     waiting, done = list(range(len(items))), []
     while waiting:
         ready = [
@@ -171,23 +172,6 @@ def order_of(
         done += ready
         waiting = [k for k in waiting if k not in ready]
     return tuple(items[k] for k in done)
-
-
-def _feeds(groups: Sequence[Group], ports: Sequence[Port], item: Item) -> list[int]:
-    kind, members = item
-    if kind == "group":
-        return list(groups[members[0]].states)
-    return [ports[k].state for k in members]
-
-
-def _reads(s: Structure, groups: Sequence[Group], ports: Sequence[Port], item: Item) -> list[int]:
-    kind, members = item
-    if kind == "group":
-        group = groups[members[0]]
-        inside = np.any(dependence(group.slopes, s.x), axis=0)
-        return [int(j) for j in np.flatnonzero(inside) if j not in group.states] + [group.driver]
-    inside = np.any([dependence(ports[k].value, s.x)[0] for k in members], axis=0)
-    return [int(j) for j in np.flatnonzero(inside)]
 
 
 #: Operations whose value jumps.
@@ -236,20 +220,23 @@ def _split(s: Structure) -> Split:
         raise NoSplit("its equations jump")
     depends = dependence(s.xdot, s.x)  # [k, j]: x_k' depends on x_j
     reach = closure(depends)
-    moving = [i for i in range(len(s.states)) if not _constant_slopes(s, i)]
+    every = variables(s)
+    moving = [  # not affine in states, inputs and time with constant coefficients
+        i for i in range(len(s.states)) if ca.depends_on(ca.jacobian(s.xdot[i], every), every)
+    ]
     alone = [i for i in moving if not any(reach[i, j] and reach[j, i] for j in others(s, i))]
     found = {i: g for i in alone if (g := along(s, i, reach)) is not None}
     groups = groups_along(found)
     # what feeds comes before what it feeds: M is block triangular
-    linear = tuple(
-        sorted(
-            (i for i in range(len(s.states)) if i not in found),
-            key=lambda i: (int(reach[i].sum()), i),
-        )
-    )
+    rest = (i for i in range(len(s.states)) if i not in found)
+    linear = tuple(sorted(rest, key=lambda i: (int(reach[i].sum()), i)))
     matrices, remainders = _linear_part(s, linear)
     ports = _ports(s, linear, remainders, groups, reach)
-    _check_switches(s, groups)
+    # kinks that are not those of a driver's rate: steps do not look for others
+    rates = [s.xdot[g.driver] for g in groups]
+    for name, expression in s.switches.items():
+        if not any(ca.is_equal(expression, rate, 20) for rate in rates):
+            raise NoSplit(f"its equations have a kink of their own ({name})")
     return Split(s, linear, groups, ports, order_of(s, groups, ports, reach), matrices)
 
 
@@ -260,13 +247,6 @@ def jumps(s: Structure) -> bool:
     """
     equations = ca.Function("f", s.arguments, [s.xdot])
     return any(equations.instruction_id(k) in _JUMPS for k in range(equations.n_instructions()))
-
-
-def _constant_slopes(s: Structure, i: int) -> bool:
-    """Whether x_i' is affine in states, inputs and time with constant coefficients."""
-    everything = variables(s)
-    slopes = ca.jacobian(s.xdot[i], everything)
-    return not ca.depends_on(slopes, everything)
 
 
 def _linear_part(
@@ -280,31 +260,19 @@ def _linear_part(
     blocks = [ca.jacobian(xdot, x), ca.jacobian(xdot, s.u), xdot]
     m, b, c = (ca.densify(q) for q in ca.substitute(blocks, [everything], [origin]))
     given, coefficients = ca.vertcat(x, s.u), ca.horzcat(m, b)
-    remainders = [
-        _remainder(xdot[k], given, coefficients[k, :].T, c[k], everything) for k in range(len(rows))
-    ]
+    remainders = []
+    for k in range(len(rows)):
+        # where the row is affine in a variable, this is taken out by setting it to 0, so that
+        # nothing cancels in numbers
+        slopes, of_row = ca.jacobian(xdot[k], given), coefficients[k, :].T
+        bent = [j for j in range(given.numel()) if ca.depends_on(slopes[j], everything)]
+        straight = [j for j in range(given.numel()) if j not in bent]
+        rest = ca.substitute(xdot[k], given[straight], ca.SX.zeros(len(straight)))
+        if ca.depends_on(rest, everything):
+            remainders.append(rest - c[k] - (of_row[bent].T @ given[bent] if bent else 0))
+        else:
+            remainders.append(ca.SX(0))
     return (m, b, c), remainders
-
-
-def _remainder(
-    row: Expression,
-    given: Expression,
-    linear: Expression,
-    constant: Expression,
-    everything: Expression,
-) -> Expression:
-    """Return what `linear` and `constant` leave of a row.
-
-    Where the row is affine in a variable, this is taken out by setting it to 0, so that nothing
-    cancels in numbers.
-    """
-    slopes = ca.jacobian(row, given)
-    bent = [j for j in range(given.numel()) if ca.depends_on(slopes[j], everything)]
-    straight = [j for j in range(given.numel()) if j not in bent]
-    rest = ca.substitute(row, given[straight], ca.SX.zeros(len(straight)))
-    if not ca.depends_on(rest, everything):
-        return ca.SX(0)
-    return rest - constant - (linear[bent].T @ given[bent] if bent else 0)
 
 
 def _ports(
@@ -329,11 +297,3 @@ def _ports(
         chord = -1 if feedback else next(iter([*drivers, *near]), -1)
         ports.append(Port(state, value, feedback, chord))
     return tuple(ports)
-
-
-def _check_switches(s: Structure, groups: Sequence[Group]) -> None:
-    """Refuse kinks that are not those of a driver's rate: steps do not look for others."""
-    rates = [s.xdot[g.driver] for g in groups]
-    for name, expression in s.switches.items():
-        if not any(ca.is_equal(expression, rate, 20) for rate in rates):
-            raise NoSplit(f"its equations have a kink of their own ({name})")
