@@ -198,11 +198,11 @@ _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
 _HYSTERESIS_SHARE = 0.1
 
-#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The second saturates early, far
-#: within the range; from the first a fit of such a loop ends with a steep A and no bend.
+#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The first saturates early, far
+#: within the range; from the second a fit of such a loop ends with a steep A and no bend.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
-    {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
     {"A": -0.35, "beta": 0.6, "gamma": 0.02, "n": 1.4},
+    {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
 )
 
 
@@ -233,8 +233,8 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "C_p": _CAPACITANCE if told is None else told.value,
         "k_P": k_p,
         "k_B": k_b,
-        **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
-        "n": LOOP_SHAPES[0]["n"],
+        **{name: share * k_l for name, share in LOOP_SHAPES[1].items() if name != "n"},
+        "n": LOOP_SHAPES[1]["n"],
     }
     try:
         return compose(BASE, {**values, **_within(_lags(values, sample_time))})
