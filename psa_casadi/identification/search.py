@@ -177,7 +177,7 @@ def _search(
         keep(best)
         best = without_blur(best, experiments)
         keep(best)
-    if thorough and not best.interrupted:
+    if (thorough or told) and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)
         not_unique |= set(open_ones)
     names = best.unknowns.names
