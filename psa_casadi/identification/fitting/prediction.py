@@ -174,11 +174,9 @@ def traced_by_theta(
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
     found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
-    count, first = len(unknowns.names), unknowns.first(index)
-    by_theta = np.zeros((len(found.output), unknowns.size))
-    by_theta[:, :count] = found.sensitivity[:, :count] @ slopes
-    by_start = found.sensitivity[:, count:] * unknowns.start_scale[index]
-    by_theta[:, first : first + len(start)] = by_start
+    count = len(unknowns.names)
+    by_theta = found.sensitivity[:, count:] @ unknowns.start_slopes(theta, index)
+    by_theta[:, :count] += found.sensitivity[:, :count] @ slopes
     return found.output, by_theta, found.way
 
 
