@@ -103,22 +103,20 @@ def physical_formulas(values: Values, free: Sequence[str]) -> list[Formula]:
 def monomials(values: Values, free: Sequence[str]) -> Iterator[Formula]:
     """Yield products and ratios of two and of three free parameters that are not zero."""
     sized = [n for n in free if values[n] != 0.0]
-    for pair in combinations(sized, 2):
-        for powers in ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2)):
-            yield _monomial(pair, powers)
-    for triple in combinations(sized, 3):
-        for second, third in product((1, -1), repeat=2):
-            yield _monomial(triple, (1, second, third))
-
-
-def _monomial(names: Sequence[str], powers: Sequence[int]) -> Formula:
-    factors = [n if abs(k) == 1 else f"{n}^{abs(k)}" for n, k in zip(names, powers, strict=True)]
-    above, below = (
-        " ".join(f for f, k in zip(factors, powers, strict=True) if sign * k > 0)
-        for sign in (1, -1)
-    )
-    text = f"{above}/({below})" if " " in below else f"{above}/{below}" if below else above
-    return Formula(text, "the ratio" if below else "the product", physical=False)
+    pairs = ((1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (1, -2))
+    triples = tuple((1, *signs) for signs in product((1, -1), repeat=2))
+    for count, every in ((2, pairs), (3, triples)):
+        for names, powers in product(combinations(sized, count), every):
+            factors = [
+                f"{n}^{abs(k)}" if abs(k) > 1 else n for n, k in zip(names, powers, strict=True)
+            ]
+            above, below = (
+                " ".join(f for f, k in zip(factors, powers, strict=True) if sign * k > 0)
+                for sign in (1, -1)
+            )
+            text = f"{above}/({below})" if " " in below else f"{above}/{below}"
+            meaning = "the ratio" if below else "the product"
+            yield Formula(text if below else above, meaning, physical=False)
 
 
 @dataclass(frozen=True)
@@ -159,10 +157,14 @@ def free_combinations(
     candidates = [judge.known(f) for f in physical_formulas(model.values, found.names)]
     open_ones = {n for n in found.names if judge.relative(n) > WEAK}
     while True:
-        news = [(judge.rank(c, open_ones), c) for c in candidates if c and open_ones & set(c.parts)]
+        news = [c for c in candidates if c and open_ones & set(c.parts)]
         if not news:
             break
-        best = min(news, key=lambda pair: pair[0])[1]
+        ranks = []  # the smallest for a formula that is sure, short, and explains much
+        for c in news:
+            free = sum(n in found.names for n in c.formula.names)
+            ranks.append(c.cancelled * 2.0**free / len(open_ones & set(c.parts)))
+        best = news[int(np.argmin(ranks))]
         results.append(judge.combination(best))
         open_ones -= set(best.parts)
     left = [n for n in found.undetermined if n in open_ones]
@@ -204,19 +206,18 @@ class _Judge:
         found, names = self._found, self._found.names
         order = formula.names if formula.physical else names
         free = [n for n in order if n in names and n in formula.names]
-        gradient = np.array([self._slope(formula, n) if n in free else 0.0 for n in names])
-        value = abs(formula.value(self._model.values))
+        values, gradient = self._model.values, np.zeros(len(names))
+        for n in free:
+            step = _STEP * self._size(n)
+            up, down = (formula.value({**values, n: values[n] + h}) for h in (step, -step))
+            gradient[names.index(n)] = (up - down) / (2.0 * step)
+        value = abs(formula.value(values))
         error = float(np.sqrt(max(float(gradient @ found.covariance @ gradient), 0.0)))
         alone = {n: abs(gradient[names.index(n)]) * found.standard_errors[n] for n in free}
         parts = tuple(n for n in free if alone[n] >= SURER * error)
         if error > KNOWN * value or len(parts) < (2 if formula.physical else len(free)):
             return None
         return _Known(formula, parts, error / value, error / max(alone.values()))
-
-    def rank(self, known: _Known, wanted: set[str]) -> float:
-        """Return what is smallest for a formula that is sure, short, and explains much."""
-        free = sum(n in self._found.names for n in known.formula.names)
-        return float(known.cancelled * 2.0**free / len(wanted & set(known.parts)))
 
     def combination(self, c: _Known) -> Combination:
         """Return what is known and what trades off."""
@@ -245,16 +246,12 @@ class _Judge:
 
     def relative(self, name: str) -> float:
         """Return a parameter's standard error over its value."""
-        value = self._model.values[name]
-        size = abs(value) or self._model.parameter(name).typical(self._model.values)
-        return self._found.standard_errors[name] / size
+        return self._found.standard_errors[name] / self._size(name)
+
+    def _size(self, name: str) -> float:
+        values = self._model.values
+        return abs(values[name]) or self._model.parameter(name).typical(values)
 
     def _tied(self, one: str, other: str) -> bool:
         row, column = self._found.names.index(one), self._found.names.index(other)
         return bool(one != other and abs(self._found.correlations[row, column]) > TIED)
-
-    def _slope(self, formula: Formula, name: str) -> float:
-        values = self._model.values
-        step = _STEP * (abs(values[name]) or self._model.parameter(name).typical(values))
-        up, down = (formula.value({**values, name: values[name] + h}) for h in (step, -step))
-        return (up - down) / (2.0 * step)

@@ -47,51 +47,39 @@ def evidence_of(
     runs; its interval and the budget are the diagnosis's to add.
     """
     model, records = fit.model, [e.record for e in experiments]
-    factors = [_factor(r, s) for r, s in zip(records, sampled or records, strict=True)]
-    runs = _runs(fit, experiments, predicted, factors)
-    chosen = next((k for k, e in enumerate(experiments) if e.held_out_whole), 0)
-    used = [_errors(e, y)[e.used] for e, y in zip(experiments, predicted, strict=True)]
-    return Evidence(
-        by=by,
-        fitted_m=_rms(np.concatenate(used)),
-        seen=_seen(records),
-        covariance=_covariance(found),
-        runs=runs,
-        reference=_reference(model, records[chosen]),
-        outside=tuple(c.name for c in model.effects if not c.in_plant),
-        unnamed=tuple(c.description for c in model.effects if c.name.startswith("patch")),
-    )
-
-
-def _runs(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    predicted: Sequence[FloatArray],
-    factors: Sequence[int],
-) -> tuple[RecordRun, ...]:
-    theta = fit.placed(experiments)
-    runs = []
-    for k, (e, y, factor) in enumerate(zip(experiments, predicted, factors, strict=True)):
-        x0 = record_start(fit.model, e.record, fit.unknowns.start(theta, k))
-        errors, held = _errors(e, y), bool(e.held_out.any())
+    runs, used, theta = [], [], fit.placed(experiments)
+    for k, (e, y) in enumerate(zip(experiments, predicted, strict=True)):
+        x0 = record_start(model, e.record, fit.unknowns.start(theta, k))
+        errors = measured(e.record) - y
+        given = sampled[k] if sampled else e.record
+        used.append(errors[e.used])
         runs.append(
             RecordRun(
                 record=e.record.name,
                 sha256=e.record.sha256,
-                start=dict(zip(fit.model.state_names, x0.tolist(), strict=True)),
-                offset_m=float(y[0]) - _shown(fit.model, e.record, x0),
+                start=dict(zip(model.state_names, x0.tolist(), strict=True)),
+                offset_m=float(y[0]) - _shown(model, e.record, x0),
                 samples=e.record.n,
-                averaged=factor,
+                averaged=max(1, round(e.record.sample_time / given.sample_time)),
                 fitted_m=_rms(errors[e.known]),
-                held_out_m=_rms(errors[e.held_out]) if held else None,
+                held_out_m=_rms(errors[e.held_out]) if e.held_out.any() else None,
                 held_out=tuple(runs_of(e.held_out)),
             )
         )
-    return tuple(runs)
-
-
-def _errors(experiment: Experiment, predicted: FloatArray) -> FloatArray:
-    return measured(experiment.record) - predicted
+    chosen = next((k for k, e in enumerate(experiments) if e.held_out_whole), 0)
+    matrix = 0.5 * (found.covariance + found.covariance.T)
+    known = np.isfinite(matrix).all()  # without names where it has overflowed
+    rows = tuple(tuple(row) for row in matrix.tolist())
+    return Evidence(
+        by=by,
+        fitted_m=_rms(np.concatenate(used)),
+        seen=_seen(records),
+        covariance=Covariance(found.names, rows) if known else Covariance((), ()),
+        runs=tuple(runs),
+        reference=_reference(model, records[chosen]),
+        outside=tuple(c.name for c in model.effects if not c.in_plant),
+        unnamed=tuple(c.description for c in model.effects if c.name.startswith("patch")),
+    )
 
 
 def _rms(values: FloatArray) -> float:
@@ -105,38 +93,22 @@ def _shown(model: Model, record: Record, x0: FloatArray) -> float:
     return float(y[model.output_names.index(OUTPUT)])
 
 
-def _factor(record: Record, sampled: Record) -> int:
-    return max(1, round(record.sample_time / sampled.sample_time))
-
-
 def _seen(records: Sequence[Record]) -> SeenRange:
-    low = min(float(r.voltage.min()) for r in records)
-    high = max(float(r.voltage.max()) for r in records)
-    warm = [t for r in records if r.temperature is not None for t in (r.temperature,)]
+    warm = [t for r in records if (t := r.temperature) is not None]
+    rates = []
+    for r in records:  # the largest, beyond what the voltage's white noise makes
+        moved = np.abs(np.diff(r.voltage)) - _NOISE * fast_noise(r.voltage)
+        rates.append(max(0.0, float(np.max(moved / np.diff(r.time)))))
     return SeenRange(
-        voltage=Interval(low, high),
-        rate=max(_rate(r) for r in records),
+        voltage=_interval([r.voltage for r in records]),
+        rate=max(rates),
         duration=max(r.duration for r in records),
-        temperature=(
-            Interval(min(float(t.min()) for t in warm), max(float(t.max()) for t in warm))
-            if warm
-            else None
-        ),
+        temperature=_interval(warm) if warm else None,
     )
 
 
-def _rate(record: Record) -> float:
-    """Return the largest rate of the voltage [V/s], beyond what its white noise makes."""
-    moved = np.abs(np.diff(record.voltage)) - _NOISE * fast_noise(record.voltage)
-    return max(0.0, float(np.max(moved / np.diff(record.time))))
-
-
-def _covariance(found: Determinacy) -> Covariance:
-    """Return the covariance, without names where it has overflowed."""
-    matrix = 0.5 * (found.covariance + found.covariance.T)
-    if not np.isfinite(matrix).all():
-        return Covariance((), ())
-    return Covariance(found.names, tuple(tuple(row) for row in matrix.tolist()))
+def _interval(columns: Sequence[FloatArray]) -> Interval:
+    return Interval(min(float(c.min()) for c in columns), max(float(c.max()) for c in columns))
 
 
 def _reference(model: Model, record: Record) -> ReferenceRun:

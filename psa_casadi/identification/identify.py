@@ -50,6 +50,9 @@ _MISSED = 1.5
 #: Rounds of fitting with every record's own residual as its noise level.
 _LEVEL_ROUNDS = 2
 
+#: What may be unlike a stack's in records.
+_DOUBTS = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_sign, doubtful_quantity)
+
 FORCE_NOTE = note("force_assumed")
 INTERRUPTED = note("interrupted")
 
@@ -188,7 +191,10 @@ def identify(
         fit=best,
         determinacy=determined,
         experiments=experiments,
-        doubts=(*_of_records(fitted), *_of_fit(best, determined, found, experiments)),
+        doubts=(
+            *(s for doubt in _DOUBTS if (s := doubt(fitted))),
+            *_of_fit(best, determined, found, experiments),
+        ),
         starts=found.starts,
         notes=(
             *said,
@@ -234,7 +240,7 @@ def with_provenance(
 
 def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
     """Return the model of the best fit so far, marked as that of a search that was interrupted."""
-    provenance = Provenance(
+    found = Provenance(
         identified_from=tuple((r.name, r.sha256) for r in records),
         package_version=__version__,
         free=best.unknowns.names,
@@ -242,7 +248,7 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
         notes=(str(INTERRUPTED), *(() if stiffness_given else (str(FORCE_NOTE),))),
         interrupted=True,
     )
-    return replace(best.model, provenance=provenance, evidence=None)
+    return replace(best.model, provenance=found, evidence=None)
 
 
 def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
@@ -288,9 +294,3 @@ def _of_fit(
         if noise > 0 and rms > _MISSED * noise:
             notes.append(note("missed", record=e.record.name, times=rms / noise))
     return notes
-
-
-def _of_records(records: Sequence[Record]) -> list[str]:
-    """Say what of the records is unlike a stack's: unit, voltage, time, sign, quantity."""
-    doubts = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_sign, doubtful_quantity)
-    return [s for doubt in doubts if (s := doubt(records))]

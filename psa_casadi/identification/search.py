@@ -157,7 +157,8 @@ def _search(
     polished: list[Fit] = []
     for name, quick in found:
         near = quick.data_cost < (_NEAR if thorough else _CLOSE) * found[0][1].data_cost
-        missed = thorough and len(polished) < _FOLLOWED and all(map(_misses, polished))
+        lost = all(f.data_cost > _MISSED * len(f.residuals) for f in polished)
+        missed = thorough and len(polished) < _FOLLOWED and lost
         if polished and (polished[0].interrupted or not (missed or (near and len(polished) < 2))):
             break
         if polished and not thorough and same_place(found[0][1], quick, experiments):
@@ -177,16 +178,11 @@ def _search(
         keep(best)
         best = without_blur(best, experiments)
         keep(best)
-    if thorough and not best.interrupted:
+    if (thorough or told) and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)
         not_unique |= set(open_ones)
     names = best.unknowns.names
     return Search(best, outcomes, tuple(n for n in names if n in not_unique))
-
-
-def _misses(found: Fit) -> bool:
-    """Whether a fit leaves much more than the noise, or lost itself on the way there."""
-    return found.data_cost > _MISSED * len(found.residuals)
 
 
 def _outcomes(
@@ -290,23 +286,22 @@ def search_forms(
             break
     if not found:
         raise failed[0]
-    ranked = sorted(found, key=lambda s: _criterion(s.best, experiments))
+    samples = [int(e.used.sum()) for e in experiments]
+
+    def criterion(s: Search) -> float:
+        levels = record_rms(s.best, experiments)
+        likely = sum(n * np.log(level**2) for n, level in zip(samples, levels, strict=True))
+        return float(likely + len(s.best.unknowns.names) * np.log(sum(samples)))
+
+    ranked = sorted(found, key=criterion)
     if len(ranked) < 2:
         return ranked[0], None
-    (better, left), (other, other_left) = ((_form(s.best), 1e9 * s.best.rms) for s in ranked)
-    said = note("form", better=better, left=left, other=other, other_left=other_left)
+    forms = [
+        next(_LABELS[c.name] for c in s.best.model.components if c.name in _LABELS) for s in ranked
+    ]
+    left, other_left = (1e9 * s.best.rms for s in ranked)
+    said = note("form", better=forms[0], left=left, other=forms[1], other_left=other_left)
     return ranked[0], said
-
-
-def _form(found: Fit) -> str:
-    return next(_LABELS[c.name] for c in found.model.components if c.name in _LABELS)
-
-
-def _criterion(found: Fit, experiments: Sequence[Experiment]) -> float:
-    samples = [int(e.used.sum()) for e in experiments]
-    levels = record_rms(found, experiments)
-    likely = sum(n * np.log(level**2) for n, level in zip(samples, levels, strict=True))
-    return float(likely + len(found.unknowns.names) * np.log(sum(samples)))
 
 
 #: The column, and the highest order of the curve.
@@ -348,9 +343,17 @@ def loads_as_curves(
         return tuple(experiments)
     progress("base fit without the measured load")
     unloaded = without_column(experiments, LOAD)
+    as_displacement = []  # the load, to the size and sign of the displacement
+    for e, load in zip(experiments, loads, strict=True):
+        y = np.asarray(e.record.displacement)
+        seen, span = np.isfinite(y), max(float(np.ptp(load)), 1e-300)
+        sign = np.sign(np.cov(load[seen], y[seen])[0, 1]) or 1.0
+        shown = np.where(seen, load * sign * e.record.range_m / span, np.nan)
+        record = replace(e.record, displacement=shown, load_force=None)
+        as_displacement.append(replace(e, record=record, further=()))
     ways = [
         fit_base(start, own, progress=progress).predicted(own)
-        for own in (unloaded, tuple(map(_as_displacement, experiments)))
+        for own in (unloaded, tuple(as_displacement))
     ]
     curves = [_curve(load, own) for load, *own in zip(loads, *ways, strict=True)]
     straight = all(c is not None and c[1] == 1 for c in curves)
@@ -359,16 +362,6 @@ def loads_as_curves(
         curve = np.zeros(e.record.n) if straight else load if own is None else own[0]
         found.append(replace(e, record=replace(e.record, load_force=curve)))
     return tuple(found)
-
-
-def _as_displacement(e: Experiment) -> Experiment:
-    """Return an experiment whose displacement is its load, to the size and sign of the first."""
-    load, y = np.asarray(e.record.load_force), np.asarray(e.record.displacement)
-    span = max(float(np.ptp(load)), 1e-300)
-    seen = np.isfinite(y)
-    sign = np.sign(np.cov(load[seen], y[seen])[0, 1]) or 1.0
-    shown = np.where(seen, load * sign * e.record.range_m / span, np.nan)
-    return replace(e, record=replace(e.record, displacement=shown, load_force=None), further=())
 
 
 def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, int] | None:

@@ -67,12 +67,19 @@ def estimates(findings: Sequence[Finding], name: str) -> Estimates:
     else (high - low)/3.92, as the intervals of a fit are made.
     """
     rows = [(k, f.parameters[name]) for k, f in enumerate(findings) if name in f.parameters]
-    told = [(k, p) for k, p in rows if _tells(p)]
-    log = name in _logarithmic() and all(_positive(p) for _, p in told)
-    theta = np.array([math.log(p.value) if log else p.value for _, p in told])
-    errors = np.array([_error(p, log) for _, p in told])
+    told = [(k, p.value, *p.interval) for k, p in rows if _tells(p) and p.interval]
+    log = name in _shown()[0] and all(min(value, low) > 0.0 for _, value, low, _ in told)
+    widths = [math.log(high / low) if log else high - low for *_, low, high in told]
     first = rows[0][1] if rows else Found(0.0, "", None)
-    return Estimates(name, first.unit, first.meaning, log, tuple(k for k, _ in told), theta, errors)
+    return Estimates(
+        name,
+        first.unit,
+        first.meaning,
+        log,
+        tuple(k for k, *_ in told),
+        np.array([math.log(value) if log else value for _, value, *_ in told]),
+        np.array(widths) / (2.0 * NORMAL_95),
+    )
 
 
 def names_of(findings: Sequence[Finding]) -> tuple[str, ...]:
@@ -85,32 +92,19 @@ def _tells(p: Found) -> bool:
     return p.told and p.interval is not None and p.interval[1] > p.interval[0]
 
 
-def _positive(p: Found) -> bool:
-    return p.value > 0.0 and p.interval is not None and p.interval[0] > 0.0
-
-
-def _error(p: Found, log: bool) -> float:
-    low, high = p.interval or (math.nan, math.nan)
-    width = math.log(high / low) if log else high - low
-    return width / (2.0 * NORMAL_95)
-
-
 @cache
-def _logarithmic() -> frozenset[str]:
-    """Return the parameters that are fitted on a logarithmic scale."""
-    every = (*COMPONENTS.values(), *EFFECTS.values())
-    return frozenset(p.name for c in every for p in c.parameters if p.log)
+def _shown() -> tuple[frozenset[str], dict[str, str]]:
+    """Return the parameters that are fitted on a logarithmic scale, and units that are shown."""
+    every = [p for c in (*COMPONENTS.values(), *EFFECTS.values()) for p in c.parameters]
+    return (
+        frozenset(p.name for p in every if p.log),
+        {p.name: p.display_unit for p in every if p.display_unit},
+    )
 
 
 def display_unit(name: str, unit: str) -> str:
     """Return the unit that a parameter is shown in."""
-    return _display_units().get(name, unit)
-
-
-@cache
-def _display_units() -> dict[str, str]:
-    every = (*COMPONENTS.values(), *EFFECTS.values())
-    return {p.name: p.display_unit for c in every for p in c.parameters if p.display_unit}
+    return _shown()[1].get(name, unit)
 
 
 #: Days in a year, the unit of time of drifts.
@@ -202,18 +196,20 @@ def population(findings: Sequence[Finding], how: Adjustment = "benjamini-hochber
             f"No parameter is told by more than {FEWEST} of the {len(findings)} devices, so there"
             " is no population to speak of; give more devices, or compare these side by side."
         )
+    diagnosed = [f for f in findings if f.verdict]  # rivals are one cause
+    causes = [" or ".join((c.effect, *c.or_else)) for f in diagnosed for c in f.causes]
     return Population(
         findings=tuple(findings),
         spreads=tuple(spreads),
-        outliers=_told(findings, spreads, how),
+        outliers=_outliers(findings, spreads, how),
         batch_p=_over_parameters(
             {s.estimates.name: s.batches.p_value for s in spreads if s.batches}, how
         ),
         drift_p=_over_parameters(
             {s.estimates.name: s.drift.p_value for s in spreads if s.drift}, how
         ),
-        verdicts=frequencies([f.verdict for f in findings if f.verdict]),
-        causes=_causes(findings),
+        verdicts=frequencies([f.verdict for f in diagnosed]),
+        causes=frequencies(causes, len(diagnosed)) if causes else (),
         left_out=tuple(few),
     )
 
@@ -234,7 +230,7 @@ def _spread(findings: Sequence[Finding], found: Estimates, how: Adjustment) -> S
     return Spread(found, mixed_regression(theta, errors), far, tested, moved)
 
 
-def _told(
+def _outliers(
     findings: Sequence[Finding], spreads: Sequence[Spread], how: Adjustment
 ) -> tuple[Outlier, ...]:
     """Return the outliers of all parameters, their p values adjusted over all tests together."""
@@ -259,21 +255,11 @@ def _over_parameters(p_values: dict[str, float], how: Adjustment) -> dict[str, f
 
 def frequencies(words: Sequence[str], of: int | None = None) -> tuple[Frequency, ...]:
     """Count words, the most frequent first; intervals of the share are Wilson's."""
-    total = len(words) if of is None else of
-    counted = Counter(words).most_common()
-    return tuple(Frequency(word, n, total, _wilson(n, total)) for word, n in counted)
-
-
-def _wilson(count: int, of: int) -> tuple[float, float]:
-    found = scipy.stats.binomtest(count, of).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)
-
-
-def _causes(findings: Sequence[Finding]) -> tuple[Frequency, ...]:
-    """Count the named causes over the diagnosed devices; rivals are one cause, joined by "or"."""
-    diagnosed = [f for f in findings if f.verdict]
-    words = [" or ".join((c.effect, *c.or_else)) for f in diagnosed for c in f.causes]
-    return frequencies(words, len(diagnosed)) if words else ()
+    total, found = len(words) if of is None else of, []
+    for word, count in Counter(words).most_common():
+        share = scipy.stats.binomtest(count, total).proportion_ci(method="wilson")
+        found.append(Frequency(word, count, total, (float(share.low), float(share.high))))
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,10 +116,10 @@ class MixedFit:
         half = wide * float(self.standard_errors[k])
         return float(self.b[k]) - half, float(self.b[k]) + half
 
-    def significance(self, k: int) -> float:
-        """Return the two-sided p value of a coefficient that is 0 (Student's t)."""
-        t = abs(float(self.b[k])) / float(self.standard_errors[k])
-        return float(2.0 * scipy.stats.t.sf(t, self.dof))
+
+def _two_sided(t: FloatArray | float, dof: FloatArray | int) -> FloatArray:
+    """Return the two-sided p values of Student's t."""
+    return np.asarray(2.0 * scipy.stats.t.sf(np.abs(t), dof))
 
 
 def mixed_regression(
@@ -200,7 +200,6 @@ _MOST = 0.3
 #: Numbers in one matrix while devices are left out in turn.
 _AT_ONCE = 2_000_000
 BoolArray = npt.NDArray[np.bool_]
-IndexArray = npt.NDArray[np.int_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +247,7 @@ def _tested(
         whole = mixed_regression(y[kept], s[kept])
         spread = s[apart] ** 2 + whole.tau**2 + whole.covariance[0, 0]
         z[apart], dof[apart] = (y[apart] - whole.b[0]) / np.sqrt(spread), whole.dof
-    p = np.asarray(2.0 * scipy.stats.t.sf(np.abs(z), dof))
+    p = _two_sided(z, dof)
     return z, p, adjusted(p, how)
 
 
@@ -257,30 +256,28 @@ def _left_out(y: FloatArray, s: FloatArray) -> FloatArray:
 
     The mean and tau of `mixed_regression` without columns, in closed form.
     """
-    n = y.size
+    n, dof = y.size, y.size - 2
     unit = float(np.median(s))
     y, variance = (y - np.median(y)) / unit, (s / unit) ** 2
-    block = max(1, _AT_ONCE // n)
-    parts = [_block(y, variance, np.arange(k, min(k + block, n))) for k in range(0, n, block)]
-    return np.concatenate(parts)
-
-
-def _block(y: FloatArray, variance: FloatArray, left_out: IndexArray) -> FloatArray:
-    others = np.ones((left_out.size, y.size))
-    others[np.arange(left_out.size), left_out] = 0.0
-    tau2, dof = np.zeros(left_out.size), y.size - 2
-    for _ in range(MOST_STEPS):
-        w = others / (variance + tau2[:, None])
-        total = w.sum(axis=1)
-        mean = (w @ y) / total
-        rest = (w * (y - mean[:, None])) ** 2  # (w r)^2
-        q = np.sum(rest * (variance + tau2[:, None]), axis=1)
-        step = np.where(q > dof, (q - dof) / np.maximum(rest.sum(axis=1), 1e-300), 0.0)
-        if np.all(step <= PRECISION * tau2):
-            break
-        tau2 += step
-    scale = np.maximum(1.0, q / dof)
-    return np.asarray((y[left_out] - mean) / np.sqrt(variance[left_out] + tau2 + scale / total))
+    block, found = max(1, _AT_ONCE // n), []
+    for first in range(0, n, block):
+        left_out = np.arange(first, min(first + block, n))
+        others = np.ones((left_out.size, n))
+        others[np.arange(left_out.size), left_out] = 0.0
+        tau2 = np.zeros(left_out.size)
+        for _ in range(MOST_STEPS):
+            w = others / (variance + tau2[:, None])
+            total = w.sum(axis=1)
+            mean = (w @ y) / total
+            rest = (w * (y - mean[:, None])) ** 2  # (w r)^2
+            q = np.sum(rest * (variance + tau2[:, None]), axis=1)
+            step = np.where(q > dof, (q - dof) / np.maximum(rest.sum(axis=1), 1e-300), 0.0)
+            if np.all(step <= PRECISION * tau2):
+                break
+            tau2 += step
+        spread = variance[left_out] + tau2 + np.maximum(1.0, q / dof) / total
+        found.append((y[left_out] - mean) / np.sqrt(spread))
+    return np.concatenate(found)
 
 
 @dataclass(frozen=True)
@@ -331,27 +328,20 @@ def batch_test(theta: ArrayLike, errors: ArrayLike, names: Sequence[str]) -> Bat
     mean = float(np.sum(weights * y) / np.sum(weights))
     between = float(np.sum(weights * (y - mean) ** 2)) - inside
     f = between / (len(kinds) - 1) / max(1.0, inside / fit.dof)
-    contrasts = [_against_others(fit, k) for k in range(len(kinds))]
-    corrected = adjusted([p for _, p in contrasts], "bonferroni")
+    count = len(kinds)  # each batch less the plain mean of the others
+    contrast = (count * np.eye(count) - 1.0) / (count - 1)
+    differs = contrast @ fit.b
+    errors_of = np.sqrt(np.diag(contrast @ fit.covariance @ contrast.T))
+    corrected = adjusted(_two_sided(differs / errors_of, fit.dof), "bonferroni")
     batches = tuple(
         Batch(
-            kind, int(x[:, k].sum()), float(fit.b[k]), fit.interval(k), contrasts[k][0],
+            kind, int(x[:, k].sum()), float(fit.b[k]), fit.interval(k), float(differs[k]),
             float(corrected[k]),
         )
         for k, kind in enumerate(kinds)
     )  # fmt: skip
     p_value = float(scipy.stats.f.sf(f, len(kinds) - 1, fit.dof))
     return BatchTest(f, p_value, fit.tau, batches)
-
-
-def _against_others(fit: MixedFit, k: int) -> tuple[float, float]:
-    """Return a batch's mean less the plain mean of the others', and its p value."""
-    count = fit.b.size
-    contrast: FloatArray = np.full(count, -1.0 / (count - 1))
-    contrast[k] = 1.0
-    differs = float(contrast @ fit.b)
-    error = float(np.sqrt(contrast @ fit.covariance @ contrast))
-    return differs, float(2.0 * scipy.stats.t.sf(abs(differs) / error, fit.dof))
 
 
 def drift(theta: ArrayLike, errors: ArrayLike, time: ArrayLike) -> Drift:
@@ -367,4 +357,5 @@ def drift(theta: ArrayLike, errors: ArrayLike, time: ArrayLike) -> Drift:
     x = np.column_stack([np.ones(t.size), (t - t.mean()) / span])
     fit = mixed_regression(theta, errors, x)
     low, high = fit.interval(1)
-    return Drift(float(fit.b[1]) / span, (low / span, high / span), fit.significance(1))
+    p = float(_two_sided(fit.b[1] / fit.standard_errors[1], fit.dof))
+    return Drift(float(fit.b[1]) / span, (low / span, high / span), p)

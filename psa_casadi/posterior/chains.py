@@ -1,8 +1,9 @@
 """Chains of the No-U-Turn sampler, what they predict, and the data tree of both."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextvars import Context, copy_context
+from collections.abc import Callable
+from contextlib import suppress
+from contextvars import copy_context
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol
@@ -82,12 +83,16 @@ def predictive(
         except PsaError:
             continue
         clean = [p.displacement for p in parts]
+        left = [
+            (measured(e.record) - y)[e.used] for e, y in zip(task.experiments, clean, strict=True)
+        ]
         if fit_offset:
-            clean = [y + np.mean(r) for y, r in zip(clean, _left(task, clean), strict=True)]
+            clean = [y + np.mean(r) for y, r in zip(clean, left, strict=True)]
             levels = list(task.levels)
         else:
             levels = [
-                _level(r, c, rng) for r, c in zip(_left(task, clean), task.inflation, strict=True)
+                float(np.sqrt(float(r @ r) / c / rng.chisquare(len(r) / c)))
+                for r, c in zip(left, task.inflation, strict=True)
             ]
         kept.append(theta)
         noise.append(levels)
@@ -104,17 +109,6 @@ def predictive(
         noise=tuple(np.array([own[k] for own in noise]) for k in range(count)),
         failed=len(draws) - len(kept),
     )
-
-
-def _left(task: Task, clean: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return what is left of the used samples of every record [m]."""
-    pairs = zip(task.experiments, clean, strict=True)
-    return [(measured(e.record) - y)[e.used] for e, y in pairs]
-
-
-def _level(residual: FloatArray, inflation: float, rng: np.random.Generator) -> float:
-    power = float(residual @ residual) / inflation
-    return float(np.sqrt(power / rng.chisquare(len(residual) / inflation)))
 
 
 Progress = Callable[[str], None]
@@ -178,10 +172,15 @@ def chains_of(
     2026). Raises InputError where nutpie is not installed, KeyboardInterrupt.
     """
     nutpie, _ = sampler_and_arviz()
-    size = density.size
+    size, context = density.size, copy_context()
+
+    def make() -> Callable[..., Any]:  # a density for each chain's thread, in the caller's context
+        own = context.copy()
+        return lambda u: own.run(density, np.asarray(u))
+
     model = nutpie.compiled_pyfunc.from_pyfunc(
         ndim=size,
-        make_logp_fn=_in_context(copy_context(), density),
+        make_logp_fn=make,
         make_expand_fn=lambda *_: lambda u: {"u": np.array(u)},
         expanded_dtypes=[np.dtype("float64")],
         expanded_shapes=[(size,)],
@@ -194,38 +193,22 @@ def chains_of(
         model, draws=draws, tune=tune, chains=chains, cores=cores, seed=seed,
         target_accept=_ACCEPT, progress_bar=False, save_warmup=False, blocking=False,
     )  # fmt: skip
-    found = _waited(running, progress)
+    progress("sampling")
+    found = None
+    try:
+        while found is None:
+            with suppress(TimeoutError):
+                found = running.wait(timeout=_LOOK)
+    except KeyboardInterrupt:
+        current_work().stop()
+        running.cancel()
+        raise
     statistics = {
         ours: found.sample_stats[theirs].to_numpy()
         for theirs, ours in _STATISTICS.items()
         if theirs in found.sample_stats
     }
     return Chains(found.posterior["u"].to_numpy(), statistics)
-
-
-def _in_context(context: Context, density: Sampled) -> Callable[[], Callable[..., Any]]:
-    """Return what makes a density for each chain's thread, in the context of the caller."""
-
-    def make() -> Callable[..., Any]:
-        own = context.copy()
-        return lambda u: own.run(density, np.asarray(u))
-
-    return make
-
-
-def _waited(running: Any, progress: Progress) -> Any:
-    """Return the trace once all chains have ended; an interrupt ends them."""
-    progress("sampling")
-    try:
-        while True:
-            try:
-                return running.wait(timeout=_LOOK)
-            except TimeoutError:
-                continue
-    except KeyboardInterrupt:
-        current_work().stop()
-        running.cancel()
-        raise
 
 
 _RECORD = "record"
@@ -243,28 +226,39 @@ def data_tree(
 ) -> Any:
     """Return an `arviz.InferenceData` of all groups; `theta` is (chains, draws, size)."""
     _, arviz = sampler_and_arviz()
-    own = {name: [_RECORD] for name in _per_record(task.unknowns)}
-    columns = columns_of_records(task)
-    times = {f"time_{c}": e.record.time for c, e in zip(columns, task.experiments, strict=True)}
-    dims = {**own, "noise": [_RECORD], **{c: [f"time_{c}"] for c in columns}}
-    seen = {c: measured(e.record) for c, e in zip(columns, task.experiments, strict=True)}
-    applied = {
-        f"voltage_{c}": e.record.voltage for c, e in zip(columns, task.experiments, strict=True)
-    }
+    told = _units(task.model, task.unknowns)
+    dims = {n: [_RECORD] for n in told if n.startswith("start_") or n in ("offset", "noise")}
+    seen, applied, times = {}, {}, {}
+    for column, e in zip(columns_of_records(task), task.experiments, strict=True):
+        time = f"time_{column}"
+        seen[column], times[time] = measured(e.record), e.record.time
+        applied[f"voltage_{column}"] = e.record.voltage
+        dims |= {column: [time], f"voltage_{column}": [time]}
+    predictions = [
+        {
+            **{c: y[None] for c, y in zip(seen, p.displacement, strict=True)},
+            "noise": np.stack(p.noise, axis=-1)[None],
+        }
+        for p in (posterior, prior)
+    ]
     tree = arviz.from_dict(
         posterior=quantities(task, theta),
         sample_stats=chains.statistics,
         prior=quantities(task, prior.theta[None]),
-        posterior_predictive=_predicted(columns, posterior),
-        prior_predictive=_predicted(columns, prior),
+        posterior_predictive=predictions[0],
+        prior_predictive=predictions[1],
         observed_data=seen,
         constant_data=applied,
         coords={_RECORD: [e.record.name for e in task.experiments], **times},
-        dims={**dims, **{f"voltage_{c}": [f"time_{c}"] for c in columns}},
+        dims=dims,
     )
-    told = _units(task.model, task.unknowns)
+    kinds = {"displacement": ("m", "Displacement"), "voltage": ("V", "Voltage")}
+    kinds["time"] = ("s", "Time")
     for group in tree.groups():
-        _describe(tree[group], told)
+        for name in tree[group].variables:
+            unit, meaning = kinds.get(name.partition("_")[0], told.get(name, ("", "")))
+            if unit:
+                tree[group][name].attrs |= {"units": unit, "long_name": meaning}
     tree.posterior.attrs["inference_library"] = "nutpie"
     tree.posterior.attrs["created_by"] = f"psa_casadi {__version__}"
     return tree
@@ -289,15 +283,6 @@ def _states(u: Unknowns) -> tuple[str, ...]:
     return tuple(dict.fromkeys(n for started in u.started for n in started))
 
 
-def _per_record(u: Unknowns) -> tuple[str, ...]:
-    return (*(f"start_{n}" for n in _states(u)), "offset")
-
-
-def _predicted(columns: Sequence[str], found: Predictive) -> dict[str, FloatArray]:
-    shown = {c: y[None] for c, y in zip(columns, found.displacement, strict=True)}
-    return {**shown, "noise": np.stack(found.noise, axis=-1)[None]}
-
-
 def _units(model: Model, u: Unknowns) -> dict[str, tuple[str, str]]:
     """Return unit and meaning of every variable."""
     told = {n: (model.parameter(n).unit, model.parameter(n).description) for n in u.names}
@@ -308,16 +293,3 @@ def _units(model: Model, u: Unknowns) -> dict[str, tuple[str, str]]:
     told["offset"] = ("m", "Offset of the displacement sensor in a record")
     told["noise"] = ("m", "Standard deviation of the noise of a record")
     return told
-
-
-def _describe(group: Any, told: Mapping[str, tuple[str, str]]) -> None:
-    for name in group.variables:
-        unit, meaning = told.get(name, ("", ""))
-        if name.startswith("displacement"):
-            unit, meaning = "m", "Displacement"
-        elif name.startswith("voltage"):
-            unit, meaning = "V", "Voltage"
-        elif name.startswith("time"):
-            unit, meaning = "s", "Time"
-        if unit:
-            group[name].attrs |= {"units": unit, "long_name": meaning}

@@ -113,11 +113,16 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
     table = arviz.summary(
         tree, var_names=list(task.unknowns.names), hdi_prob=HDI, round_to="none", kind="all"
     )
-    edge = 50.0 * (1.0 - HDI)
+    edge, u = 50.0 * (1.0 - HDI), task.unknowns
     found = []
-    for name in task.unknowns.names:
-        row = table.loc[name]
-        spread = float(tree.prior[name].std())
+    for k, name in enumerate(u.names):
+        row, values = table.loc[name], tree.posterior[name].to_numpy()
+        if u.loop is not None and k in u.loop:
+            spread = float(tree.prior[name].std())
+            share = float(np.std(values) / spread) if spread > 0.0 else float("nan")
+        else:  # in ln units where these are searched
+            moved = np.log(values) if u.log[k] else values / u.scale[k]
+            share = float(np.std(moved) / u.prior[k])
         found.append(
             Figures(
                 name=name,
@@ -129,20 +134,10 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
                 mc_error=float(row["mcse_mean"]),
                 ess=float(min(row["ess_bulk"], row["ess_tail"])),
                 r_hat=float(row["r_hat"]),
-                prior_share=_share(task, name, tree.posterior[name].to_numpy(), spread),
+                prior_share=share,
             )
         )
     return tuple(found)
-
-
-def _share(task: Task, name: str, values: Any, spread: float) -> float:
-    """Return posterior over prior standard deviation, in ln units where these are searched."""
-    u = task.unknowns
-    k = u.names.index(name)
-    if u.loop is not None and k in u.loop:
-        return float(np.std(values) / spread) if spread > 0.0 else float("nan")
-    moved = np.log(values) if u.log[k] else values / u.scale[k]
-    return float(np.std(moved) / u.prior[k])
 
 
 def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple[Note, ...]:

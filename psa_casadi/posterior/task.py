@@ -117,25 +117,21 @@ class Density:
         theta, slope, bend = self.within.theta(z)
         with np.errstate(all="ignore"):
             found = self.evaluate(theta) if np.isfinite(theta).all() else None
-            value, by_theta = (-np.inf, np.zeros_like(u)) if found is None else self._sum(*found)
-            value += float(np.sum(np.log(np.abs(slope))))
-            gradient = self.factor.T @ (by_theta * slope + bend)
+            if found is None:
+                return -np.inf, np.zeros_like(u)
+            residual, jacobian = found
+            value, pull, rest = 0.0, residual.copy(), residual.copy()
+            for block in self.blocks:
+                own = residual[block.rows]
+                power = float(own @ own)
+                value -= 0.5 * block.count * float(np.log(power))
+                pull[block.rows] *= block.count / power
+                rest[block.rows] = 0.0
+            value += float(np.sum(np.log(np.abs(slope)))) - 0.5 * float(rest @ rest)
+            gradient = self.factor.T @ (bend - (jacobian.T @ pull) * slope)
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return -np.inf, np.zeros_like(u)
         return value, gradient
-
-    def _sum(self, residual: FloatArray, jacobian: FloatArray) -> tuple[float, FloatArray]:
-        rest = np.ones(len(residual), dtype=bool)
-        value, pull = 0.0, np.zeros_like(residual)
-        for block in self.blocks:
-            own = residual[block.rows]
-            power = float(own @ own)
-            value -= 0.5 * block.count * float(np.log(power))
-            pull[block.rows] = own * (block.count / power)
-            rest[block.rows] = False
-        pull[rest] = residual[rest]
-        value -= 0.5 * float(residual[rest] @ residual[rest])
-        return value, -(jacobian.T @ pull)
 
 
 _EVALUATIONS, _TOLERANCE, _ROUNDS = 60, 1e-6, 2
@@ -201,9 +197,20 @@ def task_of(
     theta[: len(names)] = unknowns.coordinates(values)
     for r in range(unknowns.records):
         unknowns.place(theta, r, {}, 0.0)
-    for _ in range(_ROUNDS):
-        found, way, sigma, experiments = _fitted(centre, experiments, unknowns, theta, sigma)
-        theta = found.theta
+    for _ in range(_ROUNDS):  # levels of records and of columns that the residuals suggest
+        found, way, _ = accurate_minimum(
+            centre, experiments, unknowns, theta, sigma,
+            tolerance=_TOLERANCE, evaluations=_EVALUATIONS,
+        )  # fmt: skip
+        if found.interrupted:
+            raise KeyboardInterrupt
+        theta, weights = found.theta, weights_of(experiments, sigma)
+        ends = np.cumsum([e.used.sum() for e in experiments])
+        own = np.split(found.residual[: len(weights)] * weights, ends[:-1])
+        sigma = [max(float(np.sqrt(np.mean(r**2))), 1e-15) for r in own]
+        beside = further_of(centre, experiments, unknowns, theta, way=way)
+        levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in beside)
+        experiments = tuple(replace(e, further=levels) for e in experiments)
     return _task(
         centre, experiments, unknowns, found, way, sigma,
         (*said, *(s for _, own in ready for s in own), *columns.left_out),
@@ -245,27 +252,6 @@ def _centres(
     return {**centre, **given}
 
 
-def _fitted(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    theta: FloatArray,
-    sigma: Sequence[float],
-) -> tuple[Minimum, Way, list[float], tuple[Experiment, ...]]:
-    """Return the fit, and the levels that its residuals suggest: of records and of columns."""
-    found, way, _ = accurate_minimum(
-        model, experiments, unknowns, theta, sigma, tolerance=_TOLERANCE, evaluations=_EVALUATIONS
-    )
-    if found.interrupted:
-        raise KeyboardInterrupt
-    weights, ends = weights_of(experiments, sigma), np.cumsum([e.used.sum() for e in experiments])
-    own = np.split(found.residual[: len(weights)] * weights, ends[:-1])
-    rms = [max(float(np.sqrt(np.mean(r**2))), 1e-15) for r in own]
-    beside = further_of(model, experiments, unknowns, found.theta, way=way)
-    levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in beside)
-    return found, way, rms, tuple(replace(e, further=levels) for e in experiments)
-
-
 def _task(
     model: Model,
     experiments: tuple[Experiment, ...],
@@ -286,7 +272,9 @@ def _task(
     edges = np.cumsum([0, *counts])
     for first, last in pairwise(edges.tolist()):
         rows = slice(first, last)
-        coloured = _inflation(residual[rows])
+        lags = autocovariance(residual[rows])  # how many neighbouring samples count as one
+        ratio = float(2.0 * np.sum(lags) / lags[0] - 1.0) if lags[0] > 0.0 else 1.0
+        coloured = max(1.0, ratio)
         inflation.append(coloured)
         blocks.append(Block(rows, (last - first) / coloured))
         precision += jacobian[rows].T @ jacobian[rows] / coloured
@@ -308,12 +296,6 @@ def _task(
         converged=found.converged,
         sentences=sentences,
     )
-
-
-def _inflation(residual: FloatArray) -> float:
-    """Return how many neighbouring samples count as one: the residual's long-run variance ratio."""
-    lags = autocovariance(residual)
-    return max(1.0, float(2.0 * np.sum(lags) / lags[0] - 1.0)) if lags[0] > 0.0 else 1.0
 
 
 def _whitening(

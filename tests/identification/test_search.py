@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import Identification, identify
-from psa_casadi.identification.prepare import prepared
 from psa_casadi.identification.refitting import exchanges
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.notes import texts
 from psa_casadi.records import Record
 from tests.studies.benchmarks.coverage import one_run
 from tests.studies.benchmarks.records import clean_loops, with_noise
@@ -153,16 +151,3 @@ def test_drop_outs_and_outliers_do_not_move_the_fit(found: Identification) -> No
         error = found.determinacy.standard_errors[name]
         assert abs(again.model.values[name] - found.model.values[name]) < 3.0 * error
     assert again.fit.rms == pytest.approx(found.fit.rms, rel=0.05)
-
-
-def test_oversampled_records_are_averaged_and_say_so() -> None:
-    t: FloatArray = 2.5e-6 * np.arange(400_000.0)
-    v: FloatArray = 50.0 * (1.0 - np.cos(2 * np.pi * t))
-    y: FloatArray = 1e-7 * v + 1e-9 * np.random.default_rng(1).standard_normal(t.size)
-    shorter, notes = prepared(Record(name="fast", time=t, voltage=v, displacement=y))
-    factor = t.size // shorter.n
-    assert factor >= 8
-    assert f"averaged in blocks of {factor}" in texts(notes)[-1]
-    assert float(np.std(np.asarray(shorter.displacement) - 1e-7 * shorter.voltage)) == (
-        pytest.approx(1e-9 / np.sqrt(factor), rel=0.1)
-    )

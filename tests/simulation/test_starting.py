@@ -5,7 +5,7 @@ import pytest
 
 from psa_casadi.components import SIMPLIFIED
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.start.ordinary import chosen_start, with_stiffness
+from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record
@@ -29,7 +29,7 @@ def _extended() -> Model:
 )
 def test_another_stiffness_changes_forces_and_no_displacement(model: Model) -> None:
     own = "k_B" if "k_B" in model.values else "k"
-    moved = with_stiffness(model, 3.0 * model.values[own])
+    moved = chosen_start([], model, 3.0 * model.values[own])[0]
     assert moved.values[own] == pytest.approx(3.0 * model.values[own])
     before, after = simulate(model, TIME, VOLTAGE), simulate(moved, TIME, VOLTAGE)
     size = np.ptp(before.displacement)

@@ -338,9 +338,9 @@ class Fit:
                 )
             except PsaError:
                 return None
-            slopes = np.full((stop, u.first(k + 1) - u.first(k)), u.offset_scale)
-            slopes[:, :-1] = run.sensitivity * u.start_scale[k]
-            slopes = slopes[known][:, np.array(columns) - u.first(k)] / level
+            slopes = run.sensitivity @ u.start_slopes(there, k)
+            slopes[:, u.first(k + 1) - 1] = u.offset_scale
+            slopes = slopes[known][:, columns] / level
             missed = (run.output[known] + u.offset(there, k) - y) / level
             return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
 

@@ -55,16 +55,14 @@ def predict_record(
     *,
     stop: int,
     rtol: float,
-    output: str = OUTPUT,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return an output (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
+    """Return the sensor's output (n,), its derivatives by `wanted` (n, k), and by `start` (n, m).
 
     `start` holds deviations of the initial states from where the first inputs and their rates put
     them, in the states' units. Time counts from the record's first sample. `rtol` is the tolerance
     of a step.
     """
-    way = Way(rtol, rtol)
-    found = trace_record(model, record, start, wanted, stop=stop, way=way, output=output)
+    found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
     count = len(wanted)
     return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
 
@@ -176,11 +174,9 @@ def traced_by_theta(
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
     found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
-    count, first = len(unknowns.names), unknowns.first(index)
-    by_theta = np.zeros((len(found.output), unknowns.size))
-    by_theta[:, :count] = found.sensitivity[:, :count] @ slopes
-    by_start = found.sensitivity[:, count:] * unknowns.start_scale[index]
-    by_theta[:, first : first + len(start)] = by_start
+    count = len(unknowns.names)
+    by_theta = found.sensitivity[:, count:] @ unknowns.start_slopes(theta, index)
+    by_theta[:, :count] += found.sensitivity[:, :count] @ slopes
     return found.output, by_theta, found.way
 
 
@@ -199,24 +195,21 @@ def predict(
     Records are simulated side by side; `differentiated` or not, in which case the Jacobian has no
     columns.
     """
-    slopes = unknowns.slopes(theta)
+    slopes, current = unknowns.slopes(theta), model.with_values(unknowns.values(theta))
 
     def one(index: int) -> Prediction:
-        experiment = experiments[index]
-        stop = experiment.record.n if everything else experiment.stop
+        record, start = experiments[index].record, unknowns.start(theta, index)
+        stop = record.n if everything else experiments[index].stop
         if not stop:
             return Prediction(np.zeros(0), np.zeros((0, unknowns.size)), "")
         if not differentiated:
-            current, start = model.with_values(unknowns.values(theta)), unknowns.start(theta, index)
-            found = trace_record(
-                current, experiment.record, start, (), stop=stop, way=way, by_start=False
+            found = trace_record(current, record, start, (), stop=stop, way=way, by_start=False)
+            x, jacobian, way_taken = found.output, found.sensitivity, found.way
+        else:
+            x, jacobian, way_taken = traced_by_theta(
+                model, record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
             )
-            shown = found.output + unknowns.offset(theta, index)
-            return Prediction(shown, found.sensitivity, found.way)
-        x, jacobian, way_taken = traced_by_theta(
-            model, experiment.record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
-        )
-        jacobian[:, unknowns.first(index + 1) - 1] = unknowns.offset_scale
+            jacobian[:, unknowns.first(index + 1) - 1] = unknowns.offset_scale
         return Prediction(x + unknowns.offset(theta, index), jacobian, way_taken)
 
     return side_by_side(one, range(len(experiments)))

@@ -23,6 +23,7 @@ MOTION_PRIOR = 30.0
 #: Lags beside the creep lag are alike in most records: each stays near its start unless told.
 LAG_PRIOR = 1.0
 _LAGS = ("R_s", "c_P", "c_B", "c")
+_CARRIED = "f_H"
 _LOOP = ("k_L", "A", "beta", "gamma")
 _STEEPEST = 3.0  # |A| over k_L + A, beyond which the loop hardly changes
 _BEND_STEP = 0.2  # an ordinary change of beta A / s, in units of 0.1 k_L
@@ -39,7 +40,8 @@ class Unknowns:
     with weak bends fixes s and the two products, and hardly A itself; so its valley is straight
     here, and A without bound (Rayleigh's quadratic loop) lies at a finite distance.
     `started` names, per record, the states whose start is searched, as deviations from where the
-    record's first voltage and rate put them.
+    record's first voltage and rate put them. Where the loop has its own coordinates, that of a
+    record's memory is q_0 = f_H(0) / A: what follows keeps its form when A moves.
     `prior` holds the standard deviation of every coordinate's weak prior (infinite for offsets),
     centred at 0.
     """
@@ -150,8 +152,32 @@ class Unknowns:
     def start(self, theta: FloatArray, record: int) -> dict[str, float]:
         """Return the deviations of one record's initial state, in the states' units."""
         first, names = self.first(record), self.started[record]
-        deviations = theta[first : first + len(names)] * self.start_scale[record]
+        deviations = theta[first : first + len(names)] * self._start_sizes(theta, record)
         return dict(zip(names, deviations.tolist(), strict=True))
+
+    def start_slopes(self, theta: FloatArray, record: int) -> FloatArray:
+        """Return d start / d theta, shape (started, size)."""
+        first, count = self.first(record), len(self.started[record])
+        slopes, sizes = np.zeros((count, self.size)), self._start_sizes(theta, record)
+        slopes[:, first : first + count] = np.diag(sizes)
+        if self.loop is not None and _CARRIED in self.started[record]:
+            row, a, a_ref = self.started[record].index(_CARRIED), *self._amplitudes(theta)
+            slopes[row, self.loop[1]] = -theta[first + row] * sizes[row] * a / a_ref
+        return slopes
+
+    def _start_sizes(self, theta: FloatArray, record: int) -> FloatArray:
+        """Return the size of a unit of every start's coordinate, in the states' units."""
+        sizes, names = self.start_scale[record], self.started[record]
+        if self.loop is None or _CARRIED not in names:
+            return sizes
+        a, a_ref = self._amplitudes(theta)
+        return np.where([n == _CARRIED for n in names], sizes * a / a_ref, sizes)
+
+    def _amplitudes(self, theta: FloatArray) -> tuple[float, float]:
+        """Return the loop's A at theta, without all other values, and its reference."""
+        k = self.loop[1] if self.loop is not None else 0
+        a_ref = float(self.reference[k])
+        return float(np.clip(a_ref / (1.0 + theta[k]), self.low[k], self.high[k])), a_ref
 
     def offset(self, theta: FloatArray, record: int) -> float:
         """Return the sensor's offset in one record [m]."""
@@ -160,10 +186,13 @@ class Unknowns:
     def place(
         self, theta: FloatArray, record: int, states: Mapping[str, float], offset: float
     ) -> None:
-        """Write the coordinates of a record's initial state and offset [m] into theta."""
+        """Write the coordinates of a record's initial state and offset [m] into theta.
+
+        The parameters' coordinates must stand in theta.
+        """
         first, last = self.first(record), self.first(record + 1) - 1
         found = np.array([states.get(n, 0.0) for n in self.started[record]])
-        theta[first:last] = found / self.start_scale[record]
+        theta[first:last] = found / self._start_sizes(theta, record)
         theta[last] = offset / self.offset_scale
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:

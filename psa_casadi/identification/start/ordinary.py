@@ -50,20 +50,18 @@ def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:
     """
     if hysteresis is None:
         return (model,)
-    names = tuple(FORMS) if hysteresis == "best" else (hysteresis,)
-    return tuple(_in_form(model, name) for name in names)
-
-
-def _in_form(model: Model, name: str) -> Model:
     known = {c.name for c in FORMS.values()}
     if not any(c.name in known for c in model.components):
         raise InputError(
             f"The model '{model.name}' has no hysteresis of its own to give another form; leave"
             " --hysteresis out."
         )
-    own = [FORMS[name] if c.name in known else c for c in model.components]
-    there = {c.name for c in own}
-    return model.with_components(c for c in own if set(c.needs) <= there)
+    found = []
+    for name in FORMS if hysteresis == "best" else (hysteresis,):
+        own = [FORMS[name] if c.name in known else c for c in model.components]
+        there = {c.name for c in own}
+        found.append(model.with_components(c for c in own if set(c.needs) <= there))
+    return tuple(found)
 
 
 #: Times T that are tried, over the sampling interval, and how often the grid closes in.
@@ -115,7 +113,13 @@ def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
     A current that is limited, leaks, has its sign turned, or belongs to another voltage is
     explained badly. Records with uneven time steps tell nothing.
     """
-    own = [r for r in records if r.current is not None and r.n > 3 and _even(r)]
+    own = [
+        r
+        for r in records
+        if r.current is not None
+        and r.n > 3
+        and np.ptp(np.diff(r.time)) < _UNEVEN * np.mean(np.diff(r.time))
+    ]
     shown = [np.asarray(r.current, dtype=np.float64) for r in own]
     total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in shown)
     if total == 0.0:
@@ -150,9 +154,9 @@ def _by_charge(records: Sequence[Record]) -> Capacitance | None:
     return Capacitance(value, float(np.sqrt(rest / power)), explained, "charge")
 
 
-def _even(record: Record) -> bool:
-    steps = np.diff(record.time)
-    return bool(np.ptp(steps) < _UNEVEN * float(np.mean(steps)))
+def _unevenness(time: FloatArray) -> float:
+    steps = np.diff(time)
+    return float(np.ptp(steps) / np.mean(steps))
 
 
 def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float]:
@@ -160,24 +164,7 @@ def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float
 
     For a residual that is an autoregression of first order.
     """
-    columns = _columns(records, time)
-    scale = np.linalg.norm(columns, axis=0)
-    scale = np.where(scale > 0.0, scale, 1.0)
-    shown = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
-    found, *_ = np.linalg.lstsq(columns / scale, shown, rcond=None)
-    rest = shown - (columns / scale) @ found
-    power = float(rest @ rest)
-    alike = min(max(float(rest[1:] @ rest[:-1]) / max(power, 1e-300), 0.0), 0.999)
-    inflation = (1.0 + alike) / (1.0 - alike)
-    spread = np.linalg.pinv((columns / scale).T @ (columns / scale), hermitian=True)[0, 0]
-    freedom = max(len(rest) - columns.shape[1], 1)
-    error = float(np.sqrt(spread * power / freedom * inflation)) / scale[0]
-    return float(found[0] / scale[0]), power, error
-
-
-def _columns(records: Sequence[Record], time: float) -> FloatArray:
-    """Return the current per farad, and of every record the sensor's zero and the start."""
-    every = []
+    every = []  # the current per farad, and of every record the sensor's zero and the start
     for k, record in enumerate(records):
         keep = float(np.exp(-record.sample_time / time))
         rate = np.append(0.0, np.diff(record.voltage) / np.diff(record.time))
@@ -186,7 +173,20 @@ def _columns(records: Sequence[Record], time: float) -> FloatArray:
         own[:, 1 + 2 * k] = 1.0
         own[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
         every.append(own)
-    return np.vstack(every)
+    columns = np.vstack(every)
+    scale = np.linalg.norm(columns, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    columns /= scale
+    shown = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
+    found, *_ = np.linalg.lstsq(columns, shown, rcond=None)
+    rest = shown - columns @ found
+    power = float(rest @ rest)
+    alike = min(max(float(rest[1:] @ rest[:-1]) / max(power, 1e-300), 0.0), 0.999)
+    inflation = (1.0 + alike) / (1.0 - alike)
+    spread = np.linalg.pinv(columns.T @ columns, hermitian=True)[0, 0]
+    freedom = max(len(rest) - columns.shape[1], 1)
+    error = float(np.sqrt(spread * power / freedom * inflation)) / scale[0]
+    return float(found[0] / scale[0]), power, error
 
 
 #: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
@@ -198,11 +198,11 @@ _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
 _HYSTERESIS_SHARE = 0.1
 
-#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The second saturates early, far
-#: within the range; from the first a fit of such a loop ends with a steep A and no bend.
+#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The first saturates early, far
+#: within the range; from the second a fit of such a loop ends with a steep A and no bend.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
-    {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
     {"A": -0.35, "beta": 0.6, "gamma": 0.02, "n": 1.4},
+    {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
 )
 
 
@@ -233,8 +233,8 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "C_p": _CAPACITANCE if told is None else told.value,
         "k_P": k_p,
         "k_B": k_b,
-        **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
-        "n": LOOP_SHAPES[0]["n"],
+        **{name: share * k_l for name, share in LOOP_SHAPES[1].items() if name != "n"},
+        "n": LOOP_SHAPES[1]["n"],
     }
     try:
         return compose(BASE, {**values, **_within(_lags(values, sample_time))})
@@ -254,25 +254,18 @@ def chosen_start(
     """Return where a fit starts, and whether its force scale is known.
 
     A `model` is taken as it is, but for start values of its own, which belong to its parameters; a
-    `stiffness` [N/m] beside it changes its force scale.
+    `stiffness` [N/m] beside it changes its force scale: all forces, stiffnesses, dampings and
+    masses are multiplied by one factor, which displacements do not show.
     """
     if model is None:
         return starting_model(records, stiffness), stiffness is not None
     model = model.with_declared_starts()
     if stiffness is None:
         return model, model.provenance.force_scale == "given"
-    return with_stiffness(model, stiffness), True
-
-
-def with_stiffness(model: Model, stiffness: float) -> Model:
-    """Return a model of the same displacement whose free stiffness [N/m] is the one given.
-
-    All forces, stiffnesses, dampings and masses are multiplied by one factor, which displacements
-    do not show.
-    """
     own = next(model.values[name] for name in ("k_B", "k") if name in model.values)
     forces = [p for p in model.structure.parameters if p.unit == "kg" or p.unit[:1] == "N"]
-    return model.with_values({p.name: model.values[p.name] * stiffness / own for p in forces})
+    scaled = {p.name: model.values[p.name] * stiffness / own for p in forces}
+    return model.with_values(scaled), True
 
 
 def loop_starts(model: Model) -> list[tuple[str, dict[str, float]]]:
