@@ -1,7 +1,5 @@
 """What is seen in a residual: what was put in, and nothing in noise."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -18,12 +16,10 @@ from tests.diagnosis.misfit_cases import (
     STEPS,
     TIME,
     FloatArray,
-    grid,
     noise,
     seen,
     shares,
 )
-from tests.tiers import slow
 
 
 def test_a_function_of_the_voltage() -> None:
@@ -161,17 +157,3 @@ def test_counts_stay_counts() -> None:
     m = misfit(record, residual, noise_floor([record], [residual])[0])
     assert "2.1 counts rms" in m.sentences[0]
     assert "+3 counts at" in m.sentences[1] or "-3 counts at" in m.sentences[1]
-
-
-@slow
-def test_a_million_samples() -> None:
-    n = 1_000_000
-    v = 50.0 * (1.0 - np.cos(2 * np.pi * np.arange(n) / 800.0))
-    residual = 1e-8 * np.sin(v / 30.0) + noise(n, 0.0, 0)
-    record = Record(name="r", time=grid(n), voltage=v, displacement=1e-7 * v + residual)
-    (floor,) = noise_floor([record], [residual])
-    before = time.process_time()
-    m = misfit(record, residual, floor)
-    # 1 s where nothing else runs; the limit leaves room for a busy machine
-    assert time.process_time() - before < 6.0
-    assert shares(m)["voltage"] > 0.95

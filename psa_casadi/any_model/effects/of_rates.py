@@ -1,6 +1,5 @@
 """Effects in the rate of a state, and the table of all effects of a model."""
 
-
 import casadi as ca
 
 from psa_casadi.any_model.effects.attached import (
