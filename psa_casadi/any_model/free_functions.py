@@ -147,7 +147,9 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
             of_base = removed_from(known.runs, h.fit.places, root.predicted, noise)
             what = f"{of} in {attached.port.words}"
             removes = of_base.share(what, root.predicted, h.predicted)
-            found.append(Free(attached.port, of, known.evidence(h), removes, law, h.fit, h.errors))
+            found.append(
+                Free(attached.port, of, known.scale.evidence(h), removes, law, h.fit, h.errors)
+            )
     return tuple(sorted(found, key=lambda f: -f.evidence))
 
 

@@ -18,10 +18,10 @@ from psa_casadi.any_model.predict import start_of, traced, zero_name
 from psa_casadi.any_model.runs import Run
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
-from psa_casadi.diagnosis.held_out import output_gain
+from psa_casadi.diagnosis.held_out import held_out_gain as gained_by
 from psa_casadi.diagnosis.probes import Direction
-from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
-from psa_casadi.diagnosis.search.hypothesis import confirmed
+from psa_casadi.diagnosis.screening import screen
+from psa_casadi.diagnosis.search.hypothesis import Look, Scale, confirmed
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.model.compose import Model
@@ -121,10 +121,6 @@ def _moved(
     return found
 
 
-#: So many starts each effect gets.
-_STARTS = 2
-
-
 @dataclass(frozen=True, eq=False)
 class OdeHypothesis:
     """A model with causes, fitted; `predicted` (n, ny) are whole experiments.
@@ -188,14 +184,8 @@ def rms_of(
     return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class OdeView:
+class OdeView(Look[OdeHypothesis]):
     """What the residual of a hypothesis shows: screening of further effects, and its test."""
-
-    of: OdeHypothesis
-    trials: tuple[Direction, ...]
-    screening: Screening
-    test: Omnibus
 
     @property
     def shows(self) -> bool:
@@ -204,23 +194,9 @@ class OdeView:
         Beside a cause the test must alarm too, as in a stack's diagnosis. Errors of every output
         below what can be told of a device show nothing.
         """
-        best = max((s.decrease for s in self.screening.scores), default=0.0)
         told = any(o.rms > o.straight for o in self.of.fit.outputs)
-        seen = told and best >= self.screening.threshold
+        seen = told and self.decrease >= self.screening.threshold
         return seen and (self.test.alarm or not self.of.causes)
-
-    def estimated(self) -> dict[str, float]:
-        """Evidence of every further effect over this hypothesis, without a fit."""
-        return estimated(self.of.fit, self.screening)
-
-    def leading(self) -> list[list[Score]]:
-        """Return the best starts of the effects worth a fit, the best effect first."""
-        return [self.starts_of(name) for name in self.screening.leading()]
-
-    def starts_of(self, name: str) -> list[Score]:
-        """Return the best directions of one effect, from which its fits start."""
-        own = [s for s in self.screening.scores if s.direction.effect.name == name]
-        return [s for s in own if s.decrease >= 0.3 * own[0].decrease][:_STARTS]
 
 
 def look(
@@ -273,25 +249,21 @@ def held_out_gain(
 
     Summed over the outputs.
     """
-    rows = zip(of.fit.outputs, colour.each, before.held, of.held, strict=True)
-    return sum(
-        output_gain(
-            sum(int(r.judged(o.index).sum()) for r in runs) / own.inflation, old, new, o.straight
-        )
-        for o, own, old, new in rows
-    )
+    samples = [sum(int(r.judged(o.index).sum()) for r in runs) for o in of.fit.outputs]
+    straight = [o.straight for o in of.fit.outputs]
+    return gained_by(samples, colour, straight, before.held, of.held)
 
 
 def held_out_confirms(
-    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, score: float
+    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], scale: Scale[OdeHypothesis]
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.hypothesis.confirmed`), what is
-    promised summed over the outputs; `score` is what is gained of it.
+    promised summed over the outputs.
     """
-    gained, promise = held_out_gain(of, before, runs, colour), 0.0
-    for k, (o, own) in enumerate(zip(of.fit.outputs, colour.each, strict=True)):
+    gained, promise = scale.held_out(of, before), 0.0
+    for k, (o, own) in enumerate(zip(of.fit.outputs, scale.colour.each, strict=True)):
         old = errors_at(runs, before.predicted, o.index, Run.judged)
         new = errors_at(runs, of.predicted, o.index, Run.judged)
         if not old.size:
@@ -300,4 +272,4 @@ def held_out_confirms(
         promise += 0.5 * old.size / own.inflation * float(np.mean((new - old) ** 2)) / after**2
     if promise == 0.0 and gained == 0.0:
         return True
-    return confirmed(gained, promise, score)
+    return confirmed(gained, promise, scale.of_fitted(of) - scale.of_fitted(before), scale.limits)
