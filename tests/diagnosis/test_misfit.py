@@ -62,13 +62,17 @@ def test_the_error_after_a_reversal() -> None:
     assert found["since_reversal"] == max(found.values())
 
 
+#: Sines of three amplitudes [V] at three frequencies each.
+SINES = np.concatenate(
+    [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
+)
+AMPLITUDE = np.repeat([30.0, 60.0, 100.0], 12_000)
+
+
 def test_amplitude_and_frequency_of_the_drive() -> None:
-    parts = [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
-    v = np.concatenate(parts)
-    amplitude = np.repeat([30.0, 30.0, 30.0, 60.0, 60.0, 60.0, 100.0, 100.0, 100.0], 4_000)
     frequency = np.tile(np.repeat([1.0, 2.0, 5.0], 4_000), 3)
-    by_amplitude = shares(seen(v, 5e-10 * amplitude))
-    by_frequency = shares(seen(v, 1e-8 * frequency))
+    by_amplitude = shares(seen(SINES, 5e-10 * AMPLITUDE))
+    by_frequency = shares(seen(SINES, 1e-8 * frequency))
     assert by_amplitude["amplitude"] > 0.9
     assert by_amplitude["frequency"] < 0.1
     assert by_frequency["frequency"] > 0.9
@@ -76,17 +80,14 @@ def test_amplitude_and_frequency_of_the_drive() -> None:
 
 
 def test_delay_grows_with_frequency_and_gain_with_amplitude() -> None:
-    parts = [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
-    v = np.concatenate(parts)
-    rate = np.gradient(v, STEP)
-    delayed = seen(v, -4e-11 * rate)
+    delayed = seen(SINES, -4e-11 * np.gradient(SINES, STEP))
     found = shares(delayed)
     assert found["frequency_lag"] > 0.3
     assert found["frequency_gain"] == found["frequency"] == 0.0
     view = next(w for w in delayed.views if w.name == "frequency_lag")
     assert np.all(np.diff(view.mean[[0, -1]]) < -5e-9)
-    amplitude = np.repeat([30.0, 30.0, 30.0, 60.0, 60.0, 60.0, 100.0, 100.0, 100.0], 4_000)
-    stronger = shares(seen(v, 1e-5 * (v - 0.5 * amplitude) * 1e-4 * (amplitude - 60.0)))
+    grown = 1e-9 * (SINES - 0.5 * AMPLITUDE) * (AMPLITUDE - 60.0)
+    stronger = shares(seen(SINES, grown))
     assert stronger["amplitude_gain"] > 0.3
     assert stronger["amplitude_lag"] == stronger["amplitude"] == 0.0
 
