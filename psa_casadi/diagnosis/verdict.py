@@ -51,7 +51,7 @@ from psa_casadi.diagnosis.result import (
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
-from psa_casadi.diagnosis.task import Thresholds, same_curves
+from psa_casadi.diagnosis.task import Task, Thresholds, same_curves
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
@@ -148,22 +148,18 @@ def useful_records(records: Sequence[Record]) -> Note:
 
 
 def alternatives(
-    named: Sequence[Step],
-    final: Fit,
-    experiments: Sequence[Experiment],
-    table: Sequence[Component],
-    limits: Thresholds,
-    *,
-    stiffness_given: bool,
+    named: Sequence[Step], final: Fit, task: Task, *, stiffness_given: bool
 ) -> tuple[Alternative, ...]:
     """Return, for each cause that may lie on the other side of the sensor, the model with that one.
 
     Of several such effects the likeliest that can be fitted and simulated.
     """
-    effects = {e.name: e for e in table}
+    effects, experiments = {e.name: e for e in task.table}, task.experiments
     found = []
     for step in named:
-        for name in sorted(told_from(step, limits), key=lambda n: -step.probability.get(n, 0.0)):
+        for name in sorted(
+            told_from(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
+        ):
             if name not in effects or effects[name].in_plant == step.cause.in_plant:
                 continue
             fitted = _fitted(step, name, experiments)
@@ -270,20 +266,13 @@ def _share(s: Share) -> ErrorShare:
 
 @stage("judging")
 def conclude(
-    steps: Sequence[Step],
-    experiments: Sequence[Experiment],
-    table: Sequence[Component],
-    stiffness_given: bool,
-    limits: Thresholds,
-    *,
-    driven: bool = True,
-    hidden: float = 0.0,
+    steps: Sequence[Step], task: Task, stiffness_given: bool, *, driven: bool = True
 ) -> Diagnosis:
     """Judge the steps of a search and return the diagnosis.
 
-    Of records whose displacement is not `driven` by the voltage nothing more is said. `hidden` is
-    the share of the readings that a saturated sensor has made.
+    Of records whose displacement is not `driven` by the voltage nothing more is said.
     """
+    experiments, table, limits = task.experiments, task.table, task.limits
     first, last = steps[0], steps[-1]
     colour = last.screening.colour
     errors = whole_residuals(experiments, last.predicted)
@@ -307,7 +296,7 @@ def conclude(
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
     lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
     doubt = unconfirmed(
-        experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden, limits=limits
+        experiments, gain, whole=whole, lost=lost, partly=partly, hidden=task.hidden, limits=limits
     )
     stands = beaten is None and doubt is None
     vague = balance.vague(steps) if stands else {}
@@ -348,9 +337,7 @@ def conclude(
         else ()
     )
     unnamed = {*vague, *(c.what for c in small)}
-    causes = tuple(
-        _cause(s, model, spent, experiments, limits) for s in named if s.cause.name not in unnamed
-    )
+    causes = tuple(_cause(s, model, spent, task) for s in named if s.cause.name not in unnamed)
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -391,9 +378,7 @@ def conclude(
         contenders=contenders(first, experiments, limits) if verdict == "ambiguous" else (),
         budget=spent,
         patch=patch,
-        alternatives=alternatives(
-            kept, final.fit, experiments, table, limits, stiffness_given=stiffness_given
-        ),
+        alternatives=alternatives(kept, final.fit, task, stiffness_given=stiffness_given),
     )
 
 
@@ -420,18 +405,16 @@ def _misfits(
     )
 
 
-def _cause(
-    s: Step, model: Model, spent: Budget, experiments: Sequence[Experiment], limits: Thresholds
-) -> Cause:
+def _cause(s: Step, model: Model, spent: Budget, task: Task) -> Cause:
     """State a cause: its probability, the share of the error that it removes, what it changes."""
-    records = [e.record for e in experiments]
+    records = [e.record for e in task.experiments]
     own = next((c for c in spent.causes if c.what == s.cause.name), None)
     return Cause(
         effect=s.cause.name,
         belongs_to=s.cause.belongs_to,
         confidence=float(min(0.99, s.probability[s.cause.name])),
         parameters=estimates(s.cause, model),
-        cannot_be_told_from=told_from(s, limits),
+        cannot_be_told_from=told_from(s, task.limits),
         explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
         remedy=s.cause.what_now.code,
         sizes=sizes(s.cause, model, records, unit=records[0].displacement_unit),
