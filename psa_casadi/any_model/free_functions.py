@@ -21,7 +21,7 @@ from psa_casadi.any_model.fit import OdeFit, refitted
 from psa_casadi.any_model.hypothesis import OdeView, hypothesis_of
 from psa_casadi.any_model.identify import noise_left
 from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, start_of, states_of, traced
-from psa_casadi.any_model.result import removed_from
+from psa_casadi.any_model.result import FreeFunction, removed_from
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
 from psa_casadi.component import Component, Equations, Symbols
@@ -75,12 +75,15 @@ class Free:
         return self.removes.share
 
 
-def curve_of(free: Free, runs: Sequence[Run]) -> tuple[str, FloatArray, FloatArray]:
-    """Return what a free function adds along all records, and the variable that this follows most.
+def correction_of(free: Free, runs: Sequence[Run]) -> FreeFunction | None:
+    """Return what a free function adds along all records, beside the variable it follows most.
 
-    (name, values (n,) of the variable, what is added (n,) to the port's sum). Raises PsaError.
+    None where it cannot be simulated.
     """
-    values = {n: _along(free, runs, n) for n in free.law.names}
+    try:
+        values = {n: _along(free, runs, n) for n in free.law.names}
+    except PsaError:
+        return None
     (component,) = free.fit.model.effects
     model = free.fit.model
     added = sum(
@@ -96,8 +99,13 @@ def curve_of(free: Free, runs: Sequence[Run]) -> tuple[str, FloatArray, FloatArr
         rest = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
         return float(rest @ rest)
 
-    name = min(values, key=scatter)
-    return name, values[name], added
+    name, s = min(values, key=scatter), model.structure
+    units = {v.name: v.unit for rows in (s.states, s.inputs, s.outputs) for v in rows}
+    return FreeFunction(
+        port=free.port.words, of=free.of, evidence=free.evidence, share=free.removes.share,
+        unit=free.port.unit, variable=name, variable_unit=units[name], along=values[name],
+        added=added,
+    )  # fmt: skip
 
 
 def _along(free: Free, runs: Sequence[Run], name: str) -> FloatArray:

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.any_model.fit import OdeFit, certainty
-from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
+from psa_casadi.any_model.free_functions import Free, correction_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
 from psa_casadi.any_model.identify import MISSED, noise_left, noise_told, with_told
 from psa_casadi.any_model.result import (
-    FreeFunction,
     OdeBudget,
     OdeDiagnosis,
     OutputError,
@@ -274,21 +273,7 @@ def _diagnosis(
         ),
         free_function=note("free_function", of=best_free.of, port=best_free.port.words,
                            share=best_free.share) if best_free else None,
-        correction=_correction(known, best_free) if best_free else None,
-    )  # fmt: skip
-
-
-def _correction(known: Known, free: Free) -> FreeFunction | None:
-    """Return what a free function adds along the records; None where it cannot be simulated."""
-    try:
-        name, along, added = curve_of(free, known.runs)
-    except PsaError:
-        return None
-    s = known.base.model.structure
-    units = {v.name: v.unit for rows in (s.states, s.inputs, s.outputs) for v in rows}
-    return FreeFunction(
-        port=free.port.words, of=free.of, evidence=free.evidence, share=free.share,
-        unit=free.port.unit, variable=name, variable_unit=units[name], along=along, added=added,
+        correction=correction_of(best_free, known.runs) if best_free else None,
     )  # fmt: skip
 
 

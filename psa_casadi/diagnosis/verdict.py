@@ -69,19 +69,17 @@ from psa_casadi.simulation.timings import stage
 from psa_casadi.variables import Interval
 
 
-def shown(steps: Sequence[Step], limits: Thresholds) -> set[str]:
-    """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
+def blind_spots(
+    steps: Sequence[Step], final: Step, table: Sequence[Component], limits: Thresholds
+) -> tuple[BlindSpot, ...]:
+    """Return effects whose smallest gain that shows on these records is more than ordinary.
 
-    Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
+    Not those that the records do show, fitted with evidence, or as likely as a cause.
     """
-    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
-    return fitted.union(*(told_from(s, limits) for s in steps))
-
-
-def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
-    """Return effects whose smallest gain that shows on these records is more than ordinary."""
     spots = []
     present = {c.name for c in final.fit.model.components}
+    present |= {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
+    present |= {n for s in steps for n in told_from(s, limits)}
     factor = np.sqrt(final.screening.threshold)
     for effect in [e for e in table if e.name not in present]:
         scores = [s for s in final.screening.scores if s.direction.effect is effect]
@@ -346,7 +344,7 @@ def conclude(
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
-        blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps, limits)]),
+        blind_to=blind_spots(steps, final, table, limits),
         remaining=_remaining(final, unseen if kept else beyond),
         next_experiment=next_experiment(
             causes,
