@@ -171,17 +171,6 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
     assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
     assert f"it removes {share.text} of the held-out error" in repr(d)
-    _is_adequate_without_friction(names["model"])
-
-
-def _is_adequate_without_friction(model: psa.Model) -> None:
-    """The same motor, whose effects are compiled by now."""
-    clean = plants.motor(2, friction=0.0)
-    columns = {"voltage": clean.columns["voltage"], "w": clean.columns["w"]}
-    d = psa.diagnose(model, {"time": clean.time, **columns, "amps": clean.columns["i"]})
-    assert d.verdict == "adequate"
-    assert not d.causes
-    assert d.base_fit is d.extended_fit
 
 
 @pytest.mark.slow
