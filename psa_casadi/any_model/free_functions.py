@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.any_model.fit import OdeFit, refitted
-from psa_casadi.any_model.hypothesis import OdeView, hypothesis_of
+from psa_casadi.any_model.hypothesis import OdeView, hypothesis_of, slopes_of
 from psa_casadi.any_model.identify import noise_left
-from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, start_of, states_of, traced
+from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, states_of
 from psa_casadi.any_model.result import FreeFunction, removed_from
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
@@ -164,18 +164,8 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
 def _decrease(known: Known, view: OdeView, attached: Attached) -> float:
     """Return the decrease of the whitened sum of squares that the coefficients promise together."""
     fit, colour = view.of.fit, view.screening.colour
-    model, starts = extended(known.table.base, [attached]), view.of.fit.starts()
-    names: list[str | int] = list(attached.component.fitted)
-    columns = []
-    for o in fit.outputs:
-        parts = []
-        for k in o.runs:
-            run = known.runs[k]
-            begun = start_of(model, run.inputs[0], starts[k])
-            none = np.zeros((len(model.state_names), len(names)))
-            slopes = traced(model, run, begun.x, names, none, o.column, fit.rtol)[1]
-            parts.append(slopes[run.fitted(o.index)[: run.stop]] / run.noise[o.index])
-        columns.append(np.vstack(parts))
+    model = extended(known.table.base, [attached])
+    columns = slopes_of(fit, known.runs, model, attached.component.fitted)
     whole = colour.whiten_all(columns[0], columns[1:])
     basis = independent(whitened_jacobian(fit, colour))
     residual = colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import Attached, extended
 from psa_casadi.any_model.fit import OdeFit
-from psa_casadi.any_model.predict import start_of, traced, zero_name
+from psa_casadi.any_model.predict import shown_by, start_of, traced, zero_name
 from psa_casadi.any_model.runs import Run
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
@@ -82,7 +82,10 @@ def _at(
     memory = tuple(fit.starts())
     for step in [s * scale for s in effect.finite_step] or [0.0]:
         try:
-            columns = _moved(fit, runs, model, gain, step, scale)
+            if step:
+                columns = _stepped(fit, runs, model.with_values({gain: step}))
+            else:
+                columns = [c[:, 0] * scale for c in slopes_of(fit, runs, model, [gain])]
         except PsaError:
             continue
         every = np.concatenate(columns)
@@ -93,30 +96,39 @@ def _at(
             )  # fmt: skip
 
 
-def _moved(
-    fit: OdeFit, runs: Sequence[Run], model: Model, gain: str, step: float, scale: float
+def slopes_of(
+    fit: OdeFit, runs: Sequence[Run], model: Model, names: Sequence[str]
 ) -> list[FloatArray]:
-    """Return what a gain changes in the fitted samples of every output: its derivative or a step.
+    """Return d prediction / d parameters (n, k) at every output's fitted samples, over its noise.
 
-    At the initial states of the fit.
+    The model begins where the fit does. Raises PsaError.
+    """
+    columns, starts, found = [model.parameter_names.index(n) for n in names], fit.starts(), []
+    for o in fit.outputs:
+        parts = []
+        for k in o.runs:
+            run = runs[k]
+            begun = start_of(model, run.inputs[0], starts[k])
+            s0 = begun.by_parameter[:, columns]
+            slopes = traced(model, run, begun.x, [*names], s0, o.column, fit.rtol)[1]
+            parts.append(slopes[run.fitted(o.index)[: run.stop]] / run.noise[o.index])
+        found.append(np.vstack(parts))
+    return found
+
+
+def _stepped(fit: OdeFit, runs: Sequence[Run], model: Model) -> list[FloatArray]:
+    """Return what another model shows in every output's fitted samples more than a fit does.
+
+    Over the noise, from the initial states of the fit. Raises PsaError.
     """
     starts, found = fit.starts(), []
-    current = model.with_values({gain: step}) if step else model
-    column = model.parameter_names.index(gain)
     for o in fit.outputs:
         parts = []
         for k, residual in zip(o.runs, o.parts, strict=True):
-            run = runs[k]
-            begun = start_of(current, run.inputs[0], starts[k])
-            wanted: list[str | int] = [] if step else [gain]
-            s0 = begun.by_parameter[:, [column]][:, : len(wanted)]
-            shown, slopes = traced(current, run, begun.x, wanted, s0, o.column, fit.rtol)
-            used = run.fitted(o.index)
-            moved = (shown if step else slopes[:, 0] * scale)[used[: run.stop]]
-            if step:  # less the fit's own predictions, without an unknown zero
-                zero = starts[k].get(zero_name(o.column), 0.0)
-                moved = moved - (run.outputs[used, o.index] - zero - residual * run.noise[o.index])
-            parts.append(moved / run.noise[o.index])
+            run, j, noise = runs[k], o.index, runs[k].noise[o.index]
+            used, zero = run.fitted(j), starts[k].get(zero_name(o.column), 0.0)
+            shown = shown_by(model, run, starts[k], run.stop, fit.rtol)[used[: run.stop], j]
+            parts.append((shown - (run.outputs[used, j] - zero - residual * noise)) / noise)
         found.append(np.concatenate(parts))
     return found
 
