@@ -18,10 +18,10 @@ import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.any_model.fit import OdeFit, refitted
-from psa_casadi.any_model.hypothesis import OdeView, hypothesis_of
+from psa_casadi.any_model.hypothesis import OdeView, hypothesis_of, slopes_of
 from psa_casadi.any_model.identify import noise_left
-from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, start_of, states_of, traced
-from psa_casadi.any_model.result import removed_from
+from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, states_of
+from psa_casadi.any_model.result import FreeFunction, removed_from
 from psa_casadi.any_model.runs import Run
 from psa_casadi.any_model.search import Known
 from psa_casadi.component import Component, Equations, Symbols
@@ -75,12 +75,15 @@ class Free:
         return self.removes.share
 
 
-def curve_of(free: Free, runs: Sequence[Run]) -> tuple[str, FloatArray, FloatArray]:
-    """Return what a free function adds along all records, and the variable that this follows most.
+def correction_of(free: Free, runs: Sequence[Run]) -> FreeFunction | None:
+    """Return what a free function adds along all records, beside the variable it follows most.
 
-    (name, values (n,) of the variable, what is added (n,) to the port's sum). Raises PsaError.
+    None where it cannot be simulated.
     """
-    values = {n: _along(free, runs, n) for n in free.law.names}
+    try:
+        values = {n: _along(free, runs, n) for n in free.law.names}
+    except PsaError:
+        return None
     (component,) = free.fit.model.effects
     model = free.fit.model
     added = sum(
@@ -96,8 +99,13 @@ def curve_of(free: Free, runs: Sequence[Run]) -> tuple[str, FloatArray, FloatArr
         rest = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
         return float(rest @ rest)
 
-    name = min(values, key=scatter)
-    return name, values[name], added
+    name, s = min(values, key=scatter), model.structure
+    units = {v.name: v.unit for rows in (s.states, s.inputs, s.outputs) for v in rows}
+    return FreeFunction(
+        port=free.port.words, of=free.of, evidence=free.evidence, share=free.removes.share,
+        unit=free.port.unit, variable=name, variable_unit=units[name], along=values[name],
+        added=added,
+    )  # fmt: skip
 
 
 def _along(free: Free, runs: Sequence[Run], name: str) -> FloatArray:
@@ -147,25 +155,17 @@ def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
             of_base = removed_from(known.runs, h.fit.places, root.predicted, noise)
             what = f"{of} in {attached.port.words}"
             removes = of_base.share(what, root.predicted, h.predicted)
-            found.append(Free(attached.port, of, known.evidence(h), removes, law, h.fit, h.errors))
+            found.append(
+                Free(attached.port, of, known.scale.evidence(h), removes, law, h.fit, h.errors)
+            )
     return tuple(sorted(found, key=lambda f: -f.evidence))
 
 
 def _decrease(known: Known, view: OdeView, attached: Attached) -> float:
     """Return the decrease of the whitened sum of squares that the coefficients promise together."""
     fit, colour = view.of.fit, view.screening.colour
-    model, starts = extended(known.table.base, [attached]), view.of.fit.starts()
-    names: list[str | int] = list(attached.component.fitted)
-    columns = []
-    for o in fit.outputs:
-        parts = []
-        for k in o.runs:
-            run = known.runs[k]
-            begun = start_of(model, run.inputs[0], starts[k])
-            none = np.zeros((len(model.state_names), len(names)))
-            slopes = traced(model, run, begun.x, names, none, o.column, fit.rtol)[1]
-            parts.append(slopes[run.fitted(o.index)[: run.stop]] / run.noise[o.index])
-        columns.append(np.vstack(parts))
+    model = extended(known.table.base, [attached])
+    columns = slopes_of(fit, known.runs, model, attached.component.fitted)
     whole = colour.whiten_all(columns[0], columns[1:])
     basis = independent(whitened_jacobian(fit, colour))
     residual = colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])

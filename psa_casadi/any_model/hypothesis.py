@@ -14,14 +14,14 @@ import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import Attached, extended
 from psa_casadi.any_model.fit import OdeFit
-from psa_casadi.any_model.predict import start_of, traced, zero_name
+from psa_casadi.any_model.predict import shown_by, start_of, traced, zero_name
 from psa_casadi.any_model.runs import Run
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
-from psa_casadi.diagnosis.held_out import output_gain
+from psa_casadi.diagnosis.held_out import held_out_gain as gained_by
 from psa_casadi.diagnosis.probes import Direction
-from psa_casadi.diagnosis.screening import Score, Screening, estimated, screen
-from psa_casadi.diagnosis.search.hypothesis import confirmed
+from psa_casadi.diagnosis.screening import screen
+from psa_casadi.diagnosis.search.hypothesis import Look, Scale, confirmed
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import MachineError, PsaError
 from psa_casadi.model.compose import Model
@@ -82,7 +82,10 @@ def _at(
     memory = tuple(fit.starts())
     for step in [s * scale for s in effect.finite_step] or [0.0]:
         try:
-            columns = _moved(fit, runs, model, gain, step, scale)
+            if step:
+                columns = _stepped(fit, runs, model.with_values({gain: step}))
+            else:
+                columns = [c[:, 0] * scale for c in slopes_of(fit, runs, model, [gain])]
         except PsaError:
             continue
         every = np.concatenate(columns)
@@ -93,36 +96,41 @@ def _at(
             )  # fmt: skip
 
 
-def _moved(
-    fit: OdeFit, runs: Sequence[Run], model: Model, gain: str, step: float, scale: float
+def slopes_of(
+    fit: OdeFit, runs: Sequence[Run], model: Model, names: Sequence[str]
 ) -> list[FloatArray]:
-    """Return what a gain changes in the fitted samples of every output: its derivative or a step.
+    """Return d prediction / d parameters (n, k) at every output's fitted samples, over its noise.
 
-    At the initial states of the fit.
+    The model begins where the fit does. Raises PsaError.
     """
-    starts, found = fit.starts(), []
-    current = model.with_values({gain: step}) if step else model
-    column = model.parameter_names.index(gain)
+    columns, starts, found = [model.parameter_names.index(n) for n in names], fit.starts(), []
     for o in fit.outputs:
         parts = []
-        for k, residual in zip(o.runs, o.parts, strict=True):
+        for k in o.runs:
             run = runs[k]
-            begun = start_of(current, run.inputs[0], starts[k])
-            wanted: list[str | int] = [] if step else [gain]
-            s0 = begun.by_parameter[:, [column]][:, : len(wanted)]
-            shown, slopes = traced(current, run, begun.x, wanted, s0, o.column, fit.rtol)
-            used = run.fitted(o.index)
-            moved = (shown if step else slopes[:, 0] * scale)[used[: run.stop]]
-            if step:  # less the fit's own predictions, without an unknown zero
-                zero = starts[k].get(zero_name(o.column), 0.0)
-                moved = moved - (run.outputs[used, o.index] - zero - residual * run.noise[o.index])
-            parts.append(moved / run.noise[o.index])
-        found.append(np.concatenate(parts))
+            begun = start_of(model, run.inputs[0], starts[k])
+            s0 = begun.by_parameter[:, columns]
+            slopes = traced(model, run, begun.x, [*names], s0, o.column, fit.rtol)[1]
+            parts.append(slopes[run.fitted(o.index)[: run.stop]] / run.noise[o.index])
+        found.append(np.vstack(parts))
     return found
 
 
-#: So many starts each effect gets.
-_STARTS = 2
+def _stepped(fit: OdeFit, runs: Sequence[Run], model: Model) -> list[FloatArray]:
+    """Return what another model shows in every output's fitted samples more than a fit does.
+
+    Over the noise, from the initial states of the fit. Raises PsaError.
+    """
+    starts, found = fit.starts(), []
+    for o in fit.outputs:
+        parts = []
+        for k, residual in zip(o.runs, o.parts, strict=True):
+            run, j, noise = runs[k], o.index, runs[k].noise[o.index]
+            used, zero = run.fitted(j), starts[k].get(zero_name(o.column), 0.0)
+            shown = shown_by(model, run, starts[k], run.stop, fit.rtol)[used[: run.stop], j]
+            parts.append((shown - (run.outputs[used, j] - zero - residual * noise)) / noise)
+        found.append(np.concatenate(parts))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,14 +196,8 @@ def rms_of(
     return float(np.sqrt(np.mean(errors**2))) if errors.size else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class OdeView:
+class OdeView(Look[OdeHypothesis]):
     """What the residual of a hypothesis shows: screening of further effects, and its test."""
-
-    of: OdeHypothesis
-    trials: tuple[Direction, ...]
-    screening: Screening
-    test: Omnibus
 
     @property
     def shows(self) -> bool:
@@ -204,23 +206,9 @@ class OdeView:
         Beside a cause the test must alarm too, as in a stack's diagnosis. Errors of every output
         below what can be told of a device show nothing.
         """
-        best = max((s.decrease for s in self.screening.scores), default=0.0)
         told = any(o.rms > o.straight for o in self.of.fit.outputs)
-        seen = told and best >= self.screening.threshold
+        seen = told and self.decrease >= self.screening.threshold
         return seen and (self.test.alarm or not self.of.causes)
-
-    def estimated(self) -> dict[str, float]:
-        """Evidence of every further effect over this hypothesis, without a fit."""
-        return estimated(self.of.fit, self.screening)
-
-    def leading(self) -> list[list[Score]]:
-        """Return the best starts of the effects worth a fit, the best effect first."""
-        return [self.starts_of(name) for name in self.screening.leading()]
-
-    def starts_of(self, name: str) -> list[Score]:
-        """Return the best directions of one effect, from which its fits start."""
-        own = [s for s in self.screening.scores if s.direction.effect.name == name]
-        return [s for s in own if s.decrease >= 0.3 * own[0].decrease][:_STARTS]
 
 
 def look(
@@ -273,25 +261,21 @@ def held_out_gain(
 
     Summed over the outputs.
     """
-    rows = zip(of.fit.outputs, colour.each, before.held, of.held, strict=True)
-    return sum(
-        output_gain(
-            sum(int(r.judged(o.index).sum()) for r in runs) / own.inflation, old, new, o.straight
-        )
-        for o, own, old, new in rows
-    )
+    samples = [sum(int(r.judged(o.index).sum()) for r in runs) for o in of.fit.outputs]
+    straight = [o.straight for o in of.fit.outputs]
+    return gained_by(samples, colour, straight, before.held, of.held)
 
 
 def held_out_confirms(
-    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], colour: Colour, score: float
+    of: OdeHypothesis, before: OdeHypothesis, runs: Sequence[Run], scale: Scale[OdeHypothesis]
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     The rule of a stack's diagnosis (`psa_casadi.diagnosis.search.hypothesis.confirmed`), what is
-    promised summed over the outputs; `score` is what is gained of it.
+    promised summed over the outputs.
     """
-    gained, promise = held_out_gain(of, before, runs, colour), 0.0
-    for k, (o, own) in enumerate(zip(of.fit.outputs, colour.each, strict=True)):
+    gained, promise = scale.held_out(of, before), 0.0
+    for k, (o, own) in enumerate(zip(of.fit.outputs, scale.colour.each, strict=True)):
         old = errors_at(runs, before.predicted, o.index, Run.judged)
         new = errors_at(runs, of.predicted, o.index, Run.judged)
         if not old.size:
@@ -300,4 +284,4 @@ def held_out_confirms(
         promise += 0.5 * old.size / own.inflation * float(np.mean((new - old) ** 2)) / after**2
     if promise == 0.0 and gained == 0.0:
         return True
-    return confirmed(gained, promise, score)
+    return confirmed(gained, promise, scale.of_fitted(of) - scale.of_fitted(before), scale.limits)

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.any_model.fit import OdeFit, certainty
-from psa_casadi.any_model.free_functions import Free, curve_of, free_functions
+from psa_casadi.any_model.free_functions import Free, correction_of, free_functions
 from psa_casadi.any_model.hypothesis import OdeHypothesis
 from psa_casadi.any_model.identify import MISSED, noise_left, noise_told, with_told
 from psa_casadi.any_model.result import (
-    FreeFunction,
     OdeBudget,
     OdeDiagnosis,
     OutputError,
@@ -90,10 +89,10 @@ def beaten_by(
     It is clearly likelier, removes more of some output by more than a form may cost, and of none so
     much less.
     """
-    evidence, form = known.evidence(best), LIMITS.form
+    evidence, form = known.scale.evidence(best), LIMITS.form
     for f in free:
         clearly = LIMITS.clearly * temperature(max(evidence, f.evidence))
-        if f.evidence - LIMITS.price <= known.of_fitted(best) + clearly:
+        if f.evidence - LIMITS.price <= known.scale.of_fitted(best) + clearly:
             continue
         theirs = weighed(known.found[frozenset()], f.errors, noise, f.share).named
         more = {n: theirs[n] - share for n, share in own.named.items()}
@@ -112,14 +111,16 @@ def left_out(known: Known, best: OdeHypothesis) -> tuple[Note, ...]:
     """
     if not best.causes or not known.view(best).test.alarm:
         return ()
-    clearly = LIMITS.clearly * temperature(known.evidence(best))
-    better = [h for h in known.found.values() if known.score(h) > known.score(best) + clearly]
+    clearly = LIMITS.clearly * temperature(known.scale.evidence(best))
+    better = [
+        h for h in known.found.values() if known.scale.score(h) > known.scale.score(best) + clearly
+    ]
     better = [h for h in better if known.slight(h) and known.stands(h)]
-    top = max(better, key=known.score, default=None)
+    top = max(better, key=known.scale.score, default=None)
     if top is None:
         return ()
     names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
-    more = known.evidence(top) - known.evidence(best)
+    more = known.scale.evidence(top) - known.scale.evidence(best)
     return (note("slight", names=names, more=more, small=small, least=LIMITS.further),)
 
 
@@ -185,20 +186,20 @@ def _chances(known: Known, best: OdeHypothesis, cause: Component) -> dict[str, f
     less = known.found.get(best.names - {cause.name}) or without(known, best, cause)
     if less is None:
         return {cause.name: 1.0}
-    view, own = known.view(less), known.evidence(less)
+    view, own = known.view(less), known.scale.evidence(less)
     evidences = dict(view.estimated())
     fitted = {c for h in known.children(less) for c in h.names - less.names}
-    top = known.evidence(best) - own
+    top = known.scale.evidence(best) - own
     near = top - LIMITS.clearly * temperature(top)
     for name in [n for n, e in evidences.items() if e > near and n not in fitted]:
         known.note(with_cause(known, less, view.starts_of(name)))
     known.finish(
-        [h for h in known.children(less) if not h.final and known.evidence(h) - own > near]
+        [h for h in known.children(less) if not h.final and known.scale.evidence(h) - own > near]
     )
     for child in known.children(less):
         (name,) = child.names - less.names
         allowed = child.names == best.names or known.worth(child)
-        evidences[name] = known.evidence(child) - own if allowed else -np.inf
+        evidences[name] = known.scale.evidence(child) - own if allowed else -np.inf
     evidences[cause.name] = top
     return probabilities({n: e for n, e in evidences.items() if np.isfinite(e)})
 
@@ -272,21 +273,7 @@ def _diagnosis(
         ),
         free_function=note("free_function", of=best_free.of, port=best_free.port.words,
                            share=best_free.share) if best_free else None,
-        correction=_correction(known, best_free) if best_free else None,
-    )  # fmt: skip
-
-
-def _correction(known: Known, free: Free) -> FreeFunction | None:
-    """Return what a free function adds along the records; None where it cannot be simulated."""
-    try:
-        name, along, added = curve_of(free, known.runs)
-    except PsaError:
-        return None
-    s = known.base.model.structure
-    units = {v.name: v.unit for rows in (s.states, s.inputs, s.outputs) for v in rows}
-    return FreeFunction(
-        port=free.port.words, of=free.of, evidence=free.evidence, share=free.share,
-        unit=free.port.unit, variable=name, variable_unit=units[name], along=along, added=added,
+        correction=correction_of(best_free, known.runs) if best_free else None,
     )  # fmt: skip
 
 
@@ -304,7 +291,7 @@ def _candidates(
         own, share, evidence = known.found.get(frozenset({name})), 0.0, estimate
         if own is not None:
             share = float(np.clip(removed.from_base(own.predicted), 0.0, 1.0))
-            evidence = known.evidence(own)
+            evidence = known.scale.evidence(own)
         rows.append(Candidate(name, share, evidence, own is not None, first.get(name, 0.0)))
     return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
 

@@ -25,8 +25,8 @@ from psa_casadi.any_model.identify import relevelled
 from psa_casadi.any_model.runs import Run
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.screening import Score, best_sets, evidence
-from psa_casadi.diagnosis.search.hypothesis import another_minimum, inside_ranges
+from psa_casadi.diagnosis.screening import Score, best_sets
+from psa_casadi.diagnosis.search.hypothesis import Scale, another_minimum, inside_ranges
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import PsaError
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -55,13 +55,17 @@ class Known:
     base: OdeFit = field(init=False)
     found: dict[Names, OdeHypothesis] = field(default_factory=dict)
     views: dict[Names, OdeView] = field(default_factory=dict)
-    colour: Colour = field(init=False)
-    judge_only: bool = field(init=False)
+    scale: Scale[OdeHypothesis] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.judge_only = any(r.held_out_whole for r in self.runs)
         self.base, self.found[NONE] = self.root.fit, self.root
-        self.colour = self.view(self.root).screening.colour
+
+        def gained(of: OdeHypothesis, before: OdeHypothesis, colour: Colour) -> float:
+            return held_out_gain(of, before, self.runs, colour)
+
+        colour = self.view(self.root).screening.colour
+        whole = any(r.held_out_whole for r in self.runs)
+        self.scale = Scale(self.root, colour, LIMITS, gained, judge_only=whole)
 
     def view(self, h: OdeHypothesis) -> OdeView:
         """Look at a hypothesis; what effects add is known from the base."""
@@ -72,23 +76,6 @@ class Known:
             self.views[h.names] = old = look(h, self.runs, self.table, known)
         return old
 
-    def evidence(self, h: OdeHypothesis) -> float:
-        """Ln of the Bayes factor over the base."""
-        return 0.0 if h.fit is self.base else evidence(self.base, h.fit, self.colour)
-
-    def of_fitted(self, h: OdeHypothesis) -> float:
-        """Evidence less the price of the causes: the score of the fitted samples alone."""
-        return self.evidence(h) - LIMITS.price * len(h.causes)
-
-    def score(self, h: OdeHypothesis) -> float:
-        """The score of all samples, with what the fitted ones predict of held-out blocks.
-
-        Experiments that are held out whole judge alone.
-        """
-        if self.judge_only:
-            return self.of_fitted(h)
-        return self.of_fitted(h) + held_out_gain(h, self.root, self.runs, self.colour)
-
     def note(self, h: OdeHypothesis | None) -> None:
         """Keep a hypothesis if it is the best of its causes, and held-out samples do not object."""
         if h is None:
@@ -97,14 +84,14 @@ class Known:
         if old is None:
             self.found[h.names] = h
             return
-        gained = self.evidence(h) - self.evidence(old)
-        if another_minimum(gained, held_out_gain(h, old, self.runs, self.colour)):
+        gained = self.scale.evidence(h) - self.scale.evidence(old)
+        if another_minimum(gained, self.scale.held_out(h, old)):
             self.found[h.names] = replace(h, causes=old.causes)
 
     def children(self, h: OdeHypothesis) -> list[OdeHypothesis]:
         """Return the hypotheses with one more cause, the likeliest first."""
         own = [c for c in self.found.values() if len(c.names - h.names) == 1 and c.names > h.names]
-        return sorted(own, key=lambda c: -self.evidence(c))
+        return sorted(own, key=lambda c: -self.scale.evidence(c))
 
     def worth(self, h: OdeHypothesis) -> bool:
         """Whether every cause is itself, removes what can be told, and held-out data confirm it."""
@@ -137,15 +124,14 @@ class Known:
                 continue
             if not can_be_told(h, before):
                 return False
-            gained = self.of_fitted(h) - self.of_fitted(before)
-            if not held_out_confirms(h, before, self.runs, self.colour, gained):
+            if not held_out_confirms(h, before, self.runs, self.scale):
                 return False
         return True
 
     def best(self) -> OdeHypothesis:
         """Return the hypothesis of the highest score that is worth having, fitted to its end."""
         while True:
-            ranked = sorted(self.found.values(), key=lambda h: -self.score(h))
+            ranked = sorted(self.found.values(), key=lambda h: -self.scale.score(h))
             top = next((h for h in ranked if self.worth(h)), self.found[NONE])
             if top.final:
                 return top
@@ -163,7 +149,9 @@ class Known:
             except PsaError:
                 pass
             old = self.found[h.names]
-            better = ended is not None and self.evidence(ended) >= self.evidence(old) - 1e-6
+            better = (
+                ended is not None and self.scale.evidence(ended) >= self.scale.evidence(old) - 1e-6
+            )
             self.found[h.names] = ended if ended and better else replace(old, final=True)
 
 
@@ -184,7 +172,7 @@ def search(
             break
         visited.add(best.names)
         view = known.view(best)
-        known.colour = view.screening.colour
+        known.scale = replace(known.scale, colour=view.screening.colour)
         if len(best.causes) > 1:
             exchange(known, best)
         if view.shows and len(best.causes) < LIMITS.most_causes:
@@ -224,8 +212,8 @@ def exchange(known: Known, h: OdeHypothesis) -> None:
 def _finish_leaders(known: Known, h: OdeHypothesis) -> None:
     children = known.children(h)
     if children:
-        least = known.evidence(children[0]) - _BEHIND
-        near = [c for c in children if known.evidence(c) > least and not c.final]
+        least = known.scale.evidence(children[0]) - _BEHIND
+        near = [c for c in children if known.scale.evidence(c) > least and not c.final]
         known.finish(near[:_FINALISTS])
 
 

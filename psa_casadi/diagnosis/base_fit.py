@@ -202,9 +202,14 @@ def smooth_between(
     share, error = float(own @ left) / power, float(np.sqrt(np.mean(left**2) / power))
     if not (share > _SURE * error and abs(share - 1.0) < _NEAR):
         return None
-    moved = tuple(replace(e, record=_moved(e.record)) for e in experiments)
-    interval = (share - 1.96 * error, share + 1.96 * error)
-    return moved, note("smooth_voltage", share=share, low=interval[0], high=interval[1])
+    moved = []
+    for e in experiments:
+        # a sample is moved by the mean of the intervals on its sides
+        higher = _higher(e.record)
+        beside = np.concatenate([higher[:1], _middle(higher), higher[-1:]])
+        moved.append(replace(e, record=replace(e.record, voltage=e.record.voltage + beside)))
+    low, high = share - 1.96 * error, share + 1.96 * error
+    return tuple(moved), note("smooth_voltage", share=share, low=low, high=high)
 
 
 def _difference(fit: Fit, number: int, experiment: Experiment) -> FloatArray:
@@ -252,16 +257,6 @@ def _higher(record: Record) -> FloatArray:
     bends[2:-2] = np.diff(np.diff(record.voltage) / step) / _middle(step)
     bends = np.median([bends[:-2], bends[1:-1], bends[2:]], axis=0)
     return np.asarray(-(step**2) * _middle(bends) / 12.0)
-
-
-def _moved(record: Record) -> Record:
-    """Return a record whose straight lines have the mean of a smooth curve in each interval.
-
-    A sample is moved by the mean of the intervals on its sides.
-    """
-    higher = _higher(record)
-    beside = np.concatenate([higher[:1], _middle(higher), higher[-1:]])
-    return replace(record, voltage=record.voltage + beside)
 
 
 #: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
@@ -446,10 +441,10 @@ def _with_masses(
         )  # fmt: skip
 
     def further(quick: Fit) -> Fit | None:
-        names, states = quick.unknowns.names, quick.starts()
         return quick_from(
-            quick, quick.model, experiments, names, start_states=states, evaluations=_QUICK
-        )
+            quick, quick.model, experiments, quick.unknowns.names,
+            start_states=quick.starts(), evaluations=_QUICK,
+        )  # fmt: skip
 
     limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
     found = [f for f in side_by_side(begun, starts) if f is not None and f.cost < limit]

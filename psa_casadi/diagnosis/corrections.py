@@ -59,11 +59,6 @@ class Signals:
     predicted: Sequence[FloatArray]
     respond: Callable[[int, FloatArray], FloatArray]
 
-    def times(self) -> tuple[float, float]:
-        """Shortest sampling interval and longest duration of a record [s]."""
-        records = [e.record for e in self.experiments]
-        return min(r.sample_time for r in records), max(r.duration for r in records)
-
     def voltage(self, k: int) -> FloatArray:
         """Voltage of a record over the range of all, 0 to 1."""
         every = [e.record.voltage for e in self.experiments]
@@ -126,13 +121,16 @@ def time_constants(records: Sequence[Record]) -> FloatArray:
 
 
 def _modes(s: Signals, k: int) -> FloatArray:
-    record = s.experiments[k].record
-    x, dt = s.displacement(k), record.sample_time
-    shortest, longest = s.times()
+    records = [e.record for e in s.experiments]
+    shortest, longest = min(r.sample_time for r in records), max(r.duration for r in records)
+    change = np.append(0.0, np.diff(s.displacement(k)))
     columns = []
     lowest = max(_PERIODS / longest, _SLOWEST / shortest)
     for f in np.geomspace(lowest, 0.45 / shortest, MODES):
-        columns += [_resonator(x, f, dt, order) for order in (0, 1)]
+        turn = 2.0 * np.pi * f * records[k].sample_time
+        pole = np.exp(turn * (-_DAMPING + 1j * np.sqrt(1.0 - _DAMPING**2)))
+        rings = [1.0, -2.0 * pole.real, abs(pole) ** 2]
+        columns += [filtered(before, rings, change) for before in ([1.0, 0.0], [0.0, 1.0])]
     return np.column_stack(columns)
 
 
@@ -155,13 +153,6 @@ def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
         b = (1.0 - a) * tau / max(step[i], 1e-300)
         z[i] = a * z[i - 1] + (b - a) * x[i - 1] + (1.0 - b) * x[i]
     return z
-
-
-def _resonator(x: FloatArray, frequency: float, dt: float, order: int) -> FloatArray:
-    pole = np.exp(2.0 * np.pi * frequency * dt * (-_DAMPING + 1j * np.sqrt(1.0 - _DAMPING**2)))
-    change = np.append(0.0, np.diff(x))
-    before = [1.0, 0.0] if order == 0 else [0.0, 1.0]
-    return filtered(before, [1.0, -2.0 * pole.real, abs(pole) ** 2], change)
 
 
 def _flat(count: int) -> FloatArray:
@@ -288,19 +279,15 @@ def _correction(
     moved = follow.moved(used @ weights)
     changes = [j @ moved for j in follow.whole]
     predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, own, strict=True))
-    copied = 0.0 if named is None else _copied(free, signals, follow, named)
+    copied = 0.0
+    if named is not None:  # the share of what they add that the columns can add as well
+        pairs = zip(named, signals.predicted, experiments, strict=True)
+        target = follow.beside(np.concatenate([(n - p)[e.used] for n, p, e in pairs]))
+        power = float(target @ target)
+        if power > 0:
+            copied = float(np.sum((independent(free).T @ target) ** 2)) / power
     held = held_out_rms(experiments, predicted)
     return Correction(kind, evidence, held, weights * shape, predicted, own, moved, copied)
-
-
-def _copied(
-    free: FloatArray, signals: Signals, follow: _Following, named: Sequence[FloatArray]
-) -> float:
-    """Return the share of what named causes add that columns (samples, k) can add as well."""
-    pairs = zip(named, signals.predicted, signals.experiments, strict=True)
-    target = follow.beside(np.concatenate([(n - p)[e.used] for n, p, e in pairs]))
-    power = float(target @ target)
-    return float(np.sum((independent(free).T @ target) ** 2)) / power if power > 0 else 0.0
 
 
 def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:

@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupte
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
-from psa_casadi.diagnosis.task import Method, Task, Thresholds, Tried, shows_ringing
+from psa_casadi.diagnosis.task import Method, Task, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import NAMING, conclude
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -77,18 +77,13 @@ class Driven:
     filtered: bool = False
 
 
-def driven(
-    base: Fit,
-    model: Model,
-    experiments: Sequence[Experiment],
-    progress: Progress,
-    limits: Thresholds,
-) -> Driven:
+def driven(base: Fit, model: Model, task: Task) -> Driven:
     """Return whether the `base` fit explains the displacement; else what the other sign explains.
 
     `model` is where the base fit started.
     """
-    if shows_ringing(experiments) and explained(base, experiments) < limits.follows:
+    experiments, progress, limits = task.experiments, task.progress, task.limits
+    if task.fast and explained(base, experiments) < limits.follows:
         base = from_resonances(base, experiments, progress) or base
     share = explained(base, experiments)
     records = [e.record for e in experiments]
@@ -382,18 +377,10 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         refuse_stuck([e.record for e in experiments])
         base, task = _base(start, replace(task, experiments=experiments))
     experiments = task.experiments
-    seen = driven(base, start, experiments, progress, task.limits)
+    seen = driven(base, start, task)
     if not seen.follows:
         steps = unsearched(base, task)
-        found = conclude(
-            steps,
-            experiments,
-            table,
-            scale_given,
-            task.limits,
-            driven=seen.filtered,
-            hidden=task.hidden,
-        )
+        found = conclude(steps, task, scale_given, driven=seen.filtered)
         return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = steps_of(best_first(base, task), task)
     task.keep(steps[-1].fit)
@@ -412,7 +399,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         else:
             between = None
     progress("judging")
-    found = conclude(steps, experiments, table, scale_given, task.limits, hidden=task.hidden)
+    found = conclude(steps, task, scale_given)
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
     more_said = [

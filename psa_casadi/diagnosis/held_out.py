@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.diagnosis.colour import rms
+from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import predicted_further
 from psa_casadi.identification.fitting.prediction import measured
@@ -125,14 +125,24 @@ def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     return tuple(found)
 
 
-def output_gain(samples: float, before: float, after: float, straight: float = 0.0) -> float:
-    """Return m ln(E0 / E): what held-out samples of one output give a model over another one.
+def held_out_gain(
+    samples: Sequence[int],
+    colour: Colour,
+    straight: Sequence[float],
+    before: Sequence[float],
+    after: Sequence[float],
+) -> float:
+    """Return sum_j m_j ln(E0_j / E_j): what held-out samples give a model over another one [nats].
 
-    `samples` are m, counted as those of white noise; E0 and E the rms errors `before` and `after`,
-    each with what cannot be told of the output, `straight`, in the output's unit.
+    m_j are the `samples` of an output over the inflation by its noise's `colour`; E0 and E the rms
+    errors `before` and `after`, each with what cannot be told of the output, `straight`, in its
+    unit.
     """
-    old, new = (max(float(np.hypot(e, straight)), 1e-300) for e in (before, after))
-    return samples * float(np.log(old / new))
+    gained = 0.0
+    for n, own, *rest in zip(samples, colour.each, straight, before, after, strict=True):
+        old, new = (max(float(np.hypot(e, rest[0])), 1e-300) for e in rest[1:])
+        gained += n / own.inflation * float(np.log(old / new))
+    return gained
 
 
 def whole_residuals(

@@ -23,7 +23,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.drive import drive_frequency
 from psa_casadi.records.record import Record
-from psa_casadi.records.repeats import Repetition, repetitions
+from psa_casadi.records.repeats import repetitions
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
@@ -89,7 +89,11 @@ def spectrum_of(
     held = sum(0.5 * line.amplitude**2 for line in lines if not line.of_drive)
     share = min(1.0, held / max(excess, held)) if held > 0 else 0.0
     f, density = _condensed(frequency, power)
-    noise = _floor_density(floor, f, record.sample_time)
+    # the noise's from its autocovariance, faded out after Bartlett
+    lags = np.arange(floor.autocovariance.size)
+    faded = floor.autocovariance * (1.0 - lags / lags.size) * np.where(lags > 0, 2.0, 1.0)
+    of_noise = np.cos(2.0 * np.pi * np.outer(f * record.sample_time, lags)) @ faded
+    noise = np.sqrt(np.maximum(2.0 * record.sample_time * of_noise, 0.0))
     return Spectrum(f, density, noise, lines, share, record.displacement_unit)
 
 
@@ -181,14 +185,6 @@ def _condensed(frequency: FloatArray, power: FloatArray) -> tuple[FloatArray, Fl
     return np.add.reduceat(frequency, starts) / size, np.sqrt(means)
 
 
-def _floor_density(floor: NoiseFloor, frequency: FloatArray, step: float) -> FloatArray:
-    """Return the density of the noise from its autocovariance, faded out after Bartlett."""
-    lags = np.arange(floor.autocovariance.size)
-    faded = floor.autocovariance * (1.0 - lags / lags.size) * np.where(lags > 0, 2.0, 1.0)
-    power = np.cos(2.0 * np.pi * np.outer(frequency * step, lags)) @ faded
-    return np.sqrt(np.maximum(2.0 * step * power, 0.0))
-
-
 BoolArray = npt.NDArray[np.bool_]
 
 #: Fewest periods that are split.
@@ -229,9 +225,10 @@ def harmonic_split(record: Record, residual: FloatArray) -> HarmonicSplit | None
     coherent odd one cannot be separated by one record. Source: Pintelon and Schoukens, System
     Identification, 2nd ed., section 4.3.
     """
-    run = _period(record)
-    if run is None:
+    runs = [r for r in repetitions(record) if r.stop - r.start >= (PERIODS - 1) * r.lag]
+    if not runs:
         return None
+    run = min(runs, key=lambda r: (r.lag, r.start - r.stop))  # the shortest period's longest run
     periods = (run.stop + run.lag - run.start) // run.lag
     # the first period is left to transients where enough others remain
     periods -= periods > PERIODS
@@ -256,15 +253,6 @@ def harmonic_split(record: Record, residual: FloatArray) -> HarmonicSplit | None
     noise = max(total - sum(found.values()), 0.0)
     first = float(record.time[run.start + run.lag] - record.time[run.start])
     return HarmonicSplit(base / first, periods, int(excited.sum()), **found, noise=noise)
-
-
-def _period(record: Record) -> Repetition | None:
-    """Return the longest run of the shortest distance with three periods of the voltage in it."""
-    runs = [r for r in repetitions(record) if r.stop - r.start >= (PERIODS - 1) * r.lag]
-    if not runs:
-        return None
-    shortest = min(r.lag for r in runs)
-    return max((r for r in runs if r.lag == shortest), key=lambda r: r.stop - r.start)
 
 
 def _excited(amplitude: FloatArray) -> BoolArray:
@@ -376,7 +364,9 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     drive = drive_of(record)
     over_time = view(ground, time_axis(record))
     steady = _steady(ground, record, over_time, drive)
-    rows = axes(record, _predicted(record, residual), drive)
+    known = record.displacement  # the prediction is this less the residual, up to a constant
+    predicted = np.full(record.n, np.nan) if known is None else known - residual
+    rows = axes(record, predicted, drive)
     # what varies as slowly as time itself would vanish with the drift
     slow = ("amplitude", "frequency")
     views = [over_time, *(view(ground if a.name in slow else steady, a) for a in rows)]
@@ -390,7 +380,9 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     said = [(v.share, _followed(v, unit)) for v in views if v.significant]
     if held is not None and held.significant:
         said.append((held.share, _held(held, slope, count, unit)))
-    said.append((spectrum.share, _lines_note(spectrum)))
+    lines = tuple((n.frequency, n.name, (n.amplitude, unit)) for n in spectrum.others[:3])
+    told = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
+    said.append((spectrum.share, told))
     worth = sorted((row for row in said if row[0] > WORTH_SAYING), key=lambda row: -row[0])
     findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in worth)]
     if split is not None and split.repeats > WORTH_SAYING * ground.excess:
@@ -411,14 +403,6 @@ def _steady(ground: Ground, record: Record, over_time: View, drive: Drive) -> Gr
         return ground
     time = record.time[ground.index] - record.time[0]
     return replace(ground, residual=ground.residual - np.interp(time, over_time.x, over_time.mean))
-
-
-def _predicted(record: Record, residual: FloatArray) -> FloatArray:
-    """Return the prediction that the residual was taken from, up to a constant."""
-    if record.displacement is None:
-        return np.full(record.n, np.nan)
-    predicted: FloatArray = record.displacement - residual
-    return predicted
 
 
 def _holds(record: Record, ground: Ground) -> tuple[View | None, Slope | None, int]:
@@ -460,11 +444,6 @@ def _held(v: View, slope: Slope | None, count: int, unit: str) -> Note:
     clear = abs(slope.value) > 3.0 * slope.error
     moves = (slope.value, unit) if clear else None
     return note("holds", count=count, moves=moves, share=v.share)
-
-
-def _lines_note(s: Spectrum) -> Note:
-    lines = tuple((line.frequency, line.name, (line.amplitude, s.unit)) for line in s.others[:3])
-    return note("lines", lines=lines, count=len(s.others), share=s.share)
 
 
 def _split(s: HarmonicSplit, unit: str) -> Note:

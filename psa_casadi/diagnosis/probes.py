@@ -229,9 +229,8 @@ def _directions_at(
         one_sided = False
     for memory in _histories(fit, experiments, effect, model):
         for step in steps:
-            trial = _Trial(fit, experiments, model, moved, memory, step)
             try:
-                columns, further = trial.columns(), trial.further()
+                columns, further = _changes(fit, experiments, model, moved, memory, step)
             except PsaError:
                 continue
             for k, (name, size) in enumerate(moved.items()):
@@ -266,59 +265,54 @@ def _histories(
     return variants
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """Parameters `moved` along their derivatives, by their sizes; or the one by a finite `step`."""
+def _changes(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    model: Model,
+    moved: Mapping[str, float],
+    memory: tuple[dict[str, float], ...],
+    step: float,
+) -> tuple[FloatArray, tuple[FloatArray, ...]]:
+    """Return what parameters change in the displacement's used samples (samples, m) [m].
 
-    fit: Fit
-    experiments: Sequence[Experiment]
-    model: Model
-    moved: Mapping[str, float]
-    memory: tuple[dict[str, float], ...]
-    step: float
+    They are `moved` along their derivatives, by their sizes, or the one by a finite `step`. With it
+    comes what each changes in every further column, beyond offsets and factors.
+    """
+    stepped = model.with_values(dict.fromkeys(moved, step)) if step else model
+    rtol = fit.way.rtol if step else _RTOL
+    rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
 
-    def columns(self) -> FloatArray:
-        """Return what each changes in the displacement's used samples (samples, m) [m]."""
-        parts = [self._moved(k, OUTPUT) for k in range(len(self.experiments))]
-        if self.step:
-            left = self.fit.residuals_of(self.experiments)
-            for k, (e, residual) in enumerate(zip(self.experiments, left, strict=True)):
-                shown = measured(e.record)[: e.stop][e.used[: e.stop]]
-                parts[k] = parts[k] + (self.fit.offset(k) - (shown - residual))[:, None]
-        return np.concatenate(parts)
-
-    def further(self) -> tuple[FloatArray, ...]:
-        """Return what each changes in every further column, beyond offsets and factors."""
-        found = []
-        for f in self.fit.further:
-            records = with_column(self.experiments, f.column)
-            left = f.left_of(np.concatenate([self._in_column(f, k) for k in records]))
-            found.append(left + f.residuals[:, None] if self.step else left)
-        return tuple(found)
-
-    def _in_column(self, f: Further, k: int) -> FloatArray:
-        e = self.experiments[k]
-        total = -measured_in(e, f.column) if self.step else np.zeros(int(e.used.sum()))
-        total = total[:, None]
-        for factor, output in zip(f.factors, COLUMNS[f.column].outputs, strict=True):
-            total = total + factor * self._moved(k, output)
-        return total
-
-    def _moved(self, k: int, output: str) -> FloatArray:
+    def changed(k: int, output: str) -> FloatArray:
         """Return an output after the step, or its changes along the derivatives (samples, m)."""
-        e, step = self.experiments[k], self.step
+        e = experiments[k]
         if e.held_out_whole:
-            return np.zeros((0, len(self.moved)))
-        model = self.model.with_values(dict.fromkeys(self.moved, step)) if step else self.model
-        start = dict.fromkeys(memory_names(model.structure), 0.0) | self.memory[k]
-        rtol = self.fit.way.rtol if step else _RTOL
+            return np.zeros((0, len(moved)))
         found = trace_record(
-            model, e.record, start, () if step else tuple(self.moved),
+            stepped, e.record, rest | memory[k], () if step else tuple(moved),
             stop=e.stop, way=Way(rtol, rtol), by_start=False, output=output,
         )  # fmt: skip
-        sizes = np.array(list(self.moved.values()))
-        moved = found.output[:, None] if step else found.sensitivity * sizes
-        return moved[e.used[: e.stop]]
+        own = found.output[:, None] if step else found.sensitivity * sizes
+        return own[e.used[: e.stop]]
+
+    def in_column(f: Further, k: int) -> FloatArray:
+        e = experiments[k]
+        total = (-measured_in(e, f.column) if step else np.zeros(int(e.used.sum())))[:, None]
+        for factor, output in zip(f.factors, COLUMNS[f.column].outputs, strict=True):
+            total = total + factor * changed(k, output)
+        return total
+
+    parts, further = [changed(k, OUTPUT) for k in range(len(experiments))], []
+    if step:
+        for k, (e, residual) in enumerate(
+            zip(experiments, fit.residuals_of(experiments), strict=True)
+        ):
+            shown = measured(e.record)[: e.stop][e.used[: e.stop]]
+            parts[k] = parts[k] + (fit.offset(k) - (shown - residual))[:, None]
+    for f in fit.further:
+        records = with_column(experiments, f.column)
+        left = f.left_of(np.concatenate([in_column(f, k) for k in records]))
+        further.append(left + f.residuals[:, None] if step else left)
+    return np.concatenate(parts), tuple(further)
 
 
 def spans(trials: Sequence[Direction]) -> list[list[int]]:

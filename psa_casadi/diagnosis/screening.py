@@ -111,8 +111,12 @@ def screen(
     if colour is None:
         every = independent(np.hstack([basis, without(columns, basis)]))
         colour = colour_of(without(fit.residuals, every), lengths, known, every)
-    beside = further_columns(fit, trials)
-    colour = replace(colour, further=_further_colours(fit, beside))
+    beside, further = further_columns(fit, trials), []
+    for f, more in zip(fit.further, beside, strict=True):  # what neither fit nor direction explains
+        fitted = independent(f.jacobian)
+        every = independent(np.hstack([f.basis, fitted, without(more, fitted)]))
+        further.append(colour_of(without(f.residuals, every), f.lengths, None, every))
+    colour = replace(colour, further=tuple(further))
     white_basis = independent(whitened_jacobian(fit, colour))
     residual = without(whitened_residuals(fit, colour), white_basis)
     whole = colour.whiten_all(columns, beside)
@@ -174,16 +178,6 @@ def further_columns(fit: Fitted, trials: Sequence[Direction]) -> list[FloatArray
         np.hstack([np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)])
         for k, f in enumerate(fit.further)
     ]
-
-
-def _further_colours(fit: Fitted, columns: Sequence[FloatArray]) -> tuple[Colour, ...]:
-    """Return the colour of what neither the fit nor a direction explains of the further columns."""
-    found = []
-    for f, own in zip(fit.further, columns, strict=True):
-        basis = independent(f.jacobian)
-        every = independent(np.hstack([f.basis, basis, without(own, basis)]))
-        found.append(colour_of(without(f.residuals, every), f.lengths, None, every))
-    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -408,7 +402,8 @@ def evidence(before: Fitted, after: Fitted, colour: Colour) -> float:
 
     The log-likelihoods of displacement and further columns add up, each with its own noise level.
     """
-    share = _freedom(before) / len(before.residuals)
+    # what is left beside the unknowns to tell the noise
+    share = max(len(before.residuals) - before.unknowns.size, 0) / len(before.residuals)
     gained = share * _gained(before.residuals, after.residuals, colour)
     jacobians = []
     level = _level(after.residuals, colour, 0.0)
@@ -416,7 +411,12 @@ def evidence(before: Fitted, after: Fitted, colour: Colour) -> float:
     for own, f in zip(colour.further, after.further, strict=True):
         jacobians.append(own.whiten(f.jacobian) / _level(f.residuals, own, f.straight))
     gained += sum(further_gains(before, after, colour).values())
-    added, jacobian = _added(before, after), np.concatenate(jacobians)
+    known, other = before.unknowns, after.unknowns
+    added = [k for k, n in enumerate(other.names) if n not in known.names]
+    for record, states in enumerate(other.started):
+        first, old_ones = other.first(record), known.started[record]
+        added += [first + k for k, s in enumerate(states) if s not in old_ones]
+    jacobian = np.concatenate(jacobians)
     kept = [k for k in range(after.unknowns.size) if k not in added]
     new, old = jacobian[:, added], jacobian[:, kept]
     free = new - old @ np.linalg.lstsq(old, new, rcond=1e-10)[0]
@@ -518,11 +518,6 @@ def credible_set(probability: Mapping[str, float], level: float) -> tuple[str, .
     return tuple(chosen)
 
 
-def _freedom(fit: Fitted) -> int:
-    """Return the number of residuals less that of the unknowns: what is left to tell the noise."""
-    return max(len(fit.residuals) - fit.unknowns.size, 0)
-
-
 def _linear(score: Score, gained: float) -> float:
     if score.penalty is not None:
         return gained - score.penalty
@@ -530,13 +525,3 @@ def _linear(score: Score, gained: float) -> float:
         return 0.0
     width = LINEAR_PRIOR * score.direction.unit_gain / abs(score.detectable_gain)
     return gained * width**2 / (1.0 + width**2) - 0.5 * float(np.log1p(width**2))
-
-
-def _added(before: Fitted, after: Fitted) -> list[int]:
-    """Return the coordinates of `after` that `before` has not."""
-    known, names = before.unknowns, after.unknowns
-    added = [k for k, n in enumerate(names.names) if n not in known.names]
-    for record, states in enumerate(names.started):
-        first = names.first(record)
-        added += [first + k for k, s in enumerate(states) if s not in known.started[record]]
-    return added

@@ -104,8 +104,8 @@ class _Play:
         return abs(float(np.log(max(plain, 1e-12) / np.clip(plain, *_PLAIN))))
 
 
-def signature(effect: Component, stack: Model | None = None) -> Signature:
-    """Return what an effect changes on a stack without effects, by default the P-885.51.
+def signature(effect: Component) -> Signature:
+    """Return what an effect changes on a P-885.51 without effects.
 
     Plays loops of two amplitudes and rates and two steps with holds in 2 s; or in 20 ms, for an
     effect that does not show in 2 s. The effect has the ordinary size of its gain if it shows.
@@ -113,28 +113,21 @@ def signature(effect: Component, stack: Model | None = None) -> Signature:
     Raises:
         SimulationError: the stack cannot follow the voltage.
     """
-    base = stack or stack_model(STACK)
+    base = stack_model(STACK)
     extended = base.with_effect(effect)
-    best = _plainest(_plays(base, extended, effect))
-    telling, coordinate, counted = _telling(effect, best)
-    gain = extended.parameter(effect.gain or "")
-    return Signature(
-        effect.name, STACK if stack is None else stack.name, gain.name, gain.unit, best.size,
-        best.time, best.voltage, best.base, best.changed, telling, coordinate, counted,
-    )  # fmt: skip
-
-
-def _plainest(plays: Iterator[_Play]) -> _Play:
-    """Return the first play that shows the effect plainly, else the one that comes nearest to it.
-
-    Far beyond that size an effect hides its own form, or the stack is no longer stable.
-    """
+    plays = _plays(base, extended, effect)
     best = next(plays)
+    # the first that shows it plainly, else the nearest to that: far beyond an effect hides its form
     for play in plays:
         if best.off == 0.0:
             break
         best = play if play.off < best.off else best
-    return best
+    telling, coordinate, counted = _telling(effect, best)
+    gain = extended.parameter(effect.gain or "")
+    return Signature(
+        effect.name, STACK, gain.name, gain.unit, best.size,
+        best.time, best.voltage, best.base, best.changed, telling, coordinate, counted,
+    )  # fmt: skip
 
 
 def standard_voltage(period: float, span: float) -> tuple[FloatArray, FloatArray]:

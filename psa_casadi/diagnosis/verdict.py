@@ -6,6 +6,7 @@ So there are two models, and the difference of their plants' displacements is to
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +14,14 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import corrections
-from psa_casadi.diagnosis.evidence import diagnosed_model
 from psa_casadi.diagnosis.held_out import (
     Budget,
+    Share,
     budget,
     errors_of,
     gain_of,
+    held_out_parts,
+    jackknife,
     lost_elsewhere,
     whole_residuals,
 )
@@ -48,10 +51,14 @@ from psa_casadi.diagnosis.result import (
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
-from psa_casadi.diagnosis.task import Thresholds, same_curves
+from psa_casadi.diagnosis.task import Task, Thresholds, same_curves
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.identify import with_provenance
 from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import ErrorBudget, ErrorShare, HeldOut
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import held, repeats
@@ -59,21 +66,20 @@ from psa_casadi.records.split import Experiment, counts, loop_sizes
 from psa_casadi.simulation.simulate import simulate_record
 from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
+from psa_casadi.variables import Interval
 
 
-def shown(steps: Sequence[Step], limits: Thresholds) -> set[str]:
-    """Return the effects that the records do show: fitted with evidence, or as likely as a cause.
+def blind_spots(
+    steps: Sequence[Step], final: Step, table: Sequence[Component], limits: Thresholds
+) -> tuple[BlindSpot, ...]:
+    """Return effects whose smallest gain that shows on these records is more than ordinary.
 
-    Where they stand beside a cause, or are rivals of it, no smallest size of theirs is told.
+    Not those that the records do show, fitted with evidence, or as likely as a cause.
     """
-    fitted = {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
-    return fitted.union(*(told_from(s, limits) for s in steps))
-
-
-def blind_spots(final: Step, table: Sequence[Component]) -> tuple[BlindSpot, ...]:
-    """Return effects whose smallest gain that shows on these records is more than ordinary."""
     spots = []
     present = {c.name for c in final.fit.model.components}
+    present |= {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
+    present |= {n for s in steps for n in told_from(s, limits)}
     factor = np.sqrt(final.screening.threshold)
     for effect in [e for e in table if e.name not in present]:
         scores = [s for s in final.screening.scores if s.direction.effect is effect]
@@ -140,22 +146,18 @@ def useful_records(records: Sequence[Record]) -> Note:
 
 
 def alternatives(
-    named: Sequence[Step],
-    final: Fit,
-    experiments: Sequence[Experiment],
-    table: Sequence[Component],
-    limits: Thresholds,
-    *,
-    stiffness_given: bool,
+    named: Sequence[Step], final: Fit, task: Task, *, stiffness_given: bool
 ) -> tuple[Alternative, ...]:
     """Return, for each cause that may lie on the other side of the sensor, the model with that one.
 
     Of several such effects the likeliest that can be fitted and simulated.
     """
-    effects = {e.name: e for e in table}
+    effects, experiments = {e.name: e for e in task.table}, task.experiments
     found = []
     for step in named:
-        for name in sorted(told_from(step, limits), key=lambda n: -step.probability.get(n, 0.0)):
+        for name in sorted(
+            told_from(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
+        ):
             if name not in effects or effects[name].in_plant == step.cause.in_plant:
                 continue
             fitted = _fitted(step, name, experiments)
@@ -207,22 +209,68 @@ FloatArray = npt.NDArray[np.float64]
 NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
 
 
+def diagnosed_model(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    predicted: Sequence[FloatArray],
+    stiffness_given: bool,
+    spent: Budget | None = None,
+) -> Model:
+    """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
+    found = determinacy(fit, experiments)
+    told = replace(
+        evidence_of(fit, found, experiments, predicted, by="psa diagnose"),
+        held_out=_held_out(experiments, predicted),
+        budget=None
+        if spent is None
+        else ErrorBudget(
+            base_m=spent.excess_rms_m,
+            noise_m=spent.noise_rms_m,
+            remains_m=spent.remains_rms_m,
+            remains_percent=spent.remains_percent,
+            causes=tuple(_share(s) for s in spent.causes),
+            unnamed=None if spent.unnamed is None else _share(spent.unnamed),
+        ),
+    )
+    records = [e.record for e in experiments]
+    return with_provenance(fit.model, found, records, stiffness_given, evidence=told)
+
+
+def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> HeldOut | None:
+    """Return the held-out error with the jackknife interval of its logarithm over the parts."""
+    sums, counts = held_out_parts(experiments, predicted)
+    if not len(counts):
+        return None
+    errors = errors_of(experiments, predicted)
+
+    def of(kept: npt.NDArray[np.bool_]) -> float:
+        power = float(np.sum(sums[kept])) / max(int(np.sum(counts[kept])), 1)
+        return 0.5 * float(np.log(max(power, 1e-300)))
+
+    centre, half = jackknife(of, len(counts))
+    records = sum(bool(e.held_out.any()) for e in experiments)
+    return HeldOut(
+        rms_m=errors.holdout_rms_m,
+        interval_m=Interval(float(np.exp(centre - half)), float(np.exp(centre + half))),
+        max_m=errors.holdout_max_m,
+        nrmse_percent=errors.holdout_nrmse_percent,
+        records=records if len(counts) == records else 0,
+    )
+
+
+def _share(s: Share) -> ErrorShare:
+    return ErrorShare(s.what, s.share, Interval(*s.interval))
+
+
 @stage("judging")
 def conclude(
-    steps: Sequence[Step],
-    experiments: Sequence[Experiment],
-    table: Sequence[Component],
-    stiffness_given: bool,
-    limits: Thresholds,
-    *,
-    driven: bool = True,
-    hidden: float = 0.0,
+    steps: Sequence[Step], task: Task, stiffness_given: bool, *, driven: bool = True
 ) -> Diagnosis:
     """Judge the steps of a search and return the diagnosis.
 
-    Of records whose displacement is not `driven` by the voltage nothing more is said. `hidden` is
-    the share of the readings that a saturated sensor has made.
+    Of records whose displacement is not `driven` by the voltage nothing more is said.
     """
+    experiments, table, limits = task.experiments, task.table, task.limits
     first, last = steps[0], steps[-1]
     colour = last.screening.colour
     errors = whole_residuals(experiments, last.predicted)
@@ -246,7 +294,7 @@ def conclude(
     whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
     lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
     doubt = unconfirmed(
-        experiments, gain, whole=whole, lost=lost, partly=partly, hidden=hidden, limits=limits
+        experiments, gain, whole=whole, lost=lost, partly=partly, hidden=task.hidden, limits=limits
     )
     stands = beaten is None and doubt is None
     vague = balance.vague(steps) if stands else {}
@@ -287,9 +335,7 @@ def conclude(
         else ()
     )
     unnamed = {*vague, *(c.what for c in small)}
-    causes = tuple(
-        _cause(s, model, spent, experiments, limits) for s in named if s.cause.name not in unnamed
-    )
+    causes = tuple(_cause(s, model, spent, task) for s in named if s.cause.name not in unnamed)
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -298,7 +344,7 @@ def conclude(
         base_errors=errors_of(experiments, first.predicted),
         extended_errors=errors_of(experiments, final.predicted),
         gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
-        blind_to=blind_spots(final, [e for e in table if e.name not in shown(steps, limits)]),
+        blind_to=blind_spots(steps, final, table, limits),
         remaining=_remaining(final, unseen if kept else beyond),
         next_experiment=next_experiment(
             causes,
@@ -330,9 +376,7 @@ def conclude(
         contenders=contenders(first, experiments, limits) if verdict == "ambiguous" else (),
         budget=spent,
         patch=patch,
-        alternatives=alternatives(
-            kept, final.fit, experiments, table, limits, stiffness_given=stiffness_given
-        ),
+        alternatives=alternatives(kept, final.fit, task, stiffness_given=stiffness_given),
     )
 
 
@@ -359,18 +403,16 @@ def _misfits(
     )
 
 
-def _cause(
-    s: Step, model: Model, spent: Budget, experiments: Sequence[Experiment], limits: Thresholds
-) -> Cause:
+def _cause(s: Step, model: Model, spent: Budget, task: Task) -> Cause:
     """State a cause: its probability, the share of the error that it removes, what it changes."""
-    records = [e.record for e in experiments]
+    records = [e.record for e in task.experiments]
     own = next((c for c in spent.causes if c.what == s.cause.name), None)
     return Cause(
         effect=s.cause.name,
         belongs_to=s.cause.belongs_to,
         confidence=float(min(0.99, s.probability[s.cause.name])),
         parameters=estimates(s.cause, model),
-        cannot_be_told_from=told_from(s, limits),
+        cannot_be_told_from=told_from(s, task.limits),
         explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
         remedy=s.cause.what_now.code,
         sizes=sizes(s.cause, model, records, unit=records[0].displacement_unit),

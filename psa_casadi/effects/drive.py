@@ -3,6 +3,7 @@
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
+from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import voltage_scale
 from psa_casadi.shapes import ANGLES, BEND_TEXT, bend, shape_parameters, softplus
 from psa_casadi.variables import Parameter, State, Values
@@ -77,12 +78,8 @@ VOLTAGE_SATURATION = Component(
         "  w = 0.005 u_rated;  clip_gain = 1 is a hard clip"
     ),
     parameters=(
-        Parameter(
-            "clip_gain", 0.0, "1", (0.0, 1.0), "share of the excess voltage that is lost", scale=0.1
-        ),
-        Parameter(
-            "clip_level", 0.6, "1", (0.3, 1.2), "level of the clip over rated voltage", scale=0.1
-        ),
+        share("clip_gain", (0.0, 1.0), "share of the excess voltage that is lost", 0.1),
+        share("clip_level", (0.3, 1.2), "level of the clip over rated voltage", 0.1, 0.6),
     ),
     equations=_voltage_saturation,
     probe={"clip_level": (0.7, 0.85, 0.95)},
@@ -129,13 +126,12 @@ DRIVE_LAG = Component(
         Parameter(
             "drive_lag_time", 0.0, "s", (0.0, 0.1), "time constant of the drive", "ms", scale=1e-4
         ),
-        Parameter(
+        positive(
             "drive_lag_shape",
             0.25,
             "1",
             (1e-4, 2.0),
             "square of the second-order time over that of the first",
-            log=True,
             limit=True,
         ),
     ),
@@ -175,13 +171,11 @@ AMPLIFIER_NONLINEARITY = Component(
         + BEND_TEXT.format("amplifier")
     ),
     parameters=(
-        Parameter(
+        share(
             "amplifier_gain",
-            0.0,
-            "1",
             (-0.2, 0.2),
             "bow and S of the amplifier's curve over the rated voltage",
-            scale=0.002,
+            0.002,
         ),
         *shape_parameters("amplifier"),
     ),
@@ -221,9 +215,7 @@ CHARGE_LEAKAGE = Component(
     gain="leak_gain",
     equation_text="drive voltage = G v - leak_gain z,  leak_time z' + z = G v",
     parameters=(
-        Parameter(
-            "leak_gain", 0.0, "1", (0.0, 1.0), "share of the charge that leaks away", scale=0.01
-        ),
+        share("leak_gain", (0.0, 1.0), "share of the charge that leaks away", 0.01),
         Parameter("leak_time", 3.0, "s", (1e-3, 1e5), "time constant of the leakage", log=True),
     ),
     states=(State("leak_voltage", "V", "part that leaks away", voltage_scale, memory=True),),

@@ -10,6 +10,7 @@ from psa_casadi.component import (
     Remedy,
     Symbols,
 )
+from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import reading_scale, stroke, stroke_scale
 from psa_casadi.variables import Input, Parameter, State, Values
 
@@ -35,9 +36,7 @@ OFFSET_DRIFT = Component(
         Parameter(
             "drift_rate", 0.0, "m/s", (-1e-3, 1e-3), "rate of the drift", "um/s", scale=_drift_scale
         ),
-        Parameter(
-            "drift_bend", 0.0, "1", (-3.0, 3.0), "change of the rate over drift_span", scale=0.3
-        ),
+        share("drift_bend", (-3.0, 3.0), "change of the rate over drift_span", 0.3),
         Parameter(
             "drift_span", 10.0, "s", (1e-6, 1e9), "time over which drift_bend counts", fitted=False
         ),
@@ -141,21 +140,18 @@ TEMPERATURE = Component(
     ),
     parameters=(
         Parameter("expansion_gain", 0.0, "1/K", (-0.1, 0.1), "expansion over stroke", scale=1e-3),
-        Parameter(
+        share(
             "temperature_gain_ratio",
-            0.0,
-            "1",
             (-100.0, 100.0),
             "relative change of the gain over the expansion over stroke",
-            scale=1.0,
+            1.0,
         ),
-        Parameter(
+        positive(
             "temperature_lag",
             0.01,
             "s",
             (1e-4, 1e5),
             "time constant from the thermometer to the stack",
-            log=True,
             limit=True,
         ),
         Parameter(

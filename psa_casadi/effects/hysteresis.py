@@ -3,6 +3,7 @@
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
+from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import stop_scale, voltage_scale
 from psa_casadi.shapes import (
     direction,
@@ -65,29 +66,18 @@ RATE_DEPENDENT_HYSTERESIS = Component(
         "  z' = u' - (|u'| sgn(z) + u')/2 (|z|/w)^4,  w = rate_threshold u_rated"
     ),
     parameters=(
-        Parameter(
-            "rate_gain",
-            0.0,
-            "1",
-            (-0.5, 0.5),
-            "growth of the loop's width per decade of voltage rate",
-            scale=0.05,
+        share(
+            "rate_gain", (-0.5, 0.5), "growth of the loop's width per decade of voltage rate", 0.05
         ),
-        Parameter(
+        positive(
             "rate_onset",
             1.0,
             "1/s",
             (1e-3, 1e3),
             "rate over rated voltage, below which the loop no longer changes",
-            log=True,
         ),
-        Parameter(
-            "rate_threshold",
-            0.1,
-            "1",
-            (0.01, 1.0),
-            "threshold of the elements over rated voltage",
-            log=True,
+        positive(
+            "rate_threshold", 0.1, "1", (0.01, 1.0), "threshold of the elements over rated voltage"
         ),
         Parameter(
             "rate_by_threshold",
@@ -158,13 +148,8 @@ HYSTERESIS_MEMORY = Component(
         Parameter(
             "memory_gain", 0.0, "1", (-100.0, 100.0), "1 with the elements", scale=1.0, fitted=False
         ),
-        Parameter(
-            "memory_threshold",
-            0.03,
-            "1",
-            (_NARROWEST, 1.0),
-            "first threshold over rated voltage",
-            log=True,
+        positive(
+            "memory_threshold", 0.03, "1", (_NARROWEST, 1.0), "first threshold over rated voltage"
         ),
         *_WEIGHTS,
     ),
@@ -207,14 +192,7 @@ RATE_INDEPENDENT_ASYMMETRY = Component(
             "rate-independent asymmetry",
             scale=_asymmetry_scale,
         ),
-        Parameter(
-            "asymmetry_bend",
-            0.0,
-            "1",
-            (-100.0, 100.0),
-            "share that follows the hysteresis force",
-            scale=1.0,
-        ),
+        share("asymmetry_bend", (-100.0, 100.0), "share that follows the hysteresis force", 1.0),
     ),
     equations=_rate_independent_asymmetry,
     probe={"asymmetry_bend": (-2.0, 0.0, 2.0)},

@@ -5,6 +5,7 @@ from functools import partial
 import casadi as ca
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Expression, Remedy, Symbols
+from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import static_stiffness, stroke, stroke_scale, velocity_scale
 from psa_casadi.shapes import (
     ANGLES,
@@ -98,13 +99,11 @@ LOAD_STIFFNESS = Component(
         "  x_s = k_L u_rated / k_s,  k_s = k_P k_B/(k_P + k_B) or k,  " + BEND_TEXT.format("load")
     ),
     parameters=(
-        Parameter(
+        share(
             "load_gain",
-            0.0,
-            "1",
             (-0.5, 0.5),
             "bow and S of the load's force over the stack's stiffness times the stroke",
-            scale=0.002,
+            0.002,
         ),
         *shape_parameters("load"),
     ),
@@ -147,21 +146,13 @@ PRELOAD_LOSS = Component(
         " x_s = k_L u_rated / k_s,  k_s = k_P k_B/(k_P + k_B) or k"
     ),
     parameters=(
-        Parameter(
-            "contact_gain",
-            0.0,
-            "1",
-            (-0.8, 10.0),
-            "spring's stiffness over the stack's",
-            scale=0.05,
-        ),
-        Parameter(
+        share("contact_gain", (-0.8, 10.0), "spring's stiffness over the stack's", 0.05),
+        share(
             "contact_position",
-            0.4,
-            "1",
             (-0.5, 1.5),
             "displacement at which contact begins, over the stroke",
-            scale=0.1,
+            0.1,
+            0.4,
         ),
     ),
     equations=_preload_loss,
@@ -213,9 +204,7 @@ BACKLASH = Component(
     ),
     parameters=(
         Parameter("backlash_gain", 0.0, "1", (0.0, 1.5), "1 is true play", scale=0.3),
-        Parameter(
-            "backlash_width", 0.01, "1", (2e-4, 0.03), "half the gap over the stroke", log=True
-        ),
+        positive("backlash_width", 0.01, "1", (2e-4, 0.03), "half the gap over the stroke"),
     ),
     states=(
         State(
@@ -275,13 +264,11 @@ RECIPROCAL_COUPLING = Component(
         " cascade, 1 Newton;  y + g y_r is y with the output held at zero, for the blocked force"
     ),
     parameters=(
-        Parameter(
+        share(
             "reciprocal_gain",
-            0.0,
-            "1",
             (0.0, 1.2),
             "share of the reaction: 0 the paper's cascade, 1 Newton; more only in error",
-            scale=0.25,
+            0.25,
         ),
     ),
     states=(
@@ -336,17 +323,11 @@ def _rate_scale(k: int, p: Values) -> float:
 
 
 def _parameters(k: int) -> tuple[Parameter, ...]:
-    def share(name: str, value: float, text: str) -> Parameter:
-        return Parameter(f"series_{name}_{k}", value, "1", (-1e3, 1e3), text, scale=0.01)
-
-    def positive(name: str, value: float, unit: str, high: float, text: str) -> Parameter:
-        return Parameter(f"series_{name}_{k}", value, unit, (1e-4, high), text, log=True)
-
     return (
-        share("share", 0.01, f"static share of mode {k}"),
-        share("ahead", 0.0, f"share of mode {k} a quarter period ahead"),
-        positive("frequency", 1e3, "Hz", 1e6, f"natural frequency of mode {k}"),
-        positive("damping", 0.02, "1", 0.7, f"damping ratio of mode {k}"),
+        share(f"series_share_{k}", (-1e3, 1e3), f"static share of mode {k}", 0.01, 0.01),
+        share(f"series_ahead_{k}", (-1e3, 1e3), f"share of mode {k} a quarter period ahead", 0.01),
+        positive(f"series_frequency_{k}", 1e3, "Hz", (1e-4, 1e6), f"natural frequency of mode {k}"),
+        positive(f"series_damping_{k}", 0.02, "1", (1e-4, 0.7), f"damping ratio of mode {k}"),
     )
 
 

@@ -13,6 +13,7 @@ from psa_casadi.component import (
     Remedy,
     Symbols,
 )
+from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import reading_scale, stroke, stroke_scale
 from psa_casadi.shapes import ANGLES, BEND_TEXT, bend, pade_section, shape_parameters
 from psa_casadi.variables import Parameter, State, Values
@@ -136,13 +137,11 @@ SENSOR_NONLINEARITY = Component(
         " stiffness,  " + BEND_TEXT.format("nonlinearity")
     ),
     parameters=(
-        Parameter(
+        share(
             "nonlinearity_gain",
-            0.0,
-            "1",
             (-0.5, 0.5),
             "bow and S over the stroke, beyond the best straight line",
-            scale=0.002,
+            0.002,
         ),
         *shape_parameters("nonlinearity"),
     ),
@@ -170,13 +169,8 @@ def _sensor_ripple(s: Symbols) -> Equations:
 
 
 def _second(name: str) -> Parameter:
-    return Parameter(
-        f"ripple_second_{name}",
-        0.0,
-        "1",
-        (-20.0, 20.0),
-        f"{name} of half the period, over the ripple",
-        scale=0.3,
+    return share(
+        f"ripple_second_{name}", (-20.0, 20.0), f"{name} of half the period, over the ripple", 0.3
     )
 
 
@@ -252,14 +246,8 @@ SENSOR_JUMP = Component(
         Parameter(
             "jump_place", 5e-6, "m", (-1e-2, 1e-2), "displacement of it", "um", scale=_place_scale
         ),
-        Parameter(
-            "jump_width",
-            0.01,
-            "1",
-            (1e-6, 0.05),
-            "half its rise over the stroke",
-            log=True,
-            limit=True,
+        positive(
+            "jump_width", 0.01, "1", (1e-6, 0.05), "half its rise over the stroke", limit=True
         ),
     ),
     equations=_sensor_jump,

@@ -3,6 +3,7 @@
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
+from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import stroke_scale
 from psa_casadi.shapes import magnitude_power, rate_magnitude, smooth_magnitude
 from psa_casadi.variables import Parameter, State, Values
@@ -42,17 +43,8 @@ SLOW_CREEP = Component(
     gain="creep_gain",
     equation_text="x_c = creep_gain (z_1 + z_2 + z_3),  creep_time 10^(i-1) z_i' + z_i = x",
     parameters=(
-        Parameter(
-            "creep_gain",
-            0.0,
-            "1",
-            (0.0, 0.5),
-            "creep per decade of time over elongation",
-            scale=0.01,
-        ),
-        Parameter(
-            "creep_time", 0.1, "s", (1e-3, 1e4), "fastest time constant of the creep", log=True
-        ),
+        share("creep_gain", (0.0, 0.5), "creep per decade of time over elongation", 0.01),
+        positive("creep_time", 0.1, "s", (1e-3, 1e4), "fastest time constant of the creep"),
     ),
     states=(_state(1), _state(2), _state(3)),
     equations=_slow_creep,
@@ -88,11 +80,7 @@ FIELD_DEPENDENT_GAIN = Component(
     ),
     gain="field_gain",
     equation_text="f_L gains k_L field_gain u |u| / u_rated",
-    parameters=(
-        Parameter(
-            "field_gain", 0.0, "1", (0.0, 2.0), "growth of the gain at rated voltage", scale=0.05
-        ),
-    ),
+    parameters=(share("field_gain", (0.0, 2.0), "growth of the gain at rated voltage", 0.05),),
     equations=_field_dependent_gain,
     remedy=Remedy("undo_curve", "range"),
     looks_like="the gain grows in proportion to the amplitude; both branches curve upwards",
@@ -130,14 +118,7 @@ FIELD_DEPENDENT_CAPACITANCE = Component(
     gain="capacitance_gain",
     equation_text="C_p u' = i/(1 + capacitance_gain |u|/u_rated)",
     parameters=(
-        Parameter(
-            "capacitance_gain",
-            0.0,
-            "1",
-            (0.0, 3.0),
-            "growth of the capacitance at rated voltage",
-            scale=0.1,
-        ),
+        share("capacitance_gain", (0.0, 3.0), "growth of the capacitance at rated voltage", 0.1),
     ),
     equations=_field_dependent_capacitance,
     needs_column=("charge", "current"),
@@ -162,13 +143,11 @@ SATURATION_OF_STRAIN = Component(
     gain="saturation_gain",
     equation_text="f_L = k_L u / sqrt(1 + saturation_gain (u/u_rated)^2)",
     parameters=(
-        Parameter(
+        share(
             "saturation_gain",
-            0.0,
-            "1",
             (0.0, 10.0),
             "twice the share of force that is lost at rated voltage, while that is small",
-            scale=0.05,
+            0.05,
         ),
     ),
     equations=_saturation_of_strain,
@@ -219,13 +198,11 @@ SELF_HEATING = Component(
         "  q' = |u'|/u_rated (|f_H|/h_ref)^(n+1) - q / heating_time"
     ),
     parameters=(
-        Parameter(
+        share(
             "heating_gain",
-            0.0,
-            "1",
             (0.0, 1e3),
             "growth of the gain per loss of one rated swing at h_ref still felt",
-            scale=_heating_scale,
+            _heating_scale,
         ),
         Parameter("heating_time", 3.0, "s", (1e-2, 1e5), "time constant of cooling", log=True),
     ),
@@ -271,12 +248,8 @@ AGEING = Component(
         " clock, or N where ageing_by_travel = 1,  N' = |u'|/(2 u_rated), 1 s for each cycle"
     ),
     parameters=(
-        Parameter(
-            "ageing_gain", 0.0, "1", (0.0, 0.3), "share of the gain lost per decade", scale=0.01
-        ),
-        Parameter(
-            "ageing_time", 1.0, "s", (1e-3, 1e7), "age at time 0 of the record's clock", log=True
-        ),
+        share("ageing_gain", (0.0, 0.3), "share of the gain lost per decade", 0.01),
+        positive("ageing_time", 1.0, "s", (1e-3, 1e7), "age at time 0 of the record's clock"),
         Parameter(
             "ageing_by_travel", 0.0, "1", (0.0, 1.0), "0: time ages, 1: cycles do", fitted=False
         ),

@@ -10,7 +10,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from fmpy import simulate_fmu
 
 import psa_casadi as psa
 from build_scripts.measured_data import ROOT
@@ -19,13 +18,11 @@ from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.predict import Sizes, sizes_of
 from psa_casadi.any_model.runs import runs_of
-from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.own_words import own_verdict_sentence
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor, oscillator, pair, tanks
-from tests.export.modelica_runs import load
 from tests.report.browser import DARK, find_browser
 from tests.report.html_page import Page, figures, numbers
 from tests.report.test_schemas import valid
@@ -151,26 +148,6 @@ def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@shares_hysteresis
-def test_the_extended_model_is_exported_like_any_other(tmp_path: Path) -> None:
-    d, record = _hysteresis(), plants.bouc_wen(1)
-    fmu = psa.export_fmu(d.model, tmp_path / "extended.fmu")
-    inputs = np.zeros(record.n, dtype=[("time", float), ("force", float)])
-    inputs["time"], inputs["force"] = record.time, record.columns["force"]
-    found = simulate_fmu(
-        str(fmu), fmi_type="CoSimulation", stop_time=record.duration,
-        output_interval=1.0 / 15000.0, input=inputs,  # fmpy holds an input over a step
-        relative_tolerance=1e-8, output=["position"],
-    )  # fmt: skip
-    shown = np.interp(record.time, found["time"], found["position"])
-    rest = record.columns["position"] - shown  # from the declared start; the plant begins there too
-    assert np.std(rest[300:]) < 1.1e-5
-    text = modelica_text(d.model, name="Oscillator")
-    assert "rate_v" in text
-    assert load(text, "Oscillator.Signal") is not None
-
-
-@pytest.mark.slow
 def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,17 +171,6 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
     assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
     assert f"it removes {share.text} of the held-out error" in repr(d)
-    _is_adequate_without_friction(names["model"])
-
-
-def _is_adequate_without_friction(model: psa.Model) -> None:
-    """The same motor, whose effects are compiled by now."""
-    clean = plants.motor(2, friction=0.0)
-    columns = {"voltage": clean.columns["voltage"], "w": clean.columns["w"]}
-    d = psa.diagnose(model, {"time": clean.time, **columns, "amps": clean.columns["i"]})
-    assert d.verdict == "adequate"
-    assert not d.causes
-    assert d.base_fit is d.extended_fit
 
 
 @pytest.mark.slow

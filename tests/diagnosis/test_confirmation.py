@@ -28,12 +28,8 @@ def triangle() -> Record:
     stack, time = draw_stack(rng), np.arange(1200) / 200.0
     voltage = np.round(0.95 * stack.u_rated * (0.5 + 0.5 * sawtooth(2 * np.pi * time, 0.5)), 3)
     y = simulate_base(stack, time, voltage).displacement
-    return Record(
-        name="r",
-        time=time,
-        voltage=voltage,
-        displacement=y + 2e-4 * np.ptp(y) * rng.standard_normal(y.size),
-    )
+    noise = 2e-4 * np.ptp(y) * rng.standard_normal(y.size)
+    return Record(name="r", time=time, voltage=voltage, displacement=y + noise)
 
 
 def shown_up_to(record: Record, share: float) -> Record:

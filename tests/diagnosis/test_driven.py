@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+import psa_casadi as psa
 from psa_casadi.cli.diagnosis_files import write_patch
-from psa_casadi.diagnosis.diagnose import diagnose, filtered
+from psa_casadi.diagnosis.diagnose import filtered
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
@@ -38,6 +39,11 @@ def shown() -> FloatArray:
     return found + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
 
 
+def _told(y: FloatArray, voltage: FloatArray = VOLTAGE) -> psa.Diagnosis:
+    record = Record(name="r", time=TIME, voltage=voltage, displacement=y)
+    return psa.diagnose([record], effects=TABLE)
+
+
 @pytest.mark.parametrize("kind", slow_but(["noise"], ["noise", "drift", "another device"]))
 def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
     rng = np.random.default_rng(1)
@@ -46,7 +52,7 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
         "drift": 1e-6 * TIME + 1e-8 * rng.standard_normal(TIME.size),
         "another device": 1e-6 * np.sin(2 * np.pi * 3.7 * TIME),
     }[kind]
-    found = diagnose([Record(name=kind, time=TIME, voltage=VOLTAGE, displacement=y)], effects=TABLE)
+    found = _told(y)
     assert found.verdict == "not_driven"
     assert not found.causes
     assert "same device" in found.notes[-1]
@@ -54,9 +60,7 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
 
 
 def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
-    found = diagnose(
-        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=-shown)], effects=TABLE
-    )
+    found = _told(-shown)
     assert found.verdict == "not_driven"
     assert (
         "the sign of the displacement flipped the base model explains 100.00 %" in found.notes[-1]
@@ -66,18 +70,9 @@ def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
 
 @pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
 def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray) -> None:
-    found = diagnose(
-        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=factor * shown)], effects=TABLE
-    )
+    found = _told(factor * shown)
     assert found.verdict == "adequate"
     assert "its unit, or that of the voltage, is probably another" in found.notes[-1]
-
-
-def test_a_unit_that_no_model_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
-    with pytest.raises(InputError, match="m, more than a stack with any sensor: its unit"):
-        diagnose(
-            [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=1e6 * shown)], effects=TABLE
-        )
 
 
 def _modes() -> Record:
@@ -104,37 +99,30 @@ def test_a_linear_filter_of_the_voltage_is_told_from_what_has_nothing_to_do_with
 
 @slow
 def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
-    found = diagnose([_modes()], effects=TABLE)
+    found = psa.diagnose([_modes()], effects=TABLE)
     assert found.verdict == "unexplained"
     assert any("A linear filter of the voltage explains" in n for n in found.notes)
     assert not any("of the same device" in n for n in found.notes)
 
 
-def test_a_voltage_or_a_displacement_that_rests_is_refused_in_words(shown: FloatArray) -> None:
-    rest = np.full(TIME.size, 1e-6)
+def test_what_no_fit_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
+    rest = np.ones(TIME.size)
+    with pytest.raises(InputError, match="m, more than a stack with any sensor: its unit"):
+        _told(1e6 * shown)
     with pytest.raises(InputError, match="The voltage is 40 V throughout"):
-        diagnose(
-            [Record(name="r", time=TIME, voltage=np.full(TIME.size, 40.0), displacement=shown)],
-            effects=TABLE,
-        )
+        _told(shown, 40.0 * rest)
     with pytest.raises(InputError, match="The displacement is 1e-06 m throughout: the sensor"):
-        diagnose([Record(name="r", time=TIME, voltage=VOLTAGE, displacement=rest)], effects=TABLE)
-    bit: FloatArray = np.where(shown > np.mean(shown), 1e-5, 0.0)
+        _told(1e-6 * rest)
     with pytest.raises(InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
-        diagnose([Record(name="r", time=TIME, voltage=VOLTAGE, displacement=bit)], effects=TABLE)
+        _told(np.where(shown > np.mean(shown), 1e-5, 0.0))
 
 
 @slow
 def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArray) -> None:
-    hold = Record(
-        name="hold",
-        time=TIME,
-        voltage=np.full(TIME.size, VOLTAGE[0]),
-        displacement=np.full(TIME.size, shown[0]),
-    )
-    found = diagnose(
-        [Record(name="r", time=TIME, voltage=VOLTAGE, displacement=shown), hold], effects=TABLE
-    )
+    moves = Record(name="r", time=TIME, voltage=VOLTAGE, displacement=shown)
+    rest = np.ones(TIME.size)
+    hold = replace(moves, name="hold", voltage=VOLTAGE[0] * rest, displacement=shown[0] * rest)
+    found = psa.diagnose([moves, hold], effects=TABLE)
     assert np.isfinite(found.base_errors.holdout_nrmse_percent)
 
 

@@ -22,12 +22,8 @@ def whole() -> Record:
     stack = draw_stack(rng)
     voltage = np.round(0.95 * stack.u_rated * np.concatenate([np.zeros(10), loops(rng, 890)]), 3)
     y = simulate_base(stack, T, voltage).displacement
-    return Record(
-        name="r",
-        time=T,
-        voltage=voltage,
-        displacement=y + 2e-4 * np.ptp(y) * rng.standard_normal(y.size),
-    )
+    noise = 2e-4 * np.ptp(y) * rng.standard_normal(y.size)
+    return Record(name="r", time=T, voltage=voltage, displacement=y + noise)
 
 
 def without(record: Record, *ranges: tuple[int, int]) -> Record:
@@ -36,11 +32,9 @@ def without(record: Record, *ranges: tuple[int, int]) -> Record:
         kept[a:b] = False
     assert record.displacement is not None
     return Record(
-        name="r",
-        time=record.time[kept],
-        voltage=record.voltage[kept],
+        name="r", time=record.time[kept], voltage=record.voltage[kept],
         displacement=record.displacement[kept],
-    )
+    )  # fmt: skip
 
 
 def test_what_happened_in_a_gap_is_no_cause(whole: Record) -> None:

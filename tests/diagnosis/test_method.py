@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 import psa_casadi as psa
+from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.task import LIMITS, STEPS, Method, Thresholds
 from tests.studies.benchmarks.ablation import (
     ablation_table,
@@ -19,19 +20,8 @@ NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
 
 def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1) -> Found:
     case = Case(kind, effect, seed)  # type: ignore[arg-type]  # the kinds below are those it knows
-    return Found(
-        case,
-        1.0,
-        "cause_named" if named else "unexplained",
-        named,
-        named,
-        (),
-        0.9,
-        {},
-        {},
-        1.0,
-        1.0,
-    )
+    verdict: Verdict = "cause_named" if named else "unexplained"
+    return Found(case, 1.0, verdict, named, named, (), 0.9, {}, {}, 1.0, 1.0)
 
 
 def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:

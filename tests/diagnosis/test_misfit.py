@@ -1,29 +1,52 @@
-"""What is seen in a residual: what was put in, and nothing in noise."""
-
-import time
+"""What is seen in a residual: what was put in, and nothing in noise; its lines and harmonics."""
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.misfit import misfit
+from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, excitation
-from tests.diagnosis.misfit_cases import (
-    LEVELS,
-    MULTISINE,
-    NOISE,
-    SINE,
-    STEP,
-    STEPS,
-    TIME,
-    FloatArray,
-    grid,
-    noise,
-    seen,
-    shares,
-)
-from tests.tiers import slow
+
+FloatArray = NDArray[np.float64]
+
+NOISE = 1e-8
+STEP = 1e-3
+
+
+def grid(samples: int, step: float = STEP) -> FloatArray:
+    return step * np.arange(samples, dtype=np.float64)
+
+
+TIME = grid(20_000)
+SINE = excitation.sine(TIME, 0.0, 100.0, 2.0)
+MULTISINE = excitation.multisine(TIME, 0.0, 100.0, (0.5, 20.0), seed=1)
+LEVELS = (0.0, 50.0, 20.0, 80.0, 0.0, 100.0, 30.0, 60.0)
+STEPS = excitation.steps(TIME, LEVELS)
+
+
+def noise(samples: int, correlation: float, seed: int) -> FloatArray:
+    white = np.random.default_rng(seed).standard_normal(samples)
+    coloured: FloatArray = lfilter([np.sqrt(1 - correlation**2)], [1, -correlation], white)
+    return NOISE * coloured
+
+
+def seen(
+    voltage: FloatArray, error: FloatArray, *, correlation: float = 0.0, seed: int = 0
+) -> Misfit:
+    residual = error + noise(voltage.size, correlation, seed)
+    record = Record(
+        name="r", time=grid(voltage.size), voltage=voltage, displacement=1e-7 * voltage + residual
+    )
+    (floor,) = noise_floor([record], [residual])
+    return misfit(record, residual, floor)
+
+
+def shares(m: Misfit) -> dict[str, float]:
+    views = (*m.views, *((m.holds,) if m.holds else ()))
+    return {v.name: v.share for v in views}
 
 
 def test_a_function_of_the_voltage() -> None:
@@ -66,13 +89,17 @@ def test_the_error_after_a_reversal() -> None:
     assert found["since_reversal"] == max(found.values())
 
 
+#: Sines of three amplitudes [V] at three frequencies each.
+SINES = np.concatenate(
+    [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
+)
+AMPLITUDE = np.repeat([30.0, 60.0, 100.0], 12_000)
+
+
 def test_amplitude_and_frequency_of_the_drive() -> None:
-    parts = [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
-    v = np.concatenate(parts)
-    amplitude = np.repeat([30.0, 30.0, 30.0, 60.0, 60.0, 60.0, 100.0, 100.0, 100.0], 4_000)
     frequency = np.tile(np.repeat([1.0, 2.0, 5.0], 4_000), 3)
-    by_amplitude = shares(seen(v, 5e-10 * amplitude))
-    by_frequency = shares(seen(v, 1e-8 * frequency))
+    by_amplitude = shares(seen(SINES, 5e-10 * AMPLITUDE))
+    by_frequency = shares(seen(SINES, 1e-8 * frequency))
     assert by_amplitude["amplitude"] > 0.9
     assert by_amplitude["frequency"] < 0.1
     assert by_frequency["frequency"] > 0.9
@@ -80,17 +107,14 @@ def test_amplitude_and_frequency_of_the_drive() -> None:
 
 
 def test_delay_grows_with_frequency_and_gain_with_amplitude() -> None:
-    parts = [excitation.sine(TIME[:4_000], 0.0, a, f) for a in (30, 60, 100) for f in (1, 2, 5)]
-    v = np.concatenate(parts)
-    rate = np.gradient(v, STEP)
-    delayed = seen(v, -4e-11 * rate)
+    delayed = seen(SINES, -4e-11 * np.gradient(SINES, STEP))
     found = shares(delayed)
     assert found["frequency_lag"] > 0.3
     assert found["frequency_gain"] == found["frequency"] == 0.0
     view = next(w for w in delayed.views if w.name == "frequency_lag")
     assert np.all(np.diff(view.mean[[0, -1]]) < -5e-9)
-    amplitude = np.repeat([30.0, 30.0, 30.0, 60.0, 60.0, 60.0, 100.0, 100.0, 100.0], 4_000)
-    stronger = shares(seen(v, 1e-5 * (v - 0.5 * amplitude) * 1e-4 * (amplitude - 60.0)))
+    grown = 1e-9 * (SINES - 0.5 * AMPLITUDE) * (AMPLITUDE - 60.0)
+    stronger = shares(seen(SINES, grown))
     assert stronger["amplitude_gain"] > 0.3
     assert stronger["amplitude_lag"] == stronger["amplitude"] == 0.0
 
@@ -163,15 +187,69 @@ def test_counts_stay_counts() -> None:
     assert "+3 counts at" in m.sentences[1] or "-3 counts at" in m.sentences[1]
 
 
-@slow
-def test_a_million_samples() -> None:
-    n = 1_000_000
-    v = 50.0 * (1.0 - np.cos(2 * np.pi * np.arange(n) / 800.0))
-    residual = 1e-8 * np.sin(v / 30.0) + noise(n, 0.0, 0)
-    record = Record(name="r", time=grid(n), voltage=v, displacement=1e-7 * v + residual)
-    (floor,) = noise_floor([record], [residual])
-    before = time.process_time()
-    m = misfit(record, residual, floor)
-    # 1 s where nothing else runs; the limit leaves room for a busy machine
-    assert time.process_time() - before < 6.0
-    assert shares(m)["voltage"] > 0.95
+@pytest.mark.parametrize("voltage", [SINE, MULTISINE], ids=["sine", "multisine"])
+def test_a_line_at_57_9_hz(voltage: FloatArray) -> None:
+    m = seen(voltage, 2e-8 * np.sin(2 * np.pi * 57.9 * TIME))
+    assert m.sentences[1].startswith("The residual has a line whatever the drive does: 57.9 Hz")
+    assert len(m.sentences) == 2
+    (line,) = m.spectrum.lines
+    assert line.frequency == pytest.approx(57.9, abs=0.02)
+    assert line.amplitude == pytest.approx(2e-8, rel=0.05)
+    assert max(shares(m).values()) == 0.0
+
+
+def test_the_mains_and_the_drive_are_named() -> None:
+    f = 1.0 / 0.45
+    error = 2e-8 * np.sin(2 * np.pi * 50.0 * TIME) + 1e-8 * np.sin(6 * np.pi * f * TIME)
+    mains, harmonic = seen(excitation.sine(TIME, 0.0, 100.0, f), error).spectrum.lines
+    assert (mains.name, mains.of_drive) == ("50 Hz mains", False)
+    assert (harmonic.name, harmonic.of_drive) == ("harmonic 3 of the drive", True)
+    slow = grid(4_000, 1.0 / 45.0)
+    aliased = Record(name="a", time=slow, voltage=np.sin(40.0 * slow), displacement=np.zeros(4_000))
+    residual = 2e-8 * np.sin(2 * np.pi * 50.0 * aliased.time) + noise(4_000, 0.0, 0)
+    (line,) = misfit(aliased, residual, *noise_floor([aliased], [residual])).spectrum.lines
+    assert line.frequency == pytest.approx(5.0, abs=0.01)
+    assert line.name == "alias of 50 Hz mains"
+
+
+def test_the_spectrum_of_noise_lies_on_its_floor() -> None:
+    for correlation in (0.0, 0.7):
+        spectrum = seen(SINE, 0.0 * SINE, correlation=correlation).spectrum
+        ratio = spectrum.density[-100:] / spectrum.floor[-100:]
+        assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.1)
+        assert np.all(np.diff(spectrum.frequency) > 0)
+
+
+def test_even_and_odd_nonlinearity_of_a_sine() -> None:
+    w = 4 * np.pi * TIME
+    error: FloatArray = 1.5e-8 * np.sin(w) + 2e-8 * np.cos(2 * w) + 1e-8 * np.sin(3 * w + 0.4)
+    found = seen(SINE, error)
+    split = found.split
+    assert split is not None
+    assert split.fundamental == pytest.approx(2.0, rel=1e-6)
+    assert split.excited == 1
+    assert split.linear == pytest.approx(1.5e-8**2 / 2, rel=0.05)
+    assert split.even == pytest.approx(2e-8**2 / 2, rel=0.05)
+    assert split.odd == pytest.approx(1e-8**2 / 2, rel=0.1)
+    assert split.noise == pytest.approx(NOISE**2, rel=0.05)
+    assert "even nonlinearity (14 nm rms)" in found.sentences[-1]
+
+
+def test_a_multisine_of_odd_lines_shows_its_nonlinearity_between_them() -> None:
+    rng = np.random.default_rng(2)
+    w = 2 * np.pi * TIME[:2_000] / 2.0
+    odd = [k for k in range(1, 40, 2) if k % 8 != 5]
+    u: FloatArray = np.tile(sum(np.cos(k * w + rng.uniform(0, 6.28)) for k in odd), 10) / 4.0
+    linear = seen(u, 3e-8 * u).split
+    even = seen(u, 3e-8 * (u**2 - np.mean(u**2))).split
+    cubic = seen(u, 3e-8 * u**3).split
+    assert linear is not None
+    assert even is not None
+    assert cubic is not None
+    assert (linear.excited, linear.even, linear.odd) == (len(odd), 0.0, 0.0)
+    assert linear.linear == pytest.approx(9e-16 * np.mean(u**2), rel=0.02)
+    assert (even.linear, even.odd) == (0.0, 0.0)
+    assert even.even == pytest.approx(9e-16 * np.var(u**2), rel=0.02)
+    assert cubic.even == 0.0
+    assert cubic.odd > 100.0 * NOISE**2 / 1e3
+    assert seen(MULTISINE, 0.0 * TIME).split is None

@@ -10,7 +10,7 @@ from psa_casadi.diagnosis.colour import (
     omnibus,
     uncertain,
 )
-from psa_casadi.records.noise import first_order_noise, high_frequency_noise
+from psa_casadi.records.noise import first_order_noise
 from psa_casadi.units import FloatArray
 from tests.studies.plants.noise import coloured
 from tests.tiers import slow_but
@@ -22,17 +22,6 @@ VOLTAGE = 50.0 * (1.0 - np.cos(2.0 * np.pi * TIME))
 
 def noise(correlation: float, seed: int = 4) -> FloatArray:
     return coloured(np.random.default_rng(seed).standard_normal(N), correlation)
-
-
-@pytest.mark.parametrize(("correlation", "within"), [(0.3, 0.06), (0.6, 0.12)])
-def test_the_level_of_coloured_noise_shows_in_its_fast_part(
-    correlation: float, within: float
-) -> None:
-    for seed in range(8):
-        rms, found = first_order_noise(noise(correlation, seed))
-        assert rms == pytest.approx(1.0, rel=within)
-        assert found == pytest.approx(correlation, abs=within)
-    assert high_frequency_noise(noise(0.6)) < 0.6
 
 
 def test_white_noise_stays_white_whatever_is_slow_beside_it() -> None:

@@ -3,6 +3,7 @@
 And what holds for all: finite slopes, ordinary costs, no run-away, rest at a hold.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +28,72 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.start.ordinary import forms_of
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.stacks import STACKS
 from psa_casadi.scales import stiffness_scale, stroke_scale
 from psa_casadi.simulation.compiler import functions_of
 from psa_casadi.simulation.simulate import simulate
-from tests.effects.effect_runs import (
-    HYSTERESIS,
-    QUICK,
-    driven,
-    linear,
-    ordinary,
-    sine_and_steps,
-    third_harmonic,
-    triangle,
-)
+from psa_casadi.simulation.stepper import Steps, run
 from tests.export.modelica_runs import right_side_error
 from tests.model.random_models import random_model, random_point
-from tests.model.stack_models import stack
+from tests.model.stack_models import LINEAR, stack
 from tests.studies.plants.ceramic import play
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
+
+FloatArray = NDArray[np.float64]
+
+#: The stack without its lags, so that slow drives are quasi-static to 1e-3.
+QUICK = {"tau": 1e-6, "R_s": 0.1, "delta": 0.0}
+
+
+#: The hysteresis of the stack.
+HYSTERESIS = {name: STACKS["P-885.51"].values[name].value for name in LINEAR}
+
+
+def linear(
+    effect: Component, gain: float, base: Sequence[Component] = BASE, **more: float
+) -> Model:
+    """Return the stack without hysteresis and with one effect."""
+    model = stack("P-885.51", **LINEAR, **{k: v for k, v in QUICK.items() if k != "delta"})
+    if base is SIMPLIFIED:
+        model = model.with_components(SIMPLIFIED).with_values({"c": 2e3})
+    return model.with_effect(effect, {str(effect.gain): gain, **more})
+
+
+def driven(model: Model, t: FloatArray, voltage: FloatArray, force: float = 0.0) -> Steps:
+    u = np.column_stack([voltage, np.full_like(t, force)])
+    return run(model, t, u, np.zeros(len(model.state_names)))
+
+
+def ordinary(effect: Component, **values: float) -> Model:
+    """Return the whole stack with one effect at the ordinary size of its gain."""
+    model = stack("P-885.51").with_effect(effect, values)
+    gain = model.parameter(str(effect.gain))
+    return model.with_values({gain.name: gain.typical({**model.values, gain.name: 0.0})})
+
+
+def sine_and_steps() -> tuple[FloatArray, FloatArray]:
+    """Two seconds at 1 kHz: six cycles of 60 V, a step to 90 V, a step to 30 V."""
+    t = np.arange(2001) / 1000.0
+    cycles = 30.0 * (1.0 - np.cos(2 * np.pi * 5.0 * t))
+    return t, np.where(t < 1.2, cycles, np.where(t < 1.6, 90.0, 30.0))
+
+
+def triangle(frequency: float, peak: float, cycles: int = 3) -> tuple[FloatArray, FloatArray]:
+    n = 400
+    t = np.arange(cycles * n + 1) / (n * frequency)
+    return t, peak * (1.0 - np.abs(2.0 * ((t * frequency) % 1.0) - 1.0))
+
+
+def third_harmonic(effect: Component, gain: float, peak: float) -> tuple[float, float]:
+    """Return fundamental and third harmonic [m] of a slow sine drive of both signs."""
+    n = 2000
+    t = np.arange(2 * n + 1) / n
+    model = linear(effect, gain)
+    x = driven(model, t, peak * np.sin(2 * np.pi * t)).y[n:-1, -1]
+    parts = np.fft.rfft(x) * 2.0 / n
+    return float(-parts[1].imag), float(-parts[3].imag)
+
 
 every_base = pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
 
@@ -307,8 +355,6 @@ def test_a_held_voltage_holds_the_output(effect: Component, base: tuple[Componen
     assert x[0] > 0.3 * stroke_scale(model.values)
     assert np.ptp(x) < 1e-6 * x[0]
 
-
-FloatArray = NDArray[np.float64]
 
 _STROKE, _RATED, _NOISE = 20e-6, 100.0, 20e-9
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.diagnosis.evidence import diagnosed_model
+from psa_casadi.diagnosis.verdict import diagnosed_model
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.compose import Model

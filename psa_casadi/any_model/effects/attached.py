@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from psa_casadi.component import Component, Equations, Expression, Remedy, Symbols
 from psa_casadi.model.compose import Model
@@ -17,8 +17,10 @@ ORDINARY, LARGEST = 0.03, 10.0
 _KIND = re.compile("_(?:of|in)_")
 #: Returns a parameter or a state of an effect by its short name.
 Own = Callable[[str], Expression]
-#: The equations of an effect: (symbols, its own by short name) -> derivatives, term.
-Law = Callable[[Symbols, Own], tuple[dict[str, Expression], Expression]]
+#: The derivatives of an effect's own states, by short name, and its term.
+Terms = tuple[dict[str, Expression], Expression]
+#: The equations of an effect: (symbols, its own by short name) -> term, or both.
+Law = Callable[[Symbols, Own], Terms | Expression]
 
 
 @dataclass(frozen=True)
@@ -55,14 +57,16 @@ def at_port(
     signal: str = "q",
     reads: tuple[Port, ...] = (),
 ) -> Attached:
-    """Return an effect that adds a term to a port's sum; its parameters begin with its name.
+    """Return an effect that adds a term to a port's sum.
 
+    Parameters and states have short names here, before which the effect's stands in the model.
     `words` are description, source, equation and what it looks like; in the equation, Q stands for
     the port's sum and q for the `signal`.
     """
 
     def equations(s: Symbols) -> Equations:
-        der, term = law(s, lambda short: getattr(s, f"{name}_{short}"))
+        found = law(s, lambda short: getattr(s, f"{name}_{short}"))
+        der, term = found if isinstance(found, tuple) else ({}, found)
         return Equations(
             der={f"{name}_{short}": rate for short, rate in der.items()},
             add={port.balance: term},
@@ -74,8 +78,8 @@ def at_port(
         description=f"{port.words}: {description}",
         source=source,
         equations=equations,
-        parameters=parameters,
-        states=states,
+        parameters=tuple(replace(p, name=f"{name}_{p.name}") for p in parameters),
+        states=tuple(replace(q, name=f"{name}_{q.name}") for q in states),
         gain=f"{name}_{gain}",
         probe={f"{name}_{short}": grid for short, grid in (probe or {}).items()},
         finite_step=finite_step,
@@ -106,22 +110,8 @@ def rounded(size: float) -> float:
     return float(f"{size:.2g}")
 
 
-def gain_of(name: str, unit: str, size: float, what: str, *, positive: bool = False) -> Parameter:
+def size_of(unit: str, size: float, what: str, *, positive: bool = False) -> Parameter:
     """Return the parameter that removes an effect at 0, in the unit of what it adds to."""
     most = LARGEST * size
     low = 0.0 if positive else -most
-    return Parameter(name, 0.0, unit, (low, most), what, scale=ORDINARY * size)
-
-
-def plain_gain(name: str, what: str) -> Parameter:
-    """Return a gain from 0 (absent) to 1 (in full)."""
-    return Parameter(name, 0.0, "1", (0.0, 1.0), what, scale=0.1)
-
-
-def time_of(name: str, sample: float, duration: float, what: str) -> Parameter:
-    """Return a time that removes an effect at 0 [s]; an ordinary one is a sampling interval."""
-    return Parameter(name, 0.0, "s", (0.0, 0.1 * duration), what, scale=sample)
-
-
-#: Steps of a time, in sampling intervals, at which lags and delays are looked for.
-TIME_STEPS = (0.0, 5.0, 20.0, 60.0)
+    return Parameter("size", 0.0, unit, (low, most), what, scale=ORDINARY * size)

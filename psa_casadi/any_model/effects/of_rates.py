@@ -1,7 +1,5 @@
 """Effects in the rate of a state, and the table of all effects of a model."""
 
-from collections.abc import Sequence
-
 import casadi as ca
 
 from psa_casadi.any_model.effects.attached import (
@@ -9,12 +7,13 @@ from psa_casadi.any_model.effects.attached import (
     ORDINARY,
     Attached,
     Own,
+    Terms,
     at_port,
-    gain_of,
     rounded,
     scale_of,
+    size_of,
 )
-from psa_casadi.any_model.effects.of_signals import angle_of, bent, beyond, level_of, signal_effects
+from psa_casadi.any_model.effects.of_signals import ANGLE, bent, beyond, level_of, signal_effects
 from psa_casadi.any_model.predict import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.model.compose import Model
@@ -31,25 +30,17 @@ _STIFF, _CORNER = 1e4, 0.005
 
 def rate_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
     """Return the effects in the rate of one state of a model."""
-    seen = _seen_by(model, port.variable)
-    found = [make(model, port, sizes) for make in (_constant, _loss, _friction, _drag)]
-    found += [make(model, port, sizes, n) for n in seen for make in (_curve, _stop)]
-    ways = _ways(model, port.variable, seen)
-    return (*found, *(_hysteresis(model, port, sizes, n) for n in ways))
-
-
-def _seen_by(model: Model, state: str) -> list[str]:
-    """Return the states that a state's rate depends on, and itself."""
-    rate = model.structure.xdot[model.state_names.index(state)]
-    found = {q.name() for q in ca.symvar(rate)}
+    state = port.variable
+    found = {q.name() for q in ca.symvar(model.structure.xdot[model.state_names.index(state)])}
     base = [q.name for c in model.components if c.gain is None for q in c.states]
-    return [n for n in base if n in found or n == state]
-
-
-def _ways(model: Model, state: str, seen: Sequence[str]) -> list[str]:
-    """Return the states along which a hysteresis may work: positions, else all that is seen."""
-    positions = [n for n in seen if n != state and _speed(model, n) is not None]
-    return positions or list(seen)
+    seen = [n for n in base if n in found or n == state]  # what the rate depends on, and itself
+    # a hysteresis works along positions, else along all that is seen
+    ways = [n for n in seen if n != state and _speed(model, n) is not None] or seen
+    return (
+        *(make(model, port, sizes) for make in (_constant, _loss, _friction, _drag)),
+        *(make(model, port, sizes, n) for n in seen for make in (_curve, _stop)),
+        *(_hysteresis(model, port, sizes, n) for n in ways),
+    )
 
 
 def _speed(model: Model, state: str) -> str | None:
@@ -59,10 +50,8 @@ def _speed(model: Model, state: str) -> str | None:
 
 
 def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
-    name = f"constant_in_{port.variable}"
-    size = sizes.rates[port.variable]
     return at_port(
-        port, name, lambda s, own: ({}, own("size")),
+        port, f"constant_in_{port.variable}", lambda s, own: own("size"),
         gain="size",
         words=(
             "a constant is missing",
@@ -70,14 +59,14 @@ def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
             "Q gains size",
             "a residual of the form of a step answer in every record",
         ),
-        parameters=(gain_of(f"{name}_size", port.unit, size, "constant part of the rate"),),
+        parameters=(size_of(port.unit, sizes.rates[port.variable], "constant part of the rate"),),
     )  # fmt: skip
 
 
 def _loss(model: Model, port: Port, sizes: Sizes) -> Attached:
-    name, v = f"loss_in_{port.variable}", port.variable
+    v = port.variable
     return at_port(
-        port, name, lambda s, own: ({}, -own("size") * getattr(s, v) / own("range")),
+        port, f"loss_in_{v}", lambda s, own: -own("size") * getattr(s, v) / own("range"),
         gain="size",
         words=(
             "it loses in proportion to its state",
@@ -86,22 +75,22 @@ def _loss(model: Model, port: Port, sizes: Sizes) -> Attached:
             "resonances are lower, and decays faster, at every level alike",
         ),
         parameters=(
-            gain_of(f"{name}_size", port.unit, sizes.rates[v], "loss at the largest state"),
-            _range(name, model, sizes, v),
+            size_of(port.unit, sizes.rates[v], "loss at the largest state"),
+            _range(model, sizes, v),
         ),
     )  # fmt: skip
 
 
 def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
-    name, v = f"friction_in_{port.variable}", port.variable
+    v = port.variable
     size = rounded(sizes.states[v])
 
-    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> Expression:
         state = getattr(s, v)
-        return {}, -own("size") * state / ca.sqrt(state**2 + own("width") ** 2)
+        return -own("size") * state / ca.sqrt(state**2 + own("width") ** 2)
 
     return at_port(
-        port, name, law,
+        port, f"friction_in_{v}", law,
         gain="size",
         words=(
             "dry friction holds against the motion",
@@ -110,11 +99,9 @@ def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
             "what stands still needs a push to move; small motions are missed most",
         ),
         parameters=(
-            gain_of(
-                f"{name}_size", port.unit, sizes.rates[v], "friction, as a rate", positive=True
-            ),
+            size_of(port.unit, sizes.rates[v], "friction, as a rate", positive=True),
             Parameter(
-                f"{name}_width", 0.02 * size, state_unit(model, v), (5e-4 * size, 0.7 * size),
+                "width", 0.02 * size, state_unit(model, v), (5e-4 * size, 0.7 * size),
                 f"{v} below which it fades", log=True, limit=True
             ),
         ),
@@ -123,14 +110,14 @@ def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
 
 
 def _drag(model: Model, port: Port, sizes: Sizes) -> Attached:
-    name, v = f"drag_in_{port.variable}", port.variable
+    v = port.variable
 
-    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> Expression:
         part = getattr(s, v) / own("range")
-        return {}, -own("size") * part * smooth_magnitude(part, _STILL)
+        return -own("size") * part * smooth_magnitude(part, _STILL)
 
     return at_port(
-        port, name, law,
+        port, f"drag_in_{v}", law,
         gain="size",
         words=(
             "it loses with the square of its state",
@@ -139,20 +126,16 @@ def _drag(model: Model, port: Port, sizes: Sizes) -> Attached:
             "damping that grows with the level",
         ),
         parameters=(
-            gain_of(f"{name}_size", port.unit, sizes.rates[v], "loss at the largest state"),
-            _range(name, model, sizes, v),
+            size_of(port.unit, sizes.rates[v], "loss at the largest state"),
+            _range(model, sizes, v),
         ),
     )  # fmt: skip
 
 
 def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
-    name = f"curve_of_{x}_in_{port.variable}"
-
-    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
-        return {}, own("size") * bent(getattr(s, x) / own("range"), own("angle"))
-
     return at_port(
-        port, name, law,
+        port, f"curve_of_{x}_in_{port.variable}",
+        lambda s, own: own("size") * bent(getattr(s, x) / own("range"), own("angle")),
         gain="size",
         words=(
             f"it depends on {x} along a curve",
@@ -161,29 +144,25 @@ def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
             "resonances move with the level; harmonics",
         ),
         parameters=(
-            gain_of(
-                f"{name}_size", port.unit, sizes.rates[port.variable],
-                "deviation from the line at the range's end"
+            size_of(
+                port.unit, sizes.rates[port.variable], "deviation from the line at the range's end"
             ),
-            angle_of(f"{name}_angle"),
-            _range(name, model, sizes, x),
+            ANGLE,
+            _range(model, sizes, x),
         ),
         probe={"angle": ANGLES},
     )  # fmt: skip
 
 
 def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
-    name = f"stop_of_{x}_in_{port.variable}"
     force, size = sizes.rates[port.variable], rounded(sizes.states[x])
 
-    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> Expression:
         excess = beyond(getattr(s, x), own("level"), _CORNER * own("range"))
-        return {}, -own("size") * excess / own("range")
+        return -own("size") * excess / own("range")
 
     return at_port(
-        port,
-        name,
-        law,
+        port, f"stop_of_{x}_in_{port.variable}", law,
         gain="size",
         words=(
             f"a stop or an overflow holds {x} at a level",
@@ -193,18 +172,14 @@ def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
         ),
         parameters=(
             Parameter(
-                f"{name}_size",
-                0.0,
-                port.unit,
-                (0.0, _STIFF * force),
-                "force of the stop, as a rate, at one range beyond it",
-                scale=force,
+                "size", 0.0, port.unit, (0.0, _STIFF * force),
+                "force of the stop, as a rate, at one range beyond it", scale=force,
             ),
-            level_of(f"{name}_level", 0.8, (0.02, 2.0), size, state_unit(model, x)),
-            _range(name, model, sizes, x),
+            level_of(0.8, (0.02, 2.0), size, state_unit(model, x)),
+            _range(model, sizes, x),
         ),
         probe={"level": tuple(share * size for share in (0.5, 0.7, 0.85, 0.95))},
-    )
+    )  # fmt: skip
 
 
 def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
@@ -212,11 +187,11 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
 
     w = x'/range and r = z, so that the loop's own way is one range where loss and bend are 1.
     """
-    name, speed = f"hysteresis_of_{x}_in_{port.variable}", _speed(model, x)
-    reads = () if speed else tuple(p for p in ports_of(model) if _is_rate(p, x))
-    fastest = sizes.rates[x]
+    speed, force = _speed(model, x), sizes.rates[port.variable]
+    rates = (p for p in ports_of(model) if p.kind == "rate" and p.variable == x)
+    reads = () if speed else tuple(rates)
 
-    def law(s: Symbols, own: Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, own: Own) -> Terms:
         rate = getattr(s, speed) if speed else getattr(s, reads[0].balance)
         w, z = rate / own("range"), own("state")
         size = smooth_magnitude(w, _STILL * own("rate") / own("range"))
@@ -225,7 +200,7 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
         return {"state": der}, -own("size") * z
 
     return at_port(
-        port, name, law,
+        port, f"hysteresis_of_{x}_in_{port.variable}", law,
         gain="size",
         words=(
             f"it depends on the way that {x} came",
@@ -234,43 +209,24 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
             "loops that stay open however slow the motion, and rest where it rests",
         ),
         parameters=(
-            _force(f"{name}_size", port, sizes),
             Parameter(
-                f"{name}_loss", 1.0, "1", (1e-3, 1e3), "how fast the loop turns", log=True
+                "size", 0.0, port.unit, (-LARGEST * force, LARGEST * force),
+                "slope of the loop's part, as a rate", scale=3 * ORDINARY * force,
             ),
-            Parameter(
-                f"{name}_bend", 0.0, "1", (-500.0, 500.0), "how the loop bends", scale=0.3
-            ),
-            Parameter(
-                f"{name}_n", 1.0, "1", (0.2, 8.0), "sharpness of the loop's turns", log=True
-            ),
-            _range(name, model, sizes, x),
-            scale_of(
-                f"{name}_rate", fastest, rate_unit(state_unit(model, x)), f"rate of {x}"
-            ),
+            Parameter("loss", 1.0, "1", (1e-3, 1e3), "how fast the loop turns", log=True),
+            Parameter("bend", 0.0, "1", (-500.0, 500.0), "how the loop bends", scale=0.3),
+            Parameter("n", 1.0, "1", (0.2, 8.0), "sharpness of the loop's turns", log=True),
+            _range(model, sizes, x),
+            scale_of("rate", sizes.rates[x], rate_unit(state_unit(model, x)), f"rate of {x}"),
         ),
-        states=(
-            State(f"{name}_state", "1", "memory of the way", 0.5, memory=True, settles=False),
-        ),
+        states=(State("state", "1", "memory of the way", 0.5, memory=True, settles=False),),
         probe={"loss": (0.3, 1.0, 4.0, 16.0)},
         reads=reads,
     )  # fmt: skip
 
 
-def _force(name: str, port: Port, sizes: Sizes) -> Parameter:
-    size = sizes.rates[port.variable]
-    return Parameter(
-        name, 0.0, port.unit, (-LARGEST * size, LARGEST * size), "slope of the loop's part, as a"
-        " rate", scale=3 * ORDINARY * size,
-    )  # fmt: skip
-
-
-def _is_rate(port: Port, state: str) -> bool:
-    return port.kind == "rate" and port.variable == state
-
-
-def _range(name: str, model: Model, sizes: Sizes, x: str) -> Parameter:
-    return scale_of(f"{name}_range", sizes.states[x], state_unit(model, x), x)
+def _range(model: Model, sizes: Sizes, x: str) -> Parameter:
+    return scale_of("range", sizes.states[x], state_unit(model, x), x)
 
 
 def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:

@@ -5,20 +5,19 @@ the output before its sensor.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 
 from psa_casadi.any_model.effects.attached import (
-    TIME_STEPS,
     Attached,
     Own,
+    Terms,
     at_port,
-    gain_of,
-    plain_gain,
     rounded,
     scale_of,
-    time_of,
+    size_of,
 )
 from psa_casadi.any_model.predict import Sizes
 from psa_casadi.component import Expression, Symbols
@@ -32,8 +31,15 @@ _CORNER, _SHARPEST, _ROUNDEST = 0.01, 1e-4, 0.1
 #: Smallest time of a filter over the sampling interval: keeps it defined at a time of 0.
 _FLOOR = 0.02
 
-#: As `Law`, with the signal's value: (symbols, signal, its own by short name) -> derivatives, term.
-_Law = Callable[[Symbols, Expression, Own], tuple[dict[str, Expression], Expression]]
+#: Steps of a time, in sampling intervals, at which lags and delays are looked for.
+_STEPS = (0.0, 5.0, 20.0, 60.0)
+#: The form of a curve.
+ANGLE = Parameter(
+    "angle", 0.0, "rad", (-2.0 * ca.pi, 2.0 * ca.pi), "form of the curve: 0 quadratic, pi/2 cubic",
+    scale=0.3,
+)  # fmt: skip
+#: As `Law`, with the signal's value: (symbols, signal, its own by short name) -> term, or both.
+_Law = Callable[[Symbols, Expression, Own], Terms | Expression]
 
 
 def signal_effects(port: Port, sizes: Sizes) -> tuple[Attached, ...]:
@@ -61,9 +67,7 @@ def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
 
 
 def _lag(port: Port, sizes: Sizes) -> Attached:
-    name, floor = f"lag_of_{port.variable}", _FLOOR * sizes.sample
-
-    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, q: Expression, own: Own) -> Terms:
         time, behind = own("time") + own("floor"), own("state") - q
         return {"state": -behind / time}, own("time") / time * behind
 
@@ -76,24 +80,20 @@ def _lag(port: Port, sizes: Sizes) -> Attached:
             "T Q' + Q = q",
             "the residual follows the signal's rate; the roll-off grows with frequency",
         ),
-        parameters=(
-            time_of(f"{name}_time", sizes.sample, sizes.duration, "time constant"),
-            _floor(f"{name}_floor", floor),
-        ),
-        states=(State(f"{name}_state", port.unit, "behind the lag", _size(port, sizes)),),
-        finite_step=TIME_STEPS,
+        parameters=_times(sizes, "time constant"),
+        states=(State("state", port.unit, "behind the lag", _size(port, sizes)),),
+        finite_step=_STEPS,
     )  # fmt: skip
 
 
 def _delay(port: Port, sizes: Sizes) -> Attached:
-    name, size = f"delay_of_{port.variable}", _size(port, sizes)
-
-    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
+    def law(s: Symbols, q: Expression, own: Own) -> Terms:
         half, floor = own("time") / 2, own("floor")
         a1, b1, first = pade_section(half, floor, q, own("a1"), own("b1"))
         a2, b2, second = pade_section(half, floor, first, own("a2"), own("b2"))
         return {"a1": a1, "b1": b1, "a2": a2, "b2": b2}, second - q
 
+    size = _size(port, sizes)
     return _made(
         port, "delay", law,
         gain="time",
@@ -103,27 +103,19 @@ def _delay(port: Port, sizes: Sizes) -> Attached:
             "Q(t) = q(t - T)",
             "phase linear in frequency at unchanged size",
         ),
-        parameters=(
-            time_of(f"{name}_time", sizes.sample, sizes.duration, "delay"),
-            _floor(f"{name}_floor", _FLOOR * sizes.sample),
-        ),
+        parameters=_times(sizes, "delay"),
         states=tuple(
-            State(f"{name}_{short}", port.unit, f"filter of section {short[1]}", size)
-            for short in ("a1", "b1", "a2", "b2")
+            State(name, port.unit, f"filter of section {name[1]}", size)
+            for name in ("a1", "b1", "a2", "b2")
         ),
-        finite_step=TIME_STEPS,
+        finite_step=_STEPS,
     )  # fmt: skip
 
 
 def _bend(port: Port, sizes: Sizes) -> Attached:
-    name, size = f"bend_of_{port.variable}", _size(port, sizes)
-
-    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
-        part = q / own("range")
-        return {}, own("size") * bent(part, own("angle"))
-
+    size = _size(port, sizes)
     return _made(
-        port, "bend", law,
+        port, "bend", lambda s, q, own: own("size") * bent(q / own("range"), own("angle")),
         gain="size",
         words=(
             "its gain depends on its level",
@@ -132,22 +124,19 @@ def _bend(port: Port, sizes: Sizes) -> Attached:
             "harmonics that grow with the level, at every frequency alike",
         ),
         parameters=(
-            gain_of(f"{name}_size", port.unit, size, "deviation from the line at the range's end"),
-            angle_of(f"{name}_angle"),
-            scale_of(f"{name}_range", size, port.unit, port.variable),
+            size_of(port.unit, size, "deviation from the line at the range's end"),
+            ANGLE,
+            scale_of("range", size, port.unit, port.variable),
         ),
         probe={"angle": ANGLES},
     )  # fmt: skip
 
 
 def _saturation(port: Port, sizes: Sizes) -> Attached:
-    name, size = f"saturation_of_{port.variable}", _size(port, sizes)
-
-    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
-        return {}, -own("gain") * beyond(q, own("level"), own("corner"))
-
+    size = _size(port, sizes)
     return _made(
-        port, "saturation", law,
+        port, "saturation",
+        lambda s, q, own: -own("gain") * beyond(q, own("level"), own("corner")),
         gain="gain",
         words=(
             "it goes no further than a level, to either side",
@@ -156,22 +145,20 @@ def _saturation(port: Port, sizes: Sizes) -> Attached:
             "flat tops at one level",
         ),
         parameters=(
-            plain_gain(f"{name}_gain", "share of the excess that is lost"),
-            level_of(f"{name}_level", 0.7, (0.05, 1.2), size, port.unit),
-            _corner(f"{name}_corner", size, port.unit),
+            Parameter("gain", 0.0, "1", (0.0, 1.0), "share of the excess that is lost", scale=0.1),
+            level_of(0.7, (0.05, 1.2), size, port.unit),
+            _corner(size, port.unit),
         ),
         probe={"level": tuple(share * size for share in (0.4, 0.6, 0.75, 0.9))},
     )  # fmt: skip
 
 
 def _dead_zone(port: Port, sizes: Sizes) -> Attached:
-    name, size = f"dead_zone_of_{port.variable}", _size(port, sizes)
-
-    def law(s: Symbols, q: Expression, own: Own) -> tuple[dict[str, Expression], Expression]:
-        return {}, -own("gain") * (q - beyond(q, own("level"), own("corner")))
-
+    size = _size(port, sizes)
+    lost = "share of the small values that is lost"
     return _made(
-        port, "dead_zone", law,
+        port, "dead_zone",
+        lambda s, q, own: -own("gain") * (q - beyond(q, own("level"), own("corner"))),
         gain="gain",
         words=(
             "small values of it do nothing",
@@ -180,18 +167,18 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
             "nothing moves about zero, and all else is offset by the zone's width",
         ),
         parameters=(
-            plain_gain(f"{name}_gain", "share of the small values that is lost"),
-            level_of(f"{name}_level", 0.1, (2e-3, 0.9), size, port.unit),
-            _corner(f"{name}_corner", size, port.unit),
+            Parameter("gain", 0.0, "1", (0.0, 1.0), lost, scale=0.1),
+            level_of(0.1, (2e-3, 0.9), size, port.unit),
+            _corner(size, port.unit),
         ),
         probe={"level": tuple(share * size for share in (0.04, 0.1, 0.25))},
     )  # fmt: skip
 
 
 def _zero(port: Port, sizes: Sizes) -> Attached:
-    name = f"zero_of_{port.variable}"
+    shift = replace(size_of(port.unit, _size(port, sizes), "shift of the zero"), name="shift")
     return _made(
-        port, "zero", lambda s, q, own: ({}, own("shift")),
+        port, "zero", lambda s, q, own: own("shift"),
         gain="shift",
         words=(
             "its zero is shifted",
@@ -199,14 +186,13 @@ def _zero(port: Port, sizes: Sizes) -> Attached:
             "Q = q + shift",
             "a constant residual in all records",
         ),
-        parameters=(gain_of(f"{name}_shift", port.unit, _size(port, sizes), "shift of the zero"),),
+        parameters=(shift,),
     )  # fmt: skip
 
 
 def _drift(port: Port, sizes: Sizes) -> Attached:
-    name = f"drift_of_{port.variable}"
     return _made(
-        port, "drift", lambda s, q, own: ({}, own("size") * s.time / own("duration")),
+        port, "drift", lambda s, q, own: own("size") * s.time / own("duration"),
         gain="size",
         words=(
             "its zero drifts with time",
@@ -215,8 +201,8 @@ def _drift(port: Port, sizes: Sizes) -> Attached:
             "a residual that grows with time whatever the inputs do",
         ),
         parameters=(
-            gain_of(f"{name}_size", port.unit, _size(port, sizes), "drift over the duration"),
-            scale_of(f"{name}_duration", sizes.duration, "s", "time"),
+            size_of(port.unit, _size(port, sizes), "drift over the duration"),
+            scale_of("duration", sizes.duration, "s", "time"),
         ),
     )  # fmt: skip
 
@@ -226,33 +212,28 @@ def bent(part: Expression, angle: Expression) -> Expression:
     return ca.cos(angle) * part**2 + ca.sin(angle) * part**3
 
 
-def angle_of(name: str) -> Parameter:
-    """Return the parameter of the curve's form."""
-    most = 2.0 * ca.pi
-    words = "form of the curve: 0 quadratic, pi/2 cubic"
-    return Parameter(name, 0.0, "rad", (-most, most), words, scale=0.3)
-
-
 def beyond(q: Expression, level: Expression, width: Expression) -> Expression:
     """Return by how much q is above +level or below -level, with corners rounded over a width."""
     above, below = (width * softplus((side * q - level) / width) for side in (1, -1))
     return above - below
 
 
-def level_of(
-    name: str, value: float, bounds: tuple[float, float], size: float, unit: str
-) -> Parameter:
+def level_of(value: float, bounds: tuple[float, float], size: float, unit: str) -> Parameter:
     """Return the parameter of a level, from its value and bounds over the size of its signal."""
     low, high = (bound * size for bound in bounds)
-    return Parameter(name, value * size, unit, (low, high), "level", scale=0.05 * size)
+    return Parameter("level", value * size, unit, (low, high), "level", scale=0.05 * size)
 
 
-def _corner(name: str, size: float, unit: str) -> Parameter:
+def _corner(size: float, unit: str) -> Parameter:
     bounds = (_SHARPEST * size, _ROUNDEST * size)
     words = "width over which the corner at the level is rounded"
-    return Parameter(name, _CORNER * size, unit, bounds, words, log=True, limit=True)
+    return Parameter("corner", _CORNER * size, unit, bounds, words, log=True, limit=True)
 
 
-def _floor(name: str, value: float) -> Parameter:
-    words = "smallest time of the filter, a scale only"
-    return Parameter(name, rounded(value), "s", (0.0, float("inf")), words, fitted=False)
+def _times(sizes: Sizes, what: str) -> tuple[Parameter, Parameter]:
+    """Return a time that removes an effect at 0 [s], and what keeps its filter defined there."""
+    floor, words = rounded(_FLOOR * sizes.sample), "smallest time of the filter, a scale only"
+    return (
+        Parameter("time", 0.0, "s", (0.0, 0.1 * sizes.duration), what, scale=sizes.sample),
+        Parameter("floor", floor, "s", (0.0, float("inf")), words, fitted=False),
+    )

@@ -14,8 +14,9 @@ inflation by the noise's colour. The evidence of all samples is the product of t
 are held out whole judge alone: of these the score has no L. The price is the prior of a cause.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +25,8 @@ from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus, residual_colour, rms
 from psa_casadi.diagnosis.held_out import (
     held_out_further,
+    held_out_gain,
     held_out_rms,
-    output_gain,
     whole_residuals,
 )
 from psa_casadi.diagnosis.noise import knowable_of, known_colour
@@ -43,6 +44,7 @@ from psa_casadi.diagnosis.task import LIMITS, Task, Thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import with_column
+from psa_casadi.identification.fitting.unknowns import Fitted
 from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.start import linear_part
@@ -128,60 +130,76 @@ def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
     return root
 
 
+class Explanation(Protocol):
+    """What a scale needs of a hypothesis: its causes, and the fit with them."""
+
+    @property
+    def causes(self) -> tuple[Component, ...]:
+        """Its causes."""
+
+    @property
+    def fit(self) -> Fitted:
+        """The fit with them."""
+
+
+H = TypeVar("H", bound=Explanation)
+
+
+def _nothing(_of: object, _before: object, _colour: Colour) -> float:
+    return 0.0
+
+
 @dataclass(frozen=True, eq=False)
-class Scale:
+class Scale(Generic[H]):
     """What hypotheses are compared by: the plain base, the colour of the noise, the limits.
 
-    `held` is the number of held-out samples; they choose between hypotheses, or `judge_only`.
+    `by_held_out` is ln of what one hypothesis gives the held-out samples over what another one
+    does; they choose between hypotheses, or `judge_only`.
     """
 
-    base: Hypothesis
+    base: H
     colour: Colour
     limits: Thresholds
-    held: int = 0
+    by_held_out: Callable[[H, H, Colour], float] = _nothing
     judge_only: bool = False
-    _known: dict[Fit, float] = field(init=False, default_factory=dict)
+    _known: dict[Fitted, float] = field(init=False, default_factory=dict)
 
-    def evidence(self, of: Hypothesis) -> float:
+    def evidence(self, of: H) -> float:
         """Ln B, of the fitted samples alone; more modes than one have their price here."""
         if of.fit not in self._known:
             self._known[of.fit] = evidence(self.base.fit, of.fit, self.colour)
         return self._known[of.fit] - self.limits.price * sum(c.count - 1 for c in of.causes)
 
-    def held_out(self, of: Hypothesis, before: Hypothesis) -> float:
+    def held_out(self, of: H, before: H) -> float:
         """Ln of what one hypothesis gives the held-out samples over what another one does."""
-        if not self.held:
-            return 0.0
-        samples = self.held / self.colour.inflation
-        gained = output_gain(samples, before.holdout_rms, of.holdout_rms)
-        rows = zip(
-            of.fit.further, self.colour.further, before.held_further, of.held_further, strict=True
-        )
-        return gained + sum(
-            output_gain(self.held / own.inflation, old, new, f.straight)
-            for f, own, old, new in rows
-        )
+        return self.by_held_out(of, before, self.colour)
 
-    def gain(self, of: Hypothesis, before: Hypothesis) -> float:
+    def gain(self, of: H, before: H) -> float:
         """Ln of the Bayes factor of one hypothesis over another one, of all samples that choose."""
         held_out = 0.0 if self.judge_only else self.held_out(of, before)
         return self.evidence(of) - self.evidence(before) + held_out
 
-    def score(self, of: Hypothesis) -> float:
+    def score(self, of: H) -> float:
         """Ln of the Bayes factor over the plain base, less the price of the causes."""
         return self.gain(of, self.base) - self.limits.price * len(of.causes)
 
-    def of_fitted(self, of: Hypothesis) -> float:
+    def of_fitted(self, of: H) -> float:
         """The score of the fitted samples alone."""
         return self.evidence(of) - self.limits.price * len(of.causes)
 
 
 def scale_of(
     base: Hypothesis, colour: Colour, limits: Thresholds, experiments: Sequence[Experiment]
-) -> Scale:
+) -> Scale[Hypothesis]:
     """Return the scale of a search; blocks of fitted records choose, whole records judge alone."""
     held = sum(int(e.held_out.sum()) for e in experiments)
-    return Scale(base, colour, limits, held, any(e.held_out_whole for e in experiments))
+
+    def gained(of: Hypothesis, before: Hypothesis, colour: Colour) -> float:
+        straight = [0.0, *(f.straight for f in of.fit.further)]
+        errors = [(h.holdout_rms, *h.held_further) for h in (before, of)]
+        return held_out_gain([held] * len(straight), colour, straight, *errors) if held else 0.0
+
+    return Scale(base, colour, limits, gained, any(e.held_out_whole for e in experiments))
 
 
 #: So many starts each effect gets.
@@ -189,14 +207,14 @@ _STARTS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Look(Generic[H]):
     """What the residual of a hypothesis shows.
 
     `of` is the hypothesis as it was seen, `trials` the directions of further effects there,
     `screening` their scores with the colour of the noise, `test` the omnibus test.
     """
 
-    of: Hypothesis
+    of: H
     trials: tuple[Direction, ...]
     screening: Screening
     test: Omnibus
@@ -205,25 +223,6 @@ class View:
     def decrease(self) -> float:
         """Decrease of the whitened sum of squares along the best direction, over the variance."""
         return max((s.decrease for s in self.screening.scores), default=0.0)
-
-    @property
-    def promise(self) -> float:
-        """Power [m^2] that the best direction would remove, linearly estimated."""
-        return self.decrease * self.screening.colour.level**2 / len(self.of.fit.residuals)
-
-    @property
-    def shows(self) -> bool:
-        """Whether a direction is above the threshold and would remove what can be told of a stack.
-
-        Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
-        """
-        seen = self.decrease >= self.screening.threshold and self.promise > self.test.knowable**2
-        return seen and (self.test.alarm or not self.of.causes)
-
-    @property
-    def leaves(self) -> bool:
-        """Whether anything is left to explain."""
-        return self.test.alarm or self.shows
 
     def estimated(self) -> dict[str, float]:
         """Evidence of every further effect over this hypothesis, without a fit."""
@@ -260,6 +259,29 @@ class View:
             if new and score not in starts and len(starts) < _STARTS:
                 starts.append(score)
         return starts
+
+
+class View(Look[Hypothesis]):
+    """What the residual of a stack's hypothesis shows."""
+
+    @property
+    def promise(self) -> float:
+        """Power [m^2] that the best direction would remove, linearly estimated."""
+        return self.decrease * self.screening.colour.level**2 / len(self.of.fit.residuals)
+
+    @property
+    def shows(self) -> bool:
+        """Whether a direction is above the threshold and would remove what can be told of a stack.
+
+        Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
+        """
+        seen = self.decrease >= self.screening.threshold and self.promise > self.test.knowable**2
+        return seen and (self.test.alarm or not self.of.causes)
+
+    @property
+    def leaves(self) -> bool:
+        """Whether anything is left to explain."""
+        return self.test.alarm or self.shows
 
 
 @stage("screening")
@@ -344,7 +366,7 @@ _SHARP, _WIDTHS = 0.05, 2.0
 
 
 def held_out_confirms(
-    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale
+    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale[Hypothesis]
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 

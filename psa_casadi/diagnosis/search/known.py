@@ -11,6 +11,7 @@ from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
+    Scale,
     View,
     another_minimum,
     examine,
@@ -55,7 +56,8 @@ class Known:
         first = examine(root, task)
         self.trials = first.trials
         own = scale_of(root, first.screening.colour, task.limits, task.experiments)
-        self.scale = replace(own, held=0) if "held out" in task.method.without else own
+        alone = Scale(root, own.colour, own.limits, judge_only=own.judge_only)
+        self.scale = alone if "held out" in task.method.without else own
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}

@@ -125,7 +125,7 @@ def _view(found: Known, h: Hypothesis, task: Task) -> View:
     own = found.views.get(h.names)
     if own is None or own.of.fit is not h.fit:
         found.views[h.names] = own = examine(h, task, found.trials)
-    return own if own.of is h else replace(own, of=h)
+    return own if own.of is h else View(h, own.trials, own.screening, own.test)
 
 
 def _step(found: Known, task: Task, view: View, chosen: Hypothesis | None) -> Step:
