@@ -96,8 +96,7 @@ class _Page:
 
     def scripts(self) -> list[Markup]:
         """Return the scripts that the page runs."""
-        found = [source("packed.js")] if self._plots or self._alive else []
-        found += [source("page.js")] if self._plots or self._alive else []
+        found = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
         found += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
         return [Markup(text) for text in found]
 
@@ -143,16 +142,15 @@ def _words(value: Any) -> Any:
 
 def _column_styles(table: Table) -> list[str]:
     """Return the style of every column: figures, hashes, long texts, or none."""
-    return [_column_style(c) for c in zip(*table.rows, strict=True)] or [""] * len(table.head)
-
-
-def _column_style(cells: tuple[str, ...]) -> str:
-    filled = [c for c in cells if c]
-    if filled and all(_FIGURE.fullmatch(c) for c in filled):
-        return "figure"
-    if filled and all(_HASH.fullmatch(c) for c in filled):
-        return "hash"
-    return "wide" if any(len(c) > _WIDE for c in filled) else ""
+    styles = []
+    for column in zip(*table.rows, strict=True):
+        cells = [c for c in column if c]
+        style = "wide" if any(len(c) > _WIDE for c in cells) else ""
+        for name, pattern in (("hash", _HASH), ("figure", _FIGURE)):
+            if cells and all(pattern.fullmatch(c) for c in cells):
+                style = name
+        styles.append(style)
+    return styles or [""] * len(table.head)
 
 
 def _still_picture(figure: Figure) -> str:

@@ -246,6 +246,10 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
     Each parameter has `unit`, in which a page shows it, with `factor` and `shift`: shown = factor *
     value + shift; and the ends of its slider.
     """
+    try:
+        file = dumps(model)
+    except InputError:  # no file holds such a model
+        file = None
     shown, s, known = output_of(model), model.structure, determined(model)
     nominals = dict(zip(model.output_names, model.output_nominals(), strict=True))
     return {
@@ -261,16 +265,8 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         "shown": shown,
         "shown_nominal": 0.0 if shown is None else float(nominals[shown]),
         "starts_itself": model.starts_itself,
-        "file": _file(model),
+        "file": file,
     }
-
-
-def _file(model: Model) -> str | None:
-    """Return MODEL.json, None for a model that no file holds."""
-    try:
-        return dumps(model)
-    except InputError:
-        return None
 
 
 def _variable(v: State | Output) -> dict[str, Any]:

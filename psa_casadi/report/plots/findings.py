@@ -218,7 +218,13 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
             plot.bars([x for _, x in group], names, degree, _DEGREE_COLOURS[degree], width=0.66,
                       hovertemplate="%{y}: %{x:.3g} %<extra></extra>")  # fmt: skip
     colours = [NOISE_COLOUR if g.degree == "fixed" else INK for g in rows]
-    plot.texts([right / 1.15] * len(rows), [g.name for g in rows], [_error_text(g) for g in rows],
+    figures = [
+        "fixed" if g.degree == "fixed"
+        else f"{phrases.number(100.0 * g.error, 2)} %" if g.error <= _LONGEST / 100.0
+        else f"> {_LONGEST:.0f} %"
+        for g in rows
+    ]  # fmt: skip
+    plot.texts([right / 1.15] * len(rows), [g.name for g in rows], figures,
                "middle left", textfont={"color": colours})  # fmt: skip
     plot.upright(100.0 * WEAK_ERROR).upright(50.0, dash="dash")
     return plot.axes(
@@ -228,14 +234,6 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
          "showgrid": False, "ticks": "", "automargin": True, "range": [-0.6, len(rows) - 0.4]},
         barmode="overlay", margin={"l": 20, "r": 10, "t": 46, "b": 46},
     )  # fmt: skip
-
-
-def _error_text(grade: Grade) -> str:
-    if grade.degree == "fixed":
-        return "fixed"
-    if not grade.error <= _LONGEST / 100.0:
-        return f"> {_LONGEST:.0f} %"
-    return f"{phrases.number(100.0 * grade.error, 2)} %"
 
 
 def correlation_plot(found: Identification) -> Panel:
