@@ -8,8 +8,8 @@ import pytest
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.report.page import results
-from psa_casadi.report.plots.panel import DARK
 from psa_casadi.report.plots.records import time_plot
+from psa_casadi.report.words import colours
 from psa_casadi.report.words.fit_words import (
     determined_sentence,
     error_bar_note,
@@ -83,7 +83,7 @@ def test_every_colour_of_a_plot_has_a_counterpart_at_night(text: str, tmp_path: 
     for page in (text, other):
         used = set(re.findall(r'"(#[0-9a-fA-F]{3,8})"', str(figures(page)).replace("'", '"')))
         assert used
-        assert used <= set(DARK)
+        assert used <= set(colours.DARK)
 
 
 def test_parameters_are_graded_as_the_determinacy_says() -> None:

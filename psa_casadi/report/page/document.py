@@ -24,8 +24,8 @@ from plotly.offline import get_plotlyjs
 
 from psa_casadi.characters import plain
 from psa_casadi.command_line import typed
-from psa_casadi.report.plots.panel import DARK, Panel, plotly_figure
-from psa_casadi.report.words import phrases
+from psa_casadi.report.plots.panel import Panel, plotly_figure
+from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
 
@@ -115,10 +115,11 @@ class _Page:
         """Return what all plots take: colours at night, the arrays, the library that draws them."""
         if not (self._plots or self._alive):
             return Markup("")
-        colours = f'<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
+        dark = json.dumps(colours.DARK)
+        first = f'<script type="application/json" id="dark-colours">{dark}</script>'
         held = {"arrays": packed(" ".join(self._arrays).encode()), "library": _library()[0]}
         rows = (f'<script type="application/gzip" id="{n}">{t}</script>' for n, t in held.items())
-        return Markup(colours + "".join(rows))
+        return Markup(first + "".join(rows))
 
 
 @cache

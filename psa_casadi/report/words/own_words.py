@@ -10,7 +10,7 @@ from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
-from psa_casadi.report.words import verdict_words
+from psa_casadi.report.words import colours, verdict_words
 from psa_casadi.report.words.phrases import (
     added,
     either,
@@ -24,7 +24,7 @@ from psa_casadi.report.words.phrases import (
     rest_sentence,
     with_unit,
 )
-from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, FloatArray, Series
+from psa_casadi.report.words.series import Curve, FloatArray, Series
 from psa_casadi.report.words.tables import Table
 
 #: Outputs that a sentence names one by one.
@@ -169,16 +169,16 @@ _FEWEST = 8
 def own_series(d: OdeDiagnosis) -> tuple[Series, ...]:
     """Return every measured output of every record, with the base and the extended model."""
     noise = {e.output: e.noise for e in d.errors}
-    curves = [("base model", BASE_COLOUR, d.base)]
+    curves = [("base model", colours.BASE, d.base)]
     if added(d):
-        curves.append(("extended model", EXTENDED_COLOUR, d.extended))
+        curves.append(("extended model", colours.EXTENDED, d.extended))
     return tuple(_series(d.model, d.runs, noise, curves))
 
 
 def own_fit_series(found: OdeIdentification) -> tuple[Series, ...]:
     """Return every measured output of every record, with the fitted model."""
     predicted = found.fit.predicted(found.runs)
-    curves = [("model", EXTENDED_COLOUR, predicted)]
+    curves = [("model", colours.EXTENDED, predicted)]
     return tuple(_series(found.model, found.runs, found.noise, curves))
 
 
