@@ -3,7 +3,7 @@
 import base64
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -27,6 +27,11 @@ from psa_casadi.report.words.tables import parameter_table
 from psa_casadi.report.words.text import identification_text, posterior_text, story
 from psa_casadi.simulation.simulate import Trajectory
 
+_WORDS: dict[type, Callable[..., str]] = {
+    Diagnosis: story,
+    Identification: identification_text,
+    Posterior: posterior_text,
+}
 Told = DiagnosisFile | OwnModelFile
 Reported = (
     Diagnosis | OdeDiagnosis | Identification | OdeIdentification | Population | Sequence[Finding]
@@ -105,14 +110,8 @@ def cell(result: Plotted | Model | Told) -> str:
     picture = base64.b64encode(buffer.getvalue()).decode("ascii")
     if isinstance(result, Record):
         return filled("cell.html", lines=[repr(result)], name=repr(result), picture=picture)
-    return filled("cell.html", told=_words(result), name=line(result), picture=picture)
-
-
-def _words(result: Plotted) -> str:
-    if isinstance(result, Diagnosis):
-        return story(result)
-    if isinstance(result, Identification):
-        return identification_text(result)
-    if isinstance(result, Posterior):
-        return posterior_text(result)
-    return line(result) if isinstance(result, Trajectory) else repr(result)
+    words = line(result) if isinstance(result, Trajectory) else repr(result)
+    for kind, tell in _WORDS.items():
+        if isinstance(result, kind):
+            words = tell(result)
+    return filled("cell.html", told=words, name=line(result), picture=picture)

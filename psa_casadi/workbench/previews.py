@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.records.read.apart import Head, head_of
+from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import TABLE, columns_of, parse_columns
 from psa_casadi.records.read.reading import read_records
 from psa_casadi.records.record import Record
@@ -68,25 +68,18 @@ def looked_at(
         )
     except InputError as error:
         problems = list(error.problems)
-    return {
-        "head": None if head is None else _head(head),
-        "problems": problems,
-        "record": None if record is None else _told(record),
-    }
+    found = _problem(*problems)
+    if head is not None:
+        guess = {name: [f.index, f.unit] for name, f in head.guess.items()}
+        found["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
+        found["head"]["guess"] = guess
+    if record is not None:
+        found["record"] = _told(record)
+    return found
 
 
-def _problem(sentence: str) -> dict[str, Any]:
-    return {"head": None, "problems": [sentence], "record": None}
-
-
-def _head(head: Head) -> dict[str, Any]:
-    return {
-        "names": head.names,
-        "units": head.units,
-        "rows": head.rows,
-        "guess": {name: [f.index, f.unit] for name, f in head.guess.items()},
-        "tables": head.tables,
-    }
+def _problem(*sentences: str) -> dict[str, Any]:
+    return {"head": None, "problems": list(sentences), "record": None}
 
 
 def _told(record: Record) -> dict[str, Any]:

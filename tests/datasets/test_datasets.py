@@ -13,8 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from psa_casadi import datasets
-from psa_casadi.cli.datasets import datasets as command
-from psa_casadi.cli.options import command as as_typer
+from psa_casadi.cli.app import app
 from psa_casadi.datasets import DATASETS, Dataset
 from psa_casadi.datasets.devices import Columns
 from psa_casadi.datasets.fetching import DATA_VARIABLE
@@ -24,13 +23,9 @@ TABLE = "".join(f"{k:.6f}\t9.000000\t{k * 1.8:.6f}\t{-0.5 * k:.6f}\r\n" for k in
 PART = Columns(first_row=3, rows=20, voltage=2, displacement=3, sample_rate=200.0)
 
 
-def psa(*arguments: str | Path) -> tuple[int, str, str]:
-    import typer  # noqa: PLC0415
-
-    app = typer.Typer()
-    app.command()(as_typer(command))
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
-    return result.exit_code, result.stdout, result.stderr
+def psa(*arguments: str | Path) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["datasets", *map(str, arguments)])
+    return result.exit_code, result.stdout
 
 
 @pytest.fixture
@@ -159,7 +154,7 @@ def test_the_command_lists_shows_and_writes(
     assert "micromanipulator" in psa()[1]
     assert psa("-q")[1].split() == list(DATASETS)
     assert dataset.citation in psa("small")[1]
-    code, out, _ = psa("small", "-o", tmp_path / "new" / "place")
+    code, out = psa("small", "-o", tmp_path / "new" / "place")
     assert code == 0
     assert "part.csv" in out
     kept = sorted((tmp_path / "new" / "place").iterdir())

@@ -144,6 +144,7 @@ def test_the_matlab_script() -> None:
         assert f"% {kind}s: {listed}\n" in script.text
 
 
+@slow
 @pytest.mark.parametrize("made", ["omsimulator"], indirect=True)
 def test_the_scripts_for_omsimulator_wire_what_fits(
     made: Path, monkeypatch: pytest.MonkeyPatch

@@ -5,9 +5,12 @@ import gzip
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+import psa_casadi as psa
 
 _ARRAYS = re.compile(r'<script type="application/gzip" id="arrays">(.*?)</script>')
 _SCRIPT = re.compile(r'<script type="application/json">(.*?)</script>', re.DOTALL)
@@ -64,3 +67,11 @@ def numbers(values: Any) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
         data = base64.b64decode(values["bdata"])
         return np.frombuffer(data, _DTYPES[values["dtype"]]).astype(np.float64)
     return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+
+
+def written(result: Any, folder: Path, **how: Any) -> tuple[str, Page]:
+    """Return the page of a result, without a model that runs, and what it holds."""
+    write = psa.write_fit_report if isinstance(result, psa.Identification) else psa.write_report
+    write(result, folder / "page.html", still=True, **how)
+    text = (folder / "page.html").read_text(encoding="utf-8")
+    return text, Page(text)

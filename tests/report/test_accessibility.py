@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from psa_casadi.report.page.results import write_fit_report, write_report
-from tests.report.browser import DARK, MOUSE, Browser, find_browser
+from tests.report.browser import DARK, MOUSE, Browser
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
 
@@ -28,11 +28,6 @@ SITE = (
     "python/index.html",
     "json/index.html",
 )
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
-    return find_browser(tmp_path_factory.mktemp("browser"))
 
 
 @slow

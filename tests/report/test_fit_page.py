@@ -5,14 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.errors import InputError
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.report.page import results
-from psa_casadi.report.plots.panel import DARK
 from psa_casadi.report.plots.records import time_plot
+from psa_casadi.report.words import colours
 from psa_casadi.report.words.fit_words import (
-    Grade,
     determined_sentence,
     error_bar_note,
     grades,
@@ -21,7 +19,7 @@ from psa_casadi.report.words.fit_words import (
 )
 from psa_casadi.report.words.series import compact, extremes, kept, series_of_fit
 from psa_casadi.report.words.tables import parameter_table
-from tests.report.html_page import Page, figures, numbers
+from tests.report.html_page import Page, figures, numbers, written
 from tests.report.report_cases import diagnosis, identification, long_fit
 from tests.tiers import slow, slow_but
 
@@ -30,16 +28,13 @@ pytestmark = pytest.mark.xdist_group("fit-page")
 
 @pytest.fixture(scope="module")
 def text(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("fit") / "fit.html"
     found = replace(
         identification(),
         doubts=("Tom & <Jerry> disagree.",),
         combinations=(Combination("group", ("k_L", "A")),),
         advice=(Advice("ringing", ("m_P",)),),
     )
-    results.write_fit_report(found, path, origin="synthetic", still=True)
-    assert [p.name for p in path.parent.iterdir()] == ["fit.html"]
-    return path.read_text(encoding="utf-8")
+    return written(found, tmp_path_factory.mktemp("fit"), origin="synthetic")[0]
 
 
 def test_the_page_of_a_fit_tells_all_of_it(text: str) -> None:
@@ -84,17 +79,11 @@ def test_a_model_without_fitted_parameters_has_its_page() -> None:
 
 
 def test_every_colour_of_a_plot_has_a_counterpart_at_night(text: str, tmp_path: Path) -> None:
-    results.write_report(diagnosis("cause_named"), tmp_path / "d.html", still=True)
-    other = (tmp_path / "d.html").read_text(encoding="utf-8")
+    other, _ = written(diagnosis("cause_named"), tmp_path)
     for page in (text, other):
         used = set(re.findall(r'"(#[0-9a-fA-F]{3,8})"', str(figures(page)).replace("'", '"')))
         assert used
-        assert used <= set(DARK)
-
-
-def test_a_fit_report_that_cannot_be_written_is_the_users_problem(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        results.write_fit_report(identification(), tmp_path / "absent" / "x.html", still=True)
+        assert used <= set(colours.DARK)
 
 
 def test_parameters_are_graded_as_the_determinacy_says() -> None:
@@ -128,14 +117,6 @@ def test_parameters_are_graded_as_the_determinacy_says() -> None:
     assert [rows[n] for n in ("k_L", "tau", "R_s", "c_P", "m_P")] == [
         "fit", "fit, weak", "fit, undetermined", "fit, on its bound", "not fitted",
     ]  # fmt: skip
-
-
-def test_all_determined_is_said_in_one_clause() -> None:
-    one = (Grade("k_L", 0.01, "determined"), Grade("m_P", float("nan"), "fixed"))
-    assert determined_sentence(one) == (
-        "The records determine all 1 fitted parameters to 10 % or better."
-    )
-    assert "ordinary change" not in error_bar_note(one)
 
 
 def test_pairs_that_are_known_only_together_are_named() -> None:

@@ -22,7 +22,7 @@ from psa_casadi.report.page.live import live_data, live_design, thinned
 from psa_casadi.report.page.results import write_report
 from psa_casadi.simulation.simulate import simulate_record
 from psa_casadi.variables import Interval, Parameter, Provenance
-from tests.report.browser import DARK, Browser, driven, find_browser
+from tests.report.browser import DARK, Browser, driven
 from tests.report.html_page import Page
 from tests.report.report_cases import diagnosis
 from tests.tiers import slow
@@ -30,11 +30,6 @@ from tests.tiers import slow
 pytestmark = pytest.mark.xdist_group("browser")
 
 NASTY = "<img src=x onerror=alert(1)>"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
-    return find_browser(tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from build_scripts import copied_pages, ports_page
 from build_scripts.commands_page import commands
 from build_scripts.effects_page import PICTURES, overview, section
 from build_scripts.measured_data import ROOT
-from build_scripts.schemas_page import WRITTEN_BY, kind
+from build_scripts.schemas_page import WRITTEN_BY
 from build_scripts.schemas_page import section as schema_section
 from psa_casadi.cli.app import app
 from psa_casadi.components import COMPONENTS
@@ -96,26 +96,6 @@ def test_the_page_of_json_files_holds_every_member_of_every_schema() -> None:
         assert [m for m in members if f"| `{m}` |" not in text] == []
         linked = set(re.findall(r"\]\(#([\w-]+)\)", text))
         assert linked == set(re.findall(r"\{ #([\w-]+) \}", text))
-
-
-@pytest.mark.parametrize(
-    ("schema", "words"),
-    [
-        ({"const": "x/1"}, '`"x/1"`'),
-        ({"enum": ["a", "b"]}, '`"a"`, `"b"`'),
-        ({"anyOf": [{"type": "number"}, {"type": "null"}]}, "number or null"),
-        ({"type": "array", "items": {"type": "string"}}, "list of strings"),
-        (
-            {"type": "array", "items": {"anyOf": [{"type": "string"}, {"$ref": "#/$defs/Own"}]}},
-            "list of strings or [Own](#f-own)",
-        ),
-        ({"type": "array", "items": {"$ref": "#/$defs/Cause"}}, "list of [Cause](#f-cause)"),
-        ({"type": "array", "prefixItems": [{"type": "number"}] * 2}, "[number, number]"),
-        ({"type": "object", "additionalProperties": {"type": "number"}}, "by name: number"),
-    ],
-)
-def test_what_a_value_may_be_is_told_in_words(schema: dict[str, object], words: str) -> None:
-    assert kind("f", schema) == words
 
 
 def test_the_page_of_ports_has_every_port_with_its_sign() -> None:

@@ -21,7 +21,7 @@ from psa_casadi.report.words.phrases import (
     one_unit,
     quantity,
 )
-from tests.report.html_page import Page
+from tests.report.html_page import Page, written
 from tests.report.report_cases import diagnosis, identification
 
 
@@ -47,14 +47,8 @@ def test_every_page_tells_date_version_command_and_the_records_hashes(
             assert e.record.sha256 in path.read_text(encoding="utf-8")
 
 
-def test_a_page_without_a_command_tells_none(tmp_path: Path) -> None:
-    write_design_page(tmp_path / "a.html", title="A design", summary=["It moves."])
-    assert "Command" not in Page((tmp_path / "a.html").read_text(encoding="utf-8")).text
-
-
 def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
-    diagnosis("cause_named").report(tmp_path / "a.html", still=True)
-    text = (tmp_path / "a.html").read_text("utf-8")
+    text, _ = written(diagnosis("cause_named"), tmp_path)
     held = re.findall(r'<script type="application/gzip" id="(\w+)">(.*?)</script>', text)
     assert [name for name, _ in held] == ["arrays", "library"]
     arrays, library = (gzip.decompress(base64.b64decode(data)).decode() for _, data in held)
@@ -75,19 +69,11 @@ def test_the_errors_of_a_page_have_one_unit(tmp_path: Path) -> None:
         base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
         extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
     )
-    d.report(tmp_path / "a.html", still=True)
-    text = Page((tmp_path / "a.html").read_text("utf-8")).text.replace("\u00a0", " ")
+    text = written(d, tmp_path)[1].text.replace("\u00a0", " ")
     start = text.index("Error on held-out samples")
     bars = text[start : text.index("Dashed: the noise")]
     assert "base model 2.50 µm extended model 0.0500 µm noise 0.00500 µm" in bars
     assert " nm" not in bars
-
-
-def test_a_unit_of_a_page_ends_with_it() -> None:
-    with one_unit(handy_scale(2e-6)):
-        assert length_scale(3e-9).unit == "µm"
-        assert length_scale(3e-9, counts=True).unit == "counts"
-    assert length_scale(3e-9).unit == "nm"
 
 
 def test_a_quantity_in_a_sentence_has_the_unit_of_its_page() -> None:
@@ -104,3 +90,4 @@ def test_a_quantity_in_a_sentence_has_the_unit_of_its_page() -> None:
         assert shown() == [*handy[:2], "0.06 µm", *handy[3:]]
     with one_unit(length_scale(1.0, counts=True)):
         assert shown() == handy
+    assert shown() == handy  # a unit of a page ends with it

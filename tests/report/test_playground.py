@@ -23,7 +23,7 @@ from psa_casadi.report.page.playground import playground
 from psa_casadi.simulation.compiler import run_compiler
 from psa_casadi.simulation.simulate import simulate
 from tests.model.sampled_models import controller
-from tests.report.browser import Browser, driven, find_browser, on_a_phone
+from tests.report.browser import Browser, driven, on_a_phone
 from tests.report.test_report_browser import told_of
 from tests.tiers import slow
 
@@ -95,11 +95,6 @@ setTimeout(function () {
   }, 400);
 }, 400);
 """
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
-    return find_browser(tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture(scope="module")

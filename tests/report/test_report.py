@@ -11,9 +11,7 @@ import pytest
 from psa_casadi.diagnosis.held_out import Budget, Share
 from psa_casadi.diagnosis.result import Cause, Estimate, Verdict
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport, CheckRow
-from psa_casadi.report.page.results import write_report
 from psa_casadi.report.plots.figures import save_figure
 from psa_casadi.report.plots.findings import evidence_plot
 from psa_casadi.report.words.phrases import Scale, length_scale, listing, number, plain, share_text
@@ -21,7 +19,7 @@ from psa_casadi.report.words.series import noise_density, series_of, spectrum, t
 from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
 from psa_casadi.report.words.text import check_sentence, effect_page, story
 from psa_casadi.report.words.verdict_words import cause_size, verdict_sentence
-from tests.report.html_page import Page, figures
+from tests.report.html_page import figures, written
 from tests.report.report_cases import ADDED, NOISE, diagnosis
 from tests.tiers import slow
 
@@ -46,9 +44,7 @@ def png_size(path: Path) -> tuple[int, int]:
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict) -> None:
     d = diagnosis(verdict)
-    write_report(d, tmp_path / "r.html", origin="synthetic", still=True)
-    text = (tmp_path / "r.html").read_text(encoding="utf-8")
-    page = Page(text)
+    text, page = written(d, tmp_path, origin="synthetic")
     assert page.loaded == []
     assert page.targets <= page.names
     assert not re.search(r"@import|url\(", text.split("<script>", 1)[0])
@@ -81,18 +77,10 @@ def test_the_picture_has_its_size_and_shows_something(tmp_path: Path, verdict: V
     assert [p.name for p in tmp_path.iterdir()] == ["d.png"]
 
 
-def test_a_report_that_cannot_be_written_is_the_users_problem(tmp_path: Path) -> None:
-    for write in (write_report, save_figure):
-        with pytest.raises(InputError, match="does not exist"):
-            write(diagnosis("adequate"), tmp_path / "absent" / "x")
-
-
 @slow
 def test_long_records_stay_small(tmp_path: Path) -> None:
-    write_report(
-        diagnosis("cause_named", tuple("abcdefgh"), 60_000), tmp_path / "r.html", still=True
-    )
-    assert (tmp_path / "r.html").stat().st_size < 3e6
+    text, _ = written(diagnosis("cause_named", tuple("abcdefgh"), 60_000), tmp_path)
+    assert len(text.encode()) < 3e6
 
 
 def test_the_window_shows_where_the_error_falls_most() -> None:
@@ -166,16 +154,10 @@ def test_tables_show_display_units_and_say_what_is_not_known() -> None:
     assert rows["k_L"][2:5] == ("9.90 to 10.1", "N/V", "fit")
     assert rows["m_P"][4] == "not fitted"
     assert [row[1] for row in blind_table(d).rows] == ["at no size", "0.00200 s"]
-    assert [row[0] for row in error_table(d, Scale("nm", 1e9)).rows] == [
-        "base",
-        "extended",
-        "noise",
-    ]
-    assert error_table(d, Scale("nm", 1e9)).rows[1][2] == "8.50"
-    assert [r[0] for r in error_table(diagnosis("adequate"), Scale("nm", 1e9)).rows] == [
-        "base",
-        "noise",
-    ]
+    both, one = (error_table(x, Scale("nm", 1e9)).rows for x in (d, diagnosis("adequate")))
+    assert [row[0] for row in both] == ["base", "extended", "noise"]
+    assert both[1][2] == "8.50"
+    assert [row[0] for row in one] == ["base", "noise"]
 
 
 @pytest.mark.parametrize(
@@ -212,13 +194,8 @@ def test_the_check_of_an_fmu_names_what_failed() -> None:
     good = CheckRow("units", 0.0, 0.0, True, "")
     bad = CheckRow("equations", float("nan"), 1e-9, False, "it stopped")
     report = CheckReport(Path("x.fmu"), (good, bad), compared=False)
-    assert check_table(report).rows[1] == (
-        "equations",
-        "not finite",
-        "1.00e-9",
-        "FAIL",
-        "it stopped",
-    )
+    row = check_table(report).rows[1]
+    assert " ".join(row) == "equations not finite 1.00e-9 FAIL it stopped"
     assert check_sentence(report).startswith("x.fmu did not pass: equations.")
     assert "no model" in check_sentence(report)
     assert "passed all 1 checks" in check_sentence(CheckReport(Path("x.fmu"), (good,), True))

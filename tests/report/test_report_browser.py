@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from psa_casadi.identification.advice import Advice
 from psa_casadi.report.page.results import write_fit_report, write_report
-from tests.report.browser import DARK, PHONE, Browser, find_browser, on_a_phone
+from tests.report.browser import DARK, PHONE, Browser, on_a_phone
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow, slow_but
 
@@ -21,11 +21,6 @@ pytestmark = pytest.mark.xdist_group("browser")
 
 PAGES = ("fit", "diagnosis")
 BLUE = np.array([0x00, 0x72, 0xB2]) / 255.0
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Browser:
-    return find_browser(tmp_path_factory.mktemp("browser"))
 
 
 @pytest.fixture(scope="module", params=slow_but(["diagnosis"], PAGES))

@@ -9,23 +9,16 @@ import pytest
 
 from psa_casadi.cli.diagnosis_files import models
 from psa_casadi.diagnosis.held_out import Budget, Share
-from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, Verdict
+from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
 from psa_casadi.effects import EFFECTS
-from psa_casadi.report.page.results import drawn, split_table, write_report
-from psa_casadi.report.words.misfit_words import strongest
+from psa_casadi.report.page.results import drawn, split_table
 from psa_casadi.report.words.phrases import probability_text
 from psa_casadi.report.words.tables import blindest, candidate_table
 from psa_casadi.report.words.text import story
-from tests.report.html_page import Page, figures, numbers
-from tests.report.report_cases import diagnosis, misfits, periodic, with_periodic
+from tests.report.html_page import figures, numbers, written
+from tests.report.report_cases import diagnosis, periodic, with_periodic
 
 WRONG, WHY = "What the base model gets wrong", "Why this cause"
-
-
-def page_of(d: Diagnosis, path: Path) -> tuple[str, Page]:
-    write_report(d, path / "r.html", origin="synthetic", still=True)
-    text = (path / "r.html").read_text(encoding="utf-8")
-    return text, Page(text)
 
 
 def headings(text: str) -> list[str]:
@@ -43,7 +36,7 @@ def told(d: Diagnosis) -> dict[str, str]:
 
 
 def test_the_page_tells_the_story_in_its_order(tmp_path: Path) -> None:
-    text, page = page_of(diagnosis("cause_named"), tmp_path)
+    text, page = written(diagnosis("cause_named"), tmp_path)
     assert headings(text) == [
         WRONG, WHY, "What was named", "What is gained", "What remains",
         "What these records could not have shown", "Next experiment", "Details: record by record",
@@ -64,7 +57,7 @@ def test_the_page_tells_the_story_in_its_order(tmp_path: Path) -> None:
 
 
 def test_what_the_records_do_not_determine_is_folded_away(tmp_path: Path) -> None:
-    text, _ = page_of(diagnosis("cause_named"), tmp_path)
+    text, _ = written(diagnosis("cause_named"), tmp_path)
     shown = text[text.index("Parameters of the extended model</h2>") :]
     above, folded = shown.split("<details><summary>Not determined by these records", 1)
     assert "<td>k_L</td>" in above
@@ -75,13 +68,13 @@ def test_what_the_records_do_not_determine_is_folded_away(tmp_path: Path) -> Non
 
 def test_the_view_is_drawn_before_and_after_the_extension(tmp_path: Path) -> None:
     d = diagnosis("cause_named")
-    text, _ = page_of(d, tmp_path)
+    text, _ = written(d, tmp_path)
     (view,) = [f for f in figures(text) if _names(f) == ["base model", "extended model"]
                and "error_y" in f["data"][0]][:1]  # fmt: skip
     before, after = (numbers(trace["y"]) for trace in view["data"])
     assert np.ptp(before) > 5 * np.ptp(after)
     assert np.min(numbers(view["data"][0]["error_y"]["array"])) > 0
-    base_only, _ = page_of(diagnosis("unexplained"), tmp_path)
+    base_only, _ = written(diagnosis("unexplained"), tmp_path)
     views = [f for f in figures(base_only) if f.get("data") and "error_y" in f["data"][0]]
     assert [_names(f) for f in views] == 3 * [["base model"]]
 
@@ -98,7 +91,7 @@ def test_an_effect_without_a_name_is_said_to_be_in_the_extended_model(tmp_path: 
     assert "cause" not in lines
     assert "slow creep removes 57 %" in lines["budget"]
     assert not models(d, Path("MODEL.json"))
-    text, page = page_of(d, tmp_path)
+    text, page = written(d, tmp_path)
     assert "Every effect that was tried" in headings(text)
     assert "Error on held-out samples, rms; the displacement's range is" in page.text
     assert "base model 50.0 nm extended model 8.50 nm noise 5.00 nm" in page.text
@@ -142,7 +135,7 @@ def _names(figure: dict[str, object]) -> list[str]:
 
 
 def test_the_signature_stands_beside_the_data(tmp_path: Path) -> None:
-    text, page = page_of(diagnosis("cause_named"), tmp_path)
+    text, page = written(diagnosis("cause_named"), tmp_path)
     assert "slow creep, as it looks and as the data look" in page.text
     assert EFFECTS["slow_creep"].looks_like in page.text
     assert "Simulated on the stack P-885.51 with creep_gain = 0.0300" in page.text
@@ -150,14 +143,14 @@ def test_the_signature_stands_beside_the_data(tmp_path: Path) -> None:
     assert np.ptp(numbers(signature["data"][1]["y"])) > 50
     # the record has no holds, so another view of it is shown and said to be so
     assert "No record has holds to compare" in page.text
-    text, page = page_of(diagnosis("unexplained"), tmp_path)
+    text, page = written(diagnosis("unexplained"), tmp_path)
     assert "as it looks" not in page.text
     assert headings(text)[1] == "Every effect that was tried"
 
 
 def test_parts_without_data_are_absent(tmp_path: Path) -> None:
     d = replace(diagnosis("cause_named"), misfit=(), remainder=(), noise=())
-    text, page = page_of(d, tmp_path)
+    text, page = written(d, tmp_path)
     assert WRONG not in headings(text)
     assert "Noise" not in headings(text)
     assert WHY in headings(text)
@@ -170,7 +163,7 @@ def test_parts_without_data_are_absent(tmp_path: Path) -> None:
 
 
 def test_the_harmonic_split_is_a_table_and_the_hum_a_spectrum(tmp_path: Path) -> None:
-    text, page = page_of(with_periodic(diagnosis("cause_named")), tmp_path)
+    text, page = written(with_periodic(diagnosis("cause_named")), tmp_path)
     assert "Where the error lies among the drive's harmonics: loops" in page.text
     assert "loops: spectrum of the residual" in page.text
     assert any(_names(f) == ["base model", "extended model", "noise"] and "error_y"
@@ -187,7 +180,7 @@ def test_the_harmonic_split_is_a_table_and_the_hum_a_spectrum(tmp_path: Path) ->
 
 
 def test_counts_stay_counts(tmp_path: Path) -> None:
-    _, page = page_of(with_periodic(diagnosis("cause_named"), counts=True), tmp_path)
+    _, page = written(with_periodic(diagnosis("cause_named"), counts=True), tmp_path)
     assert "base [counts rms]" in page.text
 
 
@@ -208,29 +201,11 @@ def test_the_terminal_tells_what_is_wrong_and_how_sure_the_cause_is() -> None:
     assert lines["blind to"] == "current limit and sensor delay"
 
 
-def test_only_a_named_cause_has_its_confidence_at_the_top(tmp_path: Path) -> None:
-    rows: tuple[tuple[Verdict, bool], ...] = (
-        ("partly_explained", True),
-        ("ambiguous", False),
-        ("adequate", False),
-    )
-    for verdict, shown in rows:
-        text, _ = page_of(diagnosis(verdict), tmp_path)
-        (verdict_words,) = re.findall(r'<p class="verdict">(.*?)</p>', text)
-        assert ("confidence 97" in verdict_words) is shown
-
-
 @pytest.mark.parametrize("width", range(60, 100, 3))
 def test_a_percent_sign_stays_with_its_number(width: int) -> None:
     for line in story(diagnosis("ambiguous"), width=width).splitlines():
         assert not line.strip().startswith("%")
         assert len(line) <= width
-
-
-def test_the_strongest_finding_is_that_of_the_worst_record() -> None:
-    _, drifting, quiet = misfits("plant_a", 1500)
-    assert strongest([quiet, drifting]) == drifting.findings[1]
-    assert strongest([quiet]) is None
 
 
 def test_blind_spots_are_named_the_furthest_first_and_five_at_most() -> None:
@@ -254,8 +229,8 @@ def test_probabilities_are_in_table_and_bars_where_a_cause_is_named(tmp_path: Pa
     assert table.head[-1] == "probability"
     assert [row[-1] for row in table.rows] == ["91 %", "8 %", "< 1 %"]
     assert len(candidate_table(diagnosis("unexplained")).head) == 3
-    text, page = page_of(diagnosis("cause_named"), tmp_path)
+    text, page = written(diagnosis("cause_named"), tmp_path)
     assert "1,250; named, 97 %" in text
     assert "the probability that it is the cause" in page.text
-    assert "1,250; 93 %" in page_of(diagnosis("unexplained"), tmp_path)[0]
+    assert "1,250; 93 %" in written(diagnosis("unexplained"), tmp_path)[0]
     assert probability_text(1.0) == "> 99 %"

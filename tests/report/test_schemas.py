@@ -93,16 +93,8 @@ def test_checks_are_as_their_schema_says() -> None:
     assert (content["passed"], content["fmu"]) == (False, "a.fmu")
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        {"format": "psa_casadi.check/2"},
-        {"passed": "yes"},
-        {"more": 1},
-        {"rows": [{"name": "a"}]},
-    ],
-)
-def test_what_is_otherwise_is_refused(spoil: dict[str, Any]) -> None:
-    content = {**check_file(CheckReport(Path("a.fmu"), (), compared=True)), **spoil}
-    with pytest.raises(jsonschema.ValidationError):
-        valid("check", json_text(content))
+def test_what_is_otherwise_is_refused() -> None:
+    content = check_file(CheckReport(Path("a.fmu"), (), compared=True))
+    for spoil in ({"passed": "yes"}, {"more": 1}, {"rows": [{"name": "a"}]}):
+        with pytest.raises(jsonschema.ValidationError):
+            valid("check", json_text({**content, **spoil}))

@@ -8,7 +8,7 @@ import re
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -70,14 +70,20 @@ class Tab:
         found: dict[str, Any] = json.loads(self.ask("GET", "/state")[2])
         return found
 
-    def until(self, status: str) -> dict[str, Any]:
+    def wait(self, there: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
         begun = time.monotonic()
         while time.monotonic() < begun + 60.0:
-            state = self.state()
-            if state["run"]["status"] == status:
+            if there(state := self.state()):
                 return state
             time.sleep(0.02)
         raise AssertionError(state)
+
+    def until(self, status: str) -> dict[str, Any]:
+        return self.wait(lambda state: state["run"]["status"] == status)
+
+    def searched(self) -> dict[str, Any]:
+        found: dict[str, Any] = self.wait(lambda state: state["run"]["events"])["run"]
+        return found
 
 
 @pytest.fixture
@@ -175,11 +181,7 @@ def test_a_second_tab_sees_the_same_run_and_starts_no_other(tab: Tab) -> None:
     for refused in ("/start", "/export", "/remove", "/hold", "/settings"):
         assert other.post(refused, {"key": 1}) == 409
     assert other.give("c.csv", SMALL) == 409
-    for _ in range(200):
-        run = other.state()["run"]
-        if run["events"]:
-            break
-        time.sleep(0.02)
+    run = other.searched()
     assert run["number"] == 1
     assert run["events"][0]["causes"] == []
     assert "--holdout records/b.csv --hysteresis=best --leave-out=slow_creep -o" in run["command"]
@@ -194,18 +196,14 @@ def test_a_second_tab_sees_the_same_run_and_starts_no_other(tab: Tab) -> None:
     for name in ("a.csv", "events.jsonl", "..%2Fwords.txt", "words.txt"):
         assert tab.ask("GET", f"/files/{name}")[0] == 404, name
     assert tab.post("/export") == 200
-    for _ in range(200):
-        if "extended.fmu" in tab.state()["files"]:
-            break
-        time.sleep(0.02)
+    tab.wait(lambda state: "extended.fmu" in state["files"])
     assert tab.ask("GET", "/files/extended.fmu")[2] == b"PK"
 
 
 def test_a_stopped_run_keeps_what_it_has_and_can_begin_again(tab: Tab) -> None:
     tab.give("a.csv", SMALL)
     tab.post("/start")
-    while not tab.state()["run"]["events"]:
-        time.sleep(0.02)
+    tab.searched()
     assert tab.post("/stop") == 200
     state = tab.until("stopped")
     assert set(state["files"]) == {"extended.json"}
@@ -221,8 +219,7 @@ def test_a_run_ends_with_the_server(tmp_path: Path) -> None:
         tab.give("a.csv", SMALL)
         tab.post("/start")
         tab.until("running")
-        while not tab.state()["run"]["events"]:
-            time.sleep(0.02)
+        tab.searched()
         job = desk.running()[0]
         pid = job.pid
         assert pid is not None

@@ -19,18 +19,12 @@ from psa_casadi.records.record import Record
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
-from psa_casadi.report.plots.panel import INK, Panel
-from psa_casadi.report.words import design_words
+from psa_casadi.report.plots.panel import Panel
+from psa_casadi.report.words import colours, design_words
 from psa_casadi.report.words.phrases import length_scale, number, plain
-from psa_casadi.report.words.series import (
-    BASE_COLOUR,
-    EXTENDED_COLOUR,
-    MEASURED_COLOUR,
-    NOISE_COLOUR,
-    FloatArray,
-)
+from psa_casadi.report.words.series import FloatArray
 
-_COLOURS = (EXTENDED_COLOUR, BASE_COLOUR, MEASURED_COLOUR)
+_COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
 _HEIGHT, _MOST_POINTS = 360, 4000
 #: Time shown of a move and its hold at first, over the move's; the rest is behind the zoom.
 _SHOWN = 2.5
@@ -81,12 +75,12 @@ def tracking_pictures(found: TrackedInput, uncompensated: FloatArray) -> list[Pi
     target, x = found.target, found.response.displacement
     share = 100.0 / target.span
     paths = _path_and("designed, simulated", target, x)
-    _curve(paths, target.time, 1e6 * uncompensated, "uncompensated, simulated", BASE_COLOUR)
+    _curve(paths, target.time, 1e6 * uncompensated, "uncompensated, simulated", colours.BASE)
     errors = Panel("time [ms]", "error [% of range]", _HEIGHT)
     _curve(errors, target.time, share * (x - target.displacement), "simulated")
     if found.by_program:
         predicted = share * (found.predicted - target.displacement)
-        _curve(errors, target.time, predicted, "predicted by the program", BASE_COLOUR, 1.2)
+        _curve(errors, target.time, predicted, "predicted by the program", colours.BASE, 1.2)
     return [
         Picture("Path and response", paths),
         Picture("Error of the designed input", errors),
@@ -121,7 +115,7 @@ def move_pictures(found: QuickMove) -> list[Picture]:
 def _path_and(name: str, target: Target, displacement: FloatArray) -> Panel:
     """Return the path over time, and a displacement [m] on it."""
     plot = Panel("time [ms]", "displacement [µm]", _HEIGHT)
-    _curve(plot, target.time, 1e6 * target.displacement, "path", MEASURED_COLOUR, 3.0)
+    _curve(plot, target.time, 1e6 * target.displacement, "path", colours.MEASURED, 3.0)
     return _curve(plot, target.time, 1e6 * displacement, name)
 
 
@@ -131,14 +125,14 @@ def _voltage(
     """Return the voltage over time with its limits, and another one that was played."""
     plot = Panel("time [ms]", "voltage [V]", _HEIGHT)
     if played is not None:
-        _curve(plot, response.time, played, "played in the trial", BASE_COLOUR)
+        _curve(plot, response.time, played, "played in the trial", colours.BASE)
     _curve(plot, response.time, response.voltage, "designed", width=1.6)
     bounds = [v for v in (limits.min_voltage, limits.max_voltage) if np.isfinite(v)]
     return Picture("Voltage", plot.across(*bounds))
 
 
 def _curve(
-    plot: Panel, time: FloatArray, values: FloatArray, name: str, colour: str = EXTENDED_COLOUR,
+    plot: Panel, time: FloatArray, values: FloatArray, name: str, colour: str = colours.EXTENDED,
     width: float = 1.4,
 ) -> Panel:  # fmt: skip
     """Add values over time [s], thinned to what a screen shows."""
@@ -163,7 +157,7 @@ def write_experiment_page(
     """
     several, record = isinstance(design, Separated), design.record
     applied = Panel("time [s]", "voltage [V]", 320)
-    applied.line(record.time, record.voltage, colour=MEASURED_COLOUR)
+    applied.line(record.time, record.voltage, colour=colours.MEASURED)
     write_design_page(
         path,
         title="Experiment that separates effects" if several else "Experiment for the parameters",
@@ -243,12 +237,12 @@ def _root_locus(d: MechanismDesign) -> Panel:
     plot = Panel("real part [1000 rad/s]", "imaginary part [1000 rad/s]", 520)
     for k, branch in enumerate(branches.T):
         name = "size 0 to 4 times" if k == 0 else ""
-        plot.line(1e-3 * branch.real, 1e-3 * branch.imag, name, NOISE_COLOUR)
+        plot.line(1e-3 * branch.real, 1e-3 * branch.imag, name, colours.NOISE)
     lag = np.array([complex(d.lag_pole)])
     for poles, name, colour, symbol in (
-        (d.free_poles, "free stack", BASE_COLOUR, "x"),
-        (d.poles, "with the mechanism", EXTENDED_COLOUR, "circle"),
-        (lag, "lag, cannot be moved", INK, "square"),
+        (d.free_poles, "free stack", colours.BASE, "x"),
+        (d.poles, "with the mechanism", colours.EXTENDED, "circle"),
+        (lag, "lag, cannot be moved", colours.INK, "square"),
     ):
         plot.marks(1e-3 * poles.real, 1e-3 * poles.imag, name, colour, 10, symbol)
     shown = np.concatenate([d.free_poles, d.poles, lag])
@@ -268,8 +262,8 @@ def _step(d: MechanismDesign) -> Panel:
     time = np.linspace(0.0, min(float(times[0][-1]), 2.0 * float(times[1][-1])), 3000)
     plot = Panel("time [ms]", "displacement [µm]", 400)
     for mounting, name, colour in (
-        (_FREE, "free stack", BASE_COLOUR),
-        (d.mounting, "with the mechanism", EXTENDED_COLOUR),
+        (_FREE, "free stack", colours.BASE),
+        (d.mounting, "with the mechanism", colours.EXTENDED),
     ):
         x = 1e6 * step_response(d.mechanics, mounting, time).displacement
         plot.line(1e3 * time, x, name, colour, 1.8)

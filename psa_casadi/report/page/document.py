@@ -24,8 +24,8 @@ from plotly.offline import get_plotlyjs
 
 from psa_casadi.characters import plain
 from psa_casadi.command_line import typed
-from psa_casadi.report.plots.panel import DARK, Panel, plotly_figure
-from psa_casadi.report.words import phrases
+from psa_casadi.report.plots.panel import Panel, plotly_figure
+from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
 
@@ -96,8 +96,7 @@ class _Page:
 
     def scripts(self) -> list[Markup]:
         """Return the scripts that the page runs."""
-        found = [source("packed.js")] if self._plots or self._alive else []
-        found += [source("page.js")] if self._plots or self._alive else []
+        found = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
         found += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
         return [Markup(text) for text in found]
 
@@ -116,10 +115,11 @@ class _Page:
         """Return what all plots take: colours at night, the arrays, the library that draws them."""
         if not (self._plots or self._alive):
             return Markup("")
-        colours = f'<script type="application/json" id="dark-colours">{json.dumps(DARK)}</script>'
+        dark = json.dumps(colours.DARK)
+        first = f'<script type="application/json" id="dark-colours">{dark}</script>'
         held = {"arrays": packed(" ".join(self._arrays).encode()), "library": _library()[0]}
         rows = (f'<script type="application/gzip" id="{n}">{t}</script>' for n, t in held.items())
-        return Markup(colours + "".join(rows))
+        return Markup(first + "".join(rows))
 
 
 @cache
@@ -143,16 +143,15 @@ def _words(value: Any) -> Any:
 
 def _column_styles(table: Table) -> list[str]:
     """Return the style of every column: figures, hashes, long texts, or none."""
-    return [_column_style(c) for c in zip(*table.rows, strict=True)] or [""] * len(table.head)
-
-
-def _column_style(cells: tuple[str, ...]) -> str:
-    filled = [c for c in cells if c]
-    if filled and all(_FIGURE.fullmatch(c) for c in filled):
-        return "figure"
-    if filled and all(_HASH.fullmatch(c) for c in filled):
-        return "hash"
-    return "wide" if any(len(c) > _WIDE for c in filled) else ""
+    styles = []
+    for column in zip(*table.rows, strict=True):
+        cells = [c for c in column if c]
+        style = "wide" if any(len(c) > _WIDE for c in cells) else ""
+        for name, pattern in (("hash", _HASH), ("figure", _FIGURE)):
+            if cells and all(pattern.fullmatch(c) for c in cells):
+                style = name
+        styles.append(style)
+    return styles or [""] * len(table.head)
 
 
 def _still_picture(figure: Figure) -> str:

@@ -20,9 +20,10 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
+from psa_casadi.report.words import colours
 from psa_casadi.report.words.fit_words import determined
 from psa_casadi.report.words.phrases import added, handy_scale, length_scale, plain, shown_in
-from psa_casadi.report.words.series import EXTENDED_COLOUR, Curve, Series, spans
+from psa_casadi.report.words.series import Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
 from psa_casadi.simulation.simulate import output_of
@@ -155,7 +156,7 @@ def live_design(
     """
     time, voltage, shown = record
     aim, words = (shown, "design") if wanted is None else (wanted, "path")
-    curve, none = Curve("model", EXTENDED_COLOUR, shown), np.zeros(len(time), dtype=bool)
+    curve, none = Curve("model", colours.EXTENDED, shown), np.zeros(len(time), dtype=bool)
     series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
     row = LiveRecord(series, {"voltage": voltage}, rest=rest)
     return LiveModel(model, begun_module(model), [row], aim=words, design=True)
@@ -246,6 +247,10 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
     Each parameter has `unit`, in which a page shows it, with `factor` and `shift`: shown = factor *
     value + shift; and the ends of its slider.
     """
+    try:
+        file = dumps(model)
+    except InputError:  # no file holds such a model
+        file = None
     shown, s, known = output_of(model), model.structure, determined(model)
     nominals = dict(zip(model.output_names, model.output_nominals(), strict=True))
     return {
@@ -261,16 +266,8 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         "shown": shown,
         "shown_nominal": 0.0 if shown is None else float(nominals[shown]),
         "starts_itself": model.starts_itself,
-        "file": _file(model),
+        "file": file,
     }
-
-
-def _file(model: Model) -> str | None:
-    """Return MODEL.json, None for a model that no file holds."""
-    try:
-        return dumps(model)
-    except InputError:
-        return None
 
 
 def _variable(v: State | Output) -> dict[str, Any]:

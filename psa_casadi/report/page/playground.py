@@ -56,25 +56,13 @@ def playground(model: Model | None = None) -> str:
         if not {p.name for p in effect.parameters} & set(whole.parameter_names):
             whole = whole.with_effect(effect)
     title = next((n for n in STACKS if stack_model(n).name == given.name), given.name)
-    return render(
-        "playground.html",
-        f"Play with {title}",
-        ["every effect", "no network"],
-        told=_told(given, whole, title),
-    )
-
-
-def _told(given: Model, whole: Model, title: str) -> dict[str, Any]:
     stacks = [_stack(given, whole, title, given.description)]
     # the terms of a model that states some are not those of other stacks
-    if not given.publication.stated and {c.name for c in given.components} >= {
-        c.name for c in BASE
-    }:
+    names = {c.name for c in given.components}
+    if not given.publication.stated and names >= {c.name for c in BASE}:
         others = [name for name in STACKS if name != title]
-        stacks += [
-            _stack(stack_model(name), whole, name, STACKS[name].description) for name in others
-        ]
-    return {
+        stacks += [_stack(stack_model(n), whole, n, STACKS[n].description) for n in others]
+    told = {
         "kind": "playground",
         **live_data(whole, web_module(whole)),
         "stacks": stacks,
@@ -82,6 +70,8 @@ def _told(given: Model, whole: Model, title: str) -> dict[str, Any]:
         "of_effects": [p.name for c in whole.effects for p in c.parameters],
         "band": _BAND,
     }
+    badges = ["every effect", "no network"]
+    return render("playground.html", f"Play with {title}", badges, told=told)
 
 
 def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str, Any]:
@@ -111,8 +101,16 @@ def fmu_parts(model: Model) -> dict[str, Any] | None:
     except InputError:
         return None
     entries = {f"sources/{n}": t.encode() for n, t in texts.items()} | terminal_entries(blank)
+    parts = [
+        f"<h1>{NAME}</h1>",
+        "<p>Start values are in modelDescription.xml; an effect is off while its gain is 0.</p>",
+        f'<p>To compile the sources: <a href="../{_README}">{_README}</a>. The terms:'
+        f' <a href="../{LICENSE_ENTRY}">{LICENSE_ENTRY}</a>.</p>',
+        "<h2>Equations</h2>",
+        equations(blank),  # which hold whatever the values are
+    ]
     entries |= {
-        DOCUMENTATION_ENTRY: _documentation(blank).encode(),
+        DOCUMENTATION_ENTRY: page(NAME, parts, "The page on the model").encode(),
         LICENSE_ENTRY: license_text(blank, 3).encode(),
         "modelDescription.xml": xml.encode(),
     }
@@ -120,19 +118,6 @@ def fmu_parts(model: Model) -> dict[str, Any] | None:
     files = [[n, len(e), any(m in e for m in marks)] for n, e in sorted(entries.items())]
     content = b"".join(entry for _, entry in sorted(entries.items()))
     return {"name": NAME, "token": token, "files": files, "packed": packed(content)}
-
-
-def _documentation(model: Model) -> str:
-    """Return a page of the equations, which hold whatever the values are."""
-    parts = [
-        f"<h1>{NAME}</h1>",
-        "<p>Start values are in modelDescription.xml; an effect is off while its gain is 0.</p>",
-        f'<p>To compile the sources: <a href="../{_README}">{_README}</a>. The terms:'
-        f' <a href="../{LICENSE_ENTRY}">{LICENSE_ENTRY}</a>.</p>',
-        "<h2>Equations</h2>",
-        equations(model),
-    ]
-    return page(NAME, parts, "The page on the model")
 
 
 def fmu_figures(model: Model, about: Model) -> dict[str, Any]:

@@ -140,10 +140,17 @@ def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | No
             answers=[f"{label}: {text}" for label, text in answers if text],
             **_budget(d),
             live=live,
-            sentences=_sentences,
+            wrong=[
+                [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -weight(m))]
+                for misfits in (d.misfit, d.remainder)
+            ],
             most_records=_TOLD_RECORDS,
             views=[p for m, name in drawn(d.misfit) if (p := _data_view(d, m, name)) is not None],
-            splits=_splits(d),
+            splits=[
+                (m.record, table)
+                for m in d.misfit[:_TOLD_RECORDS]
+                if (table := split_table(m, *_compared(d, m))) is not None
+            ],
             evidence=findings.evidence_plot(d),
             signatures=[s for c in d.causes[:_SIGNATURES] if (s := _signature(d, c.effect))],
             causes=[
@@ -226,6 +233,7 @@ def _own_page(d: OdeDiagnosis) -> str:
     rows.sort(key=lambda row: -row[1].range_share)
     free = d.correction
     effects = {c.name: c for c in d.model.components}
+    gain, by_record = own_words.own_error_tables(d, series)
     return render(
         "own_diagnosis.html",
         f"Diagnosis of {plain(d.model.name)}: {verdict_words.VERDICTS[d.verdict]}",
@@ -260,8 +268,8 @@ def _own_page(d: OdeDiagnosis) -> str:
             (c, effects[c.effect], share.text, tables.parameter_table(d.model, only=c.parameters))
             for c, share in zip(d.causes, d.budget.causes, strict=True)
         ],
-        gain=own_words.own_error_table(d),
-        by_record=own_words.own_record_table(d, series),
+        gain=gain,
+        by_record=by_record,
     )
 
 
@@ -409,12 +417,6 @@ def _budget(d: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _sentences(misfits: Sequence[Misfit]) -> list[tuple[str, ...]]:
-    """Return the sentences on the records with the largest errors over their noise."""
-    order = sorted(misfits, key=lambda m: -weight(m))[:_TOLD_RECORDS]
-    return [m.sentences[:_TOLD] for m in order]
-
-
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
     """Return record and name of the views with the largest shares, one of every family.
 
@@ -456,12 +458,6 @@ def _data_view(d: Diagnosis, m: Misfit, name: str) -> Picture | None:
     )
     share = f", {phrases.percent(before.share)} of the excess" if before.significant else ""
     return Picture(f"{m.record}: {lowered(AXES[before.name].title)}{share}", plot)
-
-
-def _splits(d: Diagnosis) -> list[tuple[str, tables.Table]]:
-    """Return the parts of residuals under periodic voltages, by record."""
-    found = ((m.record, split_table(m, *_compared(d, m))) for m in d.misfit[:_TOLD_RECORDS])
-    return [(record, table) for record, table in found if table is not None]
 
 
 def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Table | None:

@@ -8,19 +8,14 @@ import numpy as np
 from psa_casadi.population.finding import NORMAL_95, Finding
 from psa_casadi.population.population import Difference, Population, Spread, display_unit
 from psa_casadi.population.statistics import mixed_regression
-from psa_casadi.report.plots.panel import BOUND_COLOUR, WEAK_COLOUR, Panel
+from psa_casadi.report.plots.panel import Panel
+from psa_casadi.report.words import colours
 from psa_casadi.report.words.phrases import handy_scale, in_brackets, length_scale, plain
-from psa_casadi.report.words.series import (
-    BASE_COLOUR,
-    EXTENDED_COLOUR,
-    MEASURED_COLOUR,
-    NOISE_COLOUR,
-    time_scale,
-)
+from psa_casadi.report.words.series import time_scale
 from psa_casadi.units import FloatArray, convert
 
 #: Colours of devices side by side, with dashes and symbols where there are more of them.
-_COLOURS = (EXTENDED_COLOUR, BASE_COLOUR, WEAK_COLOUR, BOUND_COLOUR, MEASURED_COLOUR)
+_COLOURS = (colours.EXTENDED, colours.BASE, colours.WEAK, colours.BOUND, colours.MEASURED)
 _DASHES = ("solid", "dash", "dot", "dashdot")
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up")
 _HEIGHT = 340
@@ -65,7 +60,7 @@ def difference_plot(findings: Sequence[Finding], rows: Sequence[Difference]) -> 
             error_x={**_bar(value, low, high, colour), "thickness": 1.6, "width": 3},
             hovertemplate="%{x:.3g} %<extra></extra>",
         )  # fmt: skip
-    plot.upright(0.0, colour=NOISE_COLOUR, width=1.0)
+    plot.upright(0.0, colour=colours.NOISE, width=1.0)
     rows_axis = {"tickvals": list(range(len(names))), "ticktext": names, "automargin": True,
                  "autorange": "reversed", "showgrid": False}  # fmt: skip
     return plot.axes(y=rows_axis, margin={"l": 20, "r": 10, "t": 46, "b": 46})
@@ -161,8 +156,8 @@ def _over_devices(
     # names lie towards the middle of the plot
     sides = np.where(np.arange(order.size) < 0.5 * order.size, "middle right", "middle left")
     for name, which, colour, symbol in (
-        ("belongs to the others", ~far, EXTENDED_COLOUR, "circle"),
-        ("stands out", far, BASE_COLOUR, "diamond"),
+        ("belongs to the others", ~far, colours.EXTENDED, "circle"),
+        ("stands out", far, colours.BASE, "diamond"),
     ):
         if not which.any():
             continue

@@ -25,15 +25,10 @@ from psa_casadi.records.record import Record
 from psa_casadi.report.plots import records
 from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
-from psa_casadi.report.words import phrases
+from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.series import (
-    BASE_COLOUR,
-    EXTENDED_COLOUR,
-    HELD_OUT_COLOUR,
-    MEASURED_COLOUR,
-    NOISE_COLOUR,
     FloatArray,
     Series,
     most_telling,
@@ -201,7 +196,7 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     plot = records.residual_plot(s, part)
     plot.layout["shapes"] = []  # a shaded band is plainer than dashes
     noise = 2.0 * s.residual_scale.factor * s.noise
-    above.axhspan(-noise, noise, color=HELD_OUT_COLOUR, label="noise, 2 sigma")
+    above.axhspan(-noise, noise, color=colours.HELD_OUT, label="noise, 2 sigma")
     draw(above, plot, f"{origin.capitalize()} minus simulated", font=font)
     above.locator_params(axis="x", nbins=5)
     above.margins(x=0.0)
@@ -210,10 +205,10 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     above.legend(fontsize=font - 0.5, loc="upper left", ncols=2, columnspacing=0.9,
                  handlelength=1.2, framealpha=0.0)  # fmt: skip
     below.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
-    rows = [("base model", BASE_COLOUR, diagnosis.base_errors.holdout_rms_m)]
+    rows = [("base model", colours.BASE, diagnosis.base_errors.holdout_rms_m)]
     if phrases.added(diagnosis):
-        rows.append(("extended", EXTENDED_COLOUR, diagnosis.extended_errors.holdout_rms_m))
-    rows.append(("noise", NOISE_COLOUR, diagnosis.noise_floor_rms_m))
+        rows.append(("extended", colours.EXTENDED, diagnosis.extended_errors.holdout_rms_m))
+    rows.append(("noise", colours.NOISE, diagnosis.noise_floor_rms_m))
     largest = max(rms for *_, rms in rows)
     scale = phrases.scale_of(diagnosis.experiments, largest)
     for k, (_, colour, rms) in enumerate(rows):
@@ -334,8 +329,8 @@ def _draw_prior(axes: Axes, found: Posterior, record: int) -> None:
     scale = phrases.length_scale(3.0 * span)
     band = f"prior, {100.0 * HDI:.0f} %"
     ends = (scale.factor * low, scale.factor * high)
-    axes.fill_between(r.time, *ends, color=BASE_COLOUR, alpha=0.3, label=band)
-    axes.plot(r.time, scale.factor * y, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
+    axes.fill_between(r.time, *ends, color=colours.BASE, alpha=0.3, label=band)
+    axes.plot(r.time, scale.factor * y, color=colours.MEASURED, linewidth=1.0, label="measured")
     middle = 0.5 * float(np.nanmax(y) + np.nanmin(y))
     axes.set_ylim(scale.factor * (middle - 1.5 * span), scale.factor * (middle + 1.5 * span))
     style(axes, "Prior predictive", "time [s]", f"displacement [{scale.unit}]")
@@ -348,10 +343,10 @@ def _draw_posterior(axes: Axes, found: Posterior, record: int) -> None:
     left = measured(r) - middle
     scale = phrases.length_scale(float(np.nanmax(np.abs(left))))
     band = f"posterior, {100.0 * HDI:.0f} %"
-    axes.plot(r.time, scale.factor * left, color=MEASURED_COLOUR, linewidth=0.8, label="measured")
+    axes.plot(r.time, scale.factor * left, color=colours.MEASURED, linewidth=0.8, label="measured")
     axes.fill_between(
         r.time, scale.factor * (low - middle), scale.factor * (high - middle),
-        color=EXTENDED_COLOUR, alpha=0.4, label=band, zorder=3,
+        color=colours.EXTENDED, alpha=0.4, label=band, zorder=3,
     )  # fmt: skip
     title = "Posterior predictive, less its median"
     style(axes, title, "time [s]", f"difference [{scale.unit}]")
@@ -365,14 +360,16 @@ def _draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
         np.array([convert(v, unit, display) for v in found.tree[g][f.name].to_numpy().ravel()])
         for g in ("posterior", "prior")
     )
-    axes.hist(values, bins=_BINS, density=True, color=EXTENDED_COLOUR, alpha=0.7)
+    axes.hist(values, bins=_BINS, density=True, color=colours.EXTENDED, alpha=0.7)
     low, high = axes.get_xlim()
     inside = before[(before >= low) & (before <= high)]
     if len(inside) >= 0.2 * max(len(before), 1):
         weights = np.full(len(inside), _BINS / (2.0 * (high - low) * len(before)))
-        axes.hist(inside, bins=_BINS // 2, weights=weights, histtype="step", color=BASE_COLOUR)
+        axes.hist(inside, bins=_BINS // 2, weights=weights, histtype="step", color=colours.BASE)
     for end in (f.low, f.high):
-        axes.axvline(convert(end, unit, display), color=NOISE_COLOUR, linestyle="--", linewidth=1.0)
+        axes.axvline(
+            convert(end, unit, display), color=colours.NOISE, linestyle="--", linewidth=1.0
+        )
     title = f"{f.name} = {phrases.number(convert(f.mean, unit, display), 4)}"
     style(axes, title, phrases.in_brackets(f.name, display), "")
     axes.set_yticks([])
@@ -390,9 +387,9 @@ def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[s
     clock = time_scale(float(seen.time[-1]))
     time = clock.factor * seen.time
     behind = left.twinx()
-    behind.fill_between(time, seen.voltage, color=NOISE_COLOUR, alpha=0.18, linewidth=0)
-    behind.set_ylabel("voltage [V] (grey)", fontsize=FONT, color=NOISE_COLOUR)
-    behind.tick_params(labelsize=FONT - 1, colors=NOISE_COLOUR)
+    behind.fill_between(time, seen.voltage, color=colours.NOISE, alpha=0.18, linewidth=0)
+    behind.set_ylabel("voltage [V] (grey)", fontsize=FONT, color=colours.NOISE)
+    behind.tick_params(labelsize=FONT - 1, colors=colours.NOISE)
     left.set_zorder(behind.get_zorder() + 1)
     left.patch.set_visible(False)
     added_over_time = Panel(f"time [{clock.unit}]", f"difference [{scale.unit}]")

@@ -13,28 +13,22 @@ from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.diagnosis.views import View
 from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
-from psa_casadi.report.plots.panel import BOUND_COLOUR, INK, WEAK_COLOUR, Panel, logarithmic
-from psa_casadi.report.words import phrases
+from psa_casadi.report.plots.panel import Panel, logarithmic
+from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
 from psa_casadi.report.words.misfit_words import AXES
-from psa_casadi.report.words.series import (
-    BASE_COLOUR,
-    EXTENDED_COLOUR,
-    NOISE_COLOUR,
-    FloatArray,
-    bar_colour,
-)
+from psa_casadi.report.words.series import FloatArray, bar_colour
 from psa_casadi.units import convert
 
 if TYPE_CHECKING:  # which take long to load
     from psa_casadi.any_model.result import OdeDiagnosis
 
 _DEGREE_COLOURS: dict[Degree, str] = {
-    "determined": EXTENDED_COLOUR,
-    "weak": WEAK_COLOUR,
-    "undetermined": BASE_COLOUR,
-    "on its bound": BOUND_COLOUR,
-    "fixed": NOISE_COLOUR,
+    "determined": colours.EXTENDED,
+    "weak": colours.WEAK,
+    "undetermined": colours.BASE,
+    "on its bound": colours.BOUND,
+    "fixed": colours.NOISE,
 }
 #: The bars begin and end here [%]; what lies beyond says so in its figure.
 _SHORTEST, _LONGEST = 0.01, 1000.0
@@ -62,9 +56,9 @@ def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Pan
     # asinh shows small, large and negative evidence in one picture; the labels give the figures
     values = [float(np.arcsinh(c.evidence / 10.0)) for c in rows]
     names = [phrases.plain(c.effect).replace("independent ", "independent\n") for c in rows]
-    colours = [bar_colour(c, set(causes)) for c in rows]
+    fills = [bar_colour(c, set(causes)) for c in rows]
     plot = Panel("evidence [ln units], compressed", height=110 + 30 * len(rows), showlegend=False)
-    plot.bars(values, names, "", colours, hoverinfo="skip")
+    plot.bars(values, names, "", fills, hoverinfo="skip")
     # the figures stand to the right of bar and zero, clear of the names
     figures = [f" {round(c.evidence):,}; {_figure(c, d)}" for c in rows]
     ends = [max(v, 0.0) for v in values]
@@ -100,8 +94,8 @@ def view_named(m: Misfit, name: str) -> View | None:
 def view_plot(before: View, after: View | None, *, counts: bool) -> Panel:
     """Binned means of the residual with two standard errors, before and after the extension."""
     scale = phrases.length_scale(float(np.max(np.abs(before.mean))), counts=counts)
-    rows = [(before, BASE_COLOUR, "base model")]
-    rows += [(after, EXTENDED_COLOUR, "extended model")] if after is not None else []
+    rows = [(before, colours.BASE, "base model")]
+    rows += [(after, colours.EXTENDED, "extended model")] if after is not None else []
     plot, factor = _view_panel(before, scale, "residual", [v.x for v, _, _ in rows])
     for view, colour, name in rows:
         errors = {"array": 2.0 * scale.factor * view.spread, "color": colour,
@@ -114,10 +108,10 @@ def view_plot(before: View, after: View | None, *, counts: bool) -> Panel:
 def spectrum_view_plot(before: Spectrum, after: Spectrum | None, *, counts: bool) -> Panel:
     """Amplitude density of the residual before and after the extension, above the noise's."""
     scale = phrases.length_scale(float(np.max(before.density)), counts=counts)
-    rows = [(before.density, before.frequency, BASE_COLOUR, "base model", "solid")]
+    rows = [(before.density, before.frequency, colours.BASE, "base model", "solid")]
     if after is not None:
-        rows.append((after.density, after.frequency, EXTENDED_COLOUR, "extended model", "solid"))
-    rows.append((before.floor, before.frequency, INK, "noise", "dash"))
+        rows.append((after.density, after.frequency, colours.EXTENDED, "extended model", "solid"))
+    rows.append((before.floor, before.frequency, colours.INK, "noise", "dash"))
     plot = Panel("frequency [Hz]", f"residual [{scale.unit}/√Hz]", _LOW, showlegend=True)
     for density, frequency, colour, name, dash in rows:
         plot.line(frequency, scale.factor * density, name, colour, 1.5, dash)
@@ -131,7 +125,7 @@ def signature_plot(seen: Signature) -> Panel:
     view, scale = seen.telling, phrases.length_scale(float(np.max(np.abs(seen.difference))))
     plot, factor = _view_panel(view, scale, "difference", [view.x])
     mean = scale.factor * view.mean
-    look: dict[str, Any] = {"line": {"color": EXTENDED_COLOUR, "width": 1.8}}
+    look: dict[str, Any] = {"line": {"color": colours.EXTENDED, "width": 1.8}}
     if view.name == "spectrum":
         top = float(np.max(mean))
         plot.line(factor * view.x, mean, "difference")
@@ -143,7 +137,7 @@ def signature_plot(seen: Signature) -> Panel:
     on = np.flatnonzero((seen.coordinate >= low) & (seen.coordinate <= high))
     on = on[:: max(1, on.size // _BEHIND)]
     behind = factor * seen.coordinate[on], scale.factor * seen.counted[on]
-    plot.marks(*behind, "samples", NOISE_COLOUR, 3)
+    plot.marks(*behind, "samples", colours.NOISE, 3)
     return plot.marks(factor * view.x, mean, "binned means", **look)
 
 
@@ -157,7 +151,7 @@ def _view_panel(
     )
     if view.name.startswith(("since_reversal", "holds", "spectrum")):
         plot.axes(logarithmic(_ends(factor * np.concatenate(shown))))
-    return plot.axes(y={"zeroline": True, "zerolinecolor": NOISE_COLOUR}), factor
+    return plot.axes(y={"zeroline": True, "zerolinecolor": colours.NOISE}), factor
 
 
 def _ends(values: FloatArray) -> tuple[float, float]:
@@ -217,9 +211,15 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
             names = [g.name for g, _ in group]
             plot.bars([x for _, x in group], names, degree, _DEGREE_COLOURS[degree], width=0.66,
                       hovertemplate="%{y}: %{x:.3g} %<extra></extra>")  # fmt: skip
-    colours = [NOISE_COLOUR if g.degree == "fixed" else INK for g in rows]
-    plot.texts([right / 1.15] * len(rows), [g.name for g in rows], [_error_text(g) for g in rows],
-               "middle left", textfont={"color": colours})  # fmt: skip
+    inks = [colours.NOISE if g.degree == "fixed" else colours.INK for g in rows]
+    figures = [
+        "fixed" if g.degree == "fixed"
+        else f"{phrases.number(100.0 * g.error, 2)} %" if g.error <= _LONGEST / 100.0
+        else f"> {_LONGEST:.0f} %"
+        for g in rows
+    ]  # fmt: skip
+    plot.texts([right / 1.15] * len(rows), [g.name for g in rows], figures,
+               "middle left", textfont={"color": inks})  # fmt: skip
     plot.upright(100.0 * WEAK_ERROR).upright(50.0, dash="dash")
     return plot.axes(
         {"type": "log", "dtick": 1, "range": [math.log10(left), math.log10(right)],
@@ -230,14 +230,6 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
     )  # fmt: skip
 
 
-def _error_text(grade: Grade) -> str:
-    if grade.degree == "fixed":
-        return "fixed"
-    if not grade.error <= _LONGEST / 100.0:
-        return f"> {_LONGEST:.0f} %"
-    return f"{phrases.number(100.0 * grade.error, 2)} %"
-
-
 def correlation_plot(found: Identification) -> Panel:
     """Correlations of the estimates as a square of colours, strong ones with their figure."""
     names, matrix = list(found.determinacy.names), found.determinacy.correlations
@@ -245,7 +237,10 @@ def correlation_plot(found: Identification) -> Panel:
     plot = Panel(height=_MARGINS + _BAR * min(rows, 2 * len(names) + 2))
     cells = [(i, k, float(np.clip(matrix[i, k], -1.0, 1.0)))
              for i in range(len(names)) for k in range(i + 1)]  # fmt: skip
-    for sign, colour, said in ((1.0, EXTENDED_COLOUR, "positive"), (-1.0, BASE_COLOUR, "negative")):
+    for sign, colour, said in (
+        (1.0, colours.EXTENDED, "positive"),
+        (-1.0, colours.BASE, "negative"),
+    ):
         shown = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
         look = {"color": colour, "opacity": [abs(v) for _, _, v in shown]}
         plot.bars(  # a cell is a bar that begins at its column
@@ -253,7 +248,7 @@ def correlation_plot(found: Identification) -> Panel:
             base=[k - 0.46 for _, k, _ in shown],
             text=[_correlation_text(v) if written and i > k else "" for i, k, v in shown],
             textposition="inside", insidetextanchor="middle", textangle=0, constraintext="none",
-            textfont={"size": 10, "color": INK},
+            textfont={"size": 10, "color": colours.INK},
             hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in shown],
             hovertemplate="%{hovertext}<extra></extra>",
         )  # fmt: skip
@@ -285,7 +280,7 @@ def profile_plot(p: Profile) -> Panel:
     unit = "" if p.unit == "1" else f" [{p.display_unit}]"
     plot = Panel(f"{p.name}{unit}", "increase of the cost", 380)
     plot.marks(values, p.increase, "all other parameters fitted anew",
-               line={"color": EXTENDED_COLOUR, "width": 2.0})  # fmt: skip
+               line={"color": colours.EXTENDED, "width": 2.0})  # fmt: skip
     if p.log:  # what the standard error alone says, in the logarithm where it has one
         at = np.geomspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
         away = np.log(at / p.estimate) * p.estimate / p.standard_error
@@ -293,7 +288,7 @@ def profile_plot(p: Profile) -> Panel:
         at = np.linspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
         away = (at - p.estimate) / p.standard_error
     shown = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
-    plot.line(shown, away**2, "linearised", NOISE_COLOUR, dash="dot")
+    plot.line(shown, away**2, "linearised", colours.NOISE, dash="dot")
     low, high = (
         edge if end is None else convert(end, p.unit, p.display_unit)
         for end, edge in ((p.low, span[0]), (p.high, span[1]))

@@ -12,44 +12,22 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from psa_casadi.characters import plain as carried
+from psa_casadi.report.words import colours
 from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.series import (
-    BASE_COLOUR,
-    EXTENDED_COLOUR,
-    HELD_OUT_COLOUR,
-    MEASURED_COLOUR,
-    NOISE_COLOUR,
-    compact,
-)
+from psa_casadi.report.words.series import compact
 
-INK, GRID, AXIS = "#222222", "#e4e7ea", "#9aa1a8"
-WEAK_COLOUR, BOUND_COLOUR = "#e69f00", "#a8568f"
-
-#: What takes a colour's place on a dark screen. Every colour in a plot is a key of this table.
-DARK = {
-    INK: "#e4e6e8",
-    GRID: "#2c343b",
-    AXIS: "#69747e",
-    MEASURED_COLOUR: "#d9dcdf",
-    BASE_COLOUR: "#ff8a45",
-    EXTENDED_COLOUR: "#56b4e9",
-    NOISE_COLOUR: "#8f979e",
-    HELD_OUT_COLOUR: "#3a3521",
-    WEAK_COLOUR: "#f0b849",
-    BOUND_COLOUR: "#d58abd",
-}
 _CLEAR = "rgba(0,0,0,0)"
 _LOOK = {
     "margin": {"l": 62, "r": 10, "t": 46, "b": 46},
-    "font": {"size": 13, "color": INK, "family": "system-ui, -apple-system, sans-serif"},
+    "font": {"size": 13, "color": colours.INK, "family": "system-ui, -apple-system, sans-serif"},
     "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0.0, "bgcolor": _CLEAR},
     "paper_bgcolor": _CLEAR,
     "plot_bgcolor": _CLEAR,
     "hovermode": "closest",
 }
 _AXIS_LOOK = {
-    "zeroline": False, "showline": True, "linecolor": AXIS, "mirror": True, "ticks": "outside",
-    "tickcolor": AXIS, "ticklen": 4, "gridcolor": GRID,
+    "zeroline": False, "showline": True, "linecolor": colours.AXIS, "mirror": True,
+    "ticks": "outside", "tickcolor": colours.AXIS, "ticklen": 4, "gridcolor": colours.GRID,
 }  # fmt: skip
 #: Arrays of fewer numbers are written as numbers.
 _SHORT = 40
@@ -76,7 +54,7 @@ class Panel:
         self.layout: dict[str, Any] = {**_LOOK, "height": height, **axes, "shapes": [], **layout}
 
     def line(
-        self, x: Any, y: Any, name: str = "", colour: str = EXTENDED_COLOUR, width: float = 1.4,
+        self, x: Any, y: Any, name: str = "", colour: str = colours.EXTENDED, width: float = 1.4,
         dash: str = "solid", **more: Any,
     ) -> "Panel":  # fmt: skip
         """Add a line; `more` are settings of plotly's scatter trace."""
@@ -84,7 +62,7 @@ class Panel:
         return self._scatter("lines", x, y, name, line=look, **more)
 
     def marks(
-        self, x: Any, y: Any, name: str = "", colour: str = EXTENDED_COLOUR, size: float = 6,
+        self, x: Any, y: Any, name: str = "", colour: str = colours.EXTENDED, size: float = 6,
         symbol: str = "circle", **more: Any,
     ) -> "Panel":  # fmt: skip
         """Add markers, and where `line` is given a line through them."""
@@ -98,9 +76,9 @@ class Panel:
             "text", x, y, "", text=list(texts), textposition=position, hoverinfo="skip", **more
         )
 
-    def bars(self, values: Any, names: Any, name: str, colours: Any, **more: Any) -> "Panel":
+    def bars(self, values: Any, names: Any, name: str, fill: Any, **more: Any) -> "Panel":
         """Add horizontal bars."""
-        look = {"color": colours} if isinstance(colours, str | list) else colours
+        look = {"color": fill} if isinstance(fill, str | list) else fill
         self.data.append(
             {"type": "bar", "orientation": "h", "x": values, "y": names, "name": name,
              "showlegend": bool(name), "marker": look, **more}
@@ -108,7 +86,7 @@ class Panel:
         return self
 
     def across(
-        self, *heights: float, name: str = "", colour: str = INK, dash: str = "dash",
+        self, *heights: float, name: str = "", colour: str = colours.INK, dash: str = "dash",
         width: float = 1.2,
     ) -> "Panel":  # fmt: skip
         """Add lines over the whole width."""
@@ -118,7 +96,7 @@ class Panel:
         return self
 
     def upright(
-        self, *places: float, colour: str = AXIS, dash: str = "dot", width: float = 1.2
+        self, *places: float, colour: str = colours.AXIS, dash: str = "dot", width: float = 1.2
     ) -> "Panel":
         """Add lines over the whole height."""
         ends = {"yref": "y domain", "y0": 0, "y1": 1}
@@ -131,7 +109,7 @@ class Panel:
         for low, high in spans:
             place = {"yref": "y domain", "y0": 0, "y1": 1, "x0": low, "x1": high}
             self.layout["shapes"].append(
-                {"type": "rect", "name": name, "fillcolor": HELD_OUT_COLOUR, "layer": "below",
+                {"type": "rect", "name": name, "fillcolor": colours.HELD_OUT, "layer": "below",
                  "line": {"width": 0}, **place}
             )  # fmt: skip
         return self

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from psa_casadi.report.plots.panel import INK, Panel, logarithmic, stacked
-from psa_casadi.report.words import series
+from psa_casadi.report.plots.panel import Panel, logarithmic, stacked
+from psa_casadi.report.words import colours, series
 from psa_casadi.report.words.phrases import in_brackets
 
 #: Points of a part of a record, measured samples shown one by one, and of a spectrum.
@@ -32,7 +32,7 @@ def measured_plot(s: series.Series, origin: str, shown: slice | series.IndexArra
     scale, clock = s.scale, s.time_scale
     time = clock.factor * s.time[shown]
     plot = Panel(f"time [{clock.unit}]", s.label)
-    plot.line(time, scale.factor * s.measured[shown], origin, series.MEASURED_COLOUR, 3.0)
+    plot.line(time, scale.factor * s.measured[shown], origin, colours.MEASURED, 3.0)
     for curve in s.curves:
         plot.line(time, scale.factor * curve.values[shown], curve.label, curve.colour)
     return _with_held_out(plot, s)
@@ -56,8 +56,8 @@ def zoom_plot(s: series.Series, origin: str, limit: int) -> Panel:
     scale, clock = s.scale, s.time_scale
     time = clock.factor * s.time[shown]
     plot = Panel(f"time [{clock.unit}]", s.label)
-    thin = {"color": series.NOISE_COLOUR, "width": 0.7}
-    plot.marks(time, scale.factor * s.measured[shown], origin, series.MEASURED_COLOUR, 4, line=thin)
+    thin = {"color": colours.NOISE, "width": 0.7}
+    plot.marks(time, scale.factor * s.measured[shown], origin, colours.MEASURED, 4, line=thin)
     for curve in s.curves:
         plot.line(time, scale.factor * curve.values[shown], curve.label, curve.colour, 2.2)
     return plot
@@ -67,7 +67,7 @@ def loop_plot(s: series.Series, origin: str, shown: slice | series.IndexArray) -
     """What was measured over what drives it, such as displacement over voltage."""
     scale, x = s.scale, s.voltage[shown]
     plot = Panel(s.against, s.label)
-    plot.line(x, scale.factor * s.measured[shown], origin, series.MEASURED_COLOUR, 3.0)
+    plot.line(x, scale.factor * s.measured[shown], origin, colours.MEASURED, 3.0)
     for curve in s.curves:
         plot.line(x, scale.factor * curve.values[shown], curve.label, curve.colour, 1.2)
     return plot
@@ -96,7 +96,7 @@ def spectrum_plot(s: series.Series, limit: int) -> Panel:
         values = small.factor * density[shown]
         reached += [float(np.min(values)), float(np.max(values))]
         plot.line(frequency[shown], values, curve.label, curve.colour)
-    plot.line(list(ends), [floor, floor], "noise floor", INK, dash="dash")
+    plot.line(list(ends), [floor, floor], "noise floor", colours.INK, dash="dash")
     return plot.axes(logarithmic(ends), logarithmic((min(reached), max(reached))))
 
 
@@ -112,7 +112,7 @@ def autocorrelation_plot(s: series.Series) -> Panel:
         lags, values = series.autocorrelation(s.residual(curve))
         band, ends = series.white_band(s.residual(curve)), float(lags[-1])
         plot.line(size * lags.astype(np.float64), values, curve.label, curve.colour, 1.6)
-    zero = {"range": [-1.05, 1.05], "zeroline": True, "zerolinecolor": series.NOISE_COLOUR}
+    zero = {"range": [-1.05, 1.05], "zeroline": True, "zerolinecolor": colours.NOISE}
     return plot.across(-band, band).axes(logarithmic((size, size * ends)), zero)
 
 
@@ -142,7 +142,7 @@ def distribution_plot(s: series.Series) -> Panel:
     if spread > 0:
         x = np.linspace(low, high, 161)
         normal = np.exp(-0.5 * ((x - mean) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
-        plot.line(small.factor * x, 100.0 * width * normal, "normal", INK, dash="dash")
+        plot.line(small.factor * x, 100.0 * width * normal, "normal", colours.INK, dash="dash")
     return plot
 
 

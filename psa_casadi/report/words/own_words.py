@@ -10,7 +10,7 @@ from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import Run, noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
-from psa_casadi.report.words import verdict_words
+from psa_casadi.report.words import colours, verdict_words
 from psa_casadi.report.words.phrases import (
     added,
     either,
@@ -24,7 +24,7 @@ from psa_casadi.report.words.phrases import (
     rest_sentence,
     with_unit,
 )
-from psa_casadi.report.words.series import BASE_COLOUR, EXTENDED_COLOUR, Curve, FloatArray, Series
+from psa_casadi.report.words.series import Curve, FloatArray, Series
 from psa_casadi.report.words.tables import Table
 
 #: Outputs that a sentence names one by one.
@@ -103,34 +103,28 @@ def own_budget_table(d: OdeDiagnosis) -> Table:
     return Table(("what", "removes", "95 % interval"), tuple(rows))
 
 
-def own_error_table(d: OdeDiagnosis) -> Table:
-    """Return noise and held-out rms of every output, of the base and of the extended model."""
-    rows = [_errors(e.output, e.unit, e.noise, e.base, e.extended, d) for e in d.errors]
-    return _error_table("output", rows, d)
+def own_error_tables(d: OdeDiagnosis, series: Sequence[Series]) -> tuple[Table, Table]:
+    """Return noise and held-out rms of the base and of the extended model by output and by record.
 
-
-def own_record_table(d: OdeDiagnosis, series: Sequence[Series]) -> Table:
-    """Return the same of every record; rms over its used samples where none is held out."""
-    rows = []
-    for s in series:
-        rms = [s.judged_rms(c) for c in s.curves]
-        rows.append(_errors(s.name, s.unit, s.noise, rms[0], rms[-1], d))
-    return _error_table("record", rows, d)
-
-
-def _errors(
-    name: str, unit: str, noise: float, base: float, extended: float, d: OdeDiagnosis
-) -> tuple[str, ...]:
-    scale = prefixed_scale(base, unit)
-    shown = [noise, base, *([extended] if d.causes else [])]
-    falls = [f"{100.0 * (1.0 - extended / base):.0f} %"] if d.causes and base > 0 else []
-    return (name, scale.unit, *(number(scale.factor * v) for v in shown), *falls)
-
-
-def _error_table(what: str, rows: Sequence[tuple[str, ...]], d: OdeDiagnosis) -> Table:
-    head = (what, "unit", "noise rms", "base, held-out rms")
+    The rms of a record is over its used samples where none is held out.
+    """
+    outputs = [(e.output, e.unit, e.noise, e.base, e.extended) for e in d.errors]
+    records = [
+        (s.name, s.unit, s.noise, s.judged_rms(s.curves[0]), s.judged_rms(s.curves[-1]))
+        for s in series
+    ]
+    head = ("unit", "noise rms", "base, held-out rms")
     more = ("extended, held-out rms", "falls by") if d.causes else ()
-    return Table((*head, *more), tuple(rows))
+    tables = []
+    for what, given in (("output", outputs), ("record", records)):
+        rows = []
+        for name, unit, noise, base, extended in given:
+            scale = prefixed_scale(base, unit)
+            shown = [noise, base, *([extended] if d.causes else [])]
+            falls = [f"{100.0 * (1.0 - extended / base):.0f} %"] if d.causes and base > 0 else []
+            rows.append((name, scale.unit, *(number(scale.factor * v) for v in shown), *falls))
+        tables.append(Table((what, *head, *more), tuple(rows)))
+    return tables[0], tables[1]
 
 
 def own_fit_table(found: OdeIdentification, series: Sequence[Series]) -> Table:
@@ -175,16 +169,16 @@ _FEWEST = 8
 def own_series(d: OdeDiagnosis) -> tuple[Series, ...]:
     """Return every measured output of every record, with the base and the extended model."""
     noise = {e.output: e.noise for e in d.errors}
-    curves = [("base model", BASE_COLOUR, d.base)]
+    curves = [("base model", colours.BASE, d.base)]
     if added(d):
-        curves.append(("extended model", EXTENDED_COLOUR, d.extended))
+        curves.append(("extended model", colours.EXTENDED, d.extended))
     return tuple(_series(d.model, d.runs, noise, curves))
 
 
 def own_fit_series(found: OdeIdentification) -> tuple[Series, ...]:
     """Return every measured output of every record, with the fitted model."""
     predicted = found.fit.predicted(found.runs)
-    curves = [("model", EXTENDED_COLOUR, predicted)]
+    curves = [("model", colours.EXTENDED, predicted)]
     return tuple(_series(found.model, found.runs, found.noise, curves))
 
 

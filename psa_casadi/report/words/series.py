@@ -12,14 +12,11 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words import phrases
+from psa_casadi.report.words import colours, phrases
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
-
-MEASURED_COLOUR, BASE_COLOUR, EXTENDED_COLOUR = "#3a3a3a", "#d55e00", "#0072b2"
-NOISE_COLOUR, HELD_OUT_COLOUR = "#8a8a8a", "#f3e9c4"
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +112,9 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     rows = []
     levels = [n.level for n in d.noise] or [d.noise_floor_rms_m] * len(d.experiments)
     for e, base, extended, noise in zip(d.experiments, d.base, d.extended, levels, strict=True):
-        curves = [Curve("base model", BASE_COLOUR, base)]
+        curves = [Curve("base model", colours.BASE, base)]
         if phrases.added(d):
-            curves.append(Curve("extended model", EXTENDED_COLOUR, extended))
+            curves.append(Curve("extended model", colours.EXTENDED, extended))
         rows.append(_series(e, curves, noise))
     return tuple(rows)
 
@@ -132,7 +129,7 @@ def series_of_fit(found: Identification) -> tuple[Series, ...]:
     predictions = found.fit.predicted(found.experiments)
     for e, predicted in zip(found.experiments, predictions, strict=True):
         noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
-        rows.append(_series(e, [Curve("model", EXTENDED_COLOUR, predicted)], noise))
+        rows.append(_series(e, [Curve("model", colours.EXTENDED, predicted)], noise))
     return tuple(rows)
 
 
@@ -152,8 +149,8 @@ def _series(e: Experiment, curves: Sequence[Curve], noise: float) -> Series:
 def bar_colour(candidate: Candidate, causes: set[str]) -> str:
     """Return the colour of a candidate: named, fitted, or screened only."""
     if candidate.effect in causes:
-        return EXTENDED_COLOUR
-    return BASE_COLOUR if candidate.fitted else NOISE_COLOUR
+        return colours.EXTENDED
+    return colours.BASE if candidate.fitted else colours.NOISE
 
 
 def spans(marked: BoolArray) -> list[tuple[int, int]]:

@@ -7,20 +7,7 @@ from psa_casadi.diagnosis.held_out import Budget, Share
 from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
-from psa_casadi.report.words.phrases import (
-    Scale,
-    added,
-    confidence_text,
-    either,
-    interval_text,
-    listing,
-    number,
-    percent,
-    plain,
-    scale_of,
-    shown_in,
-    with_unit,
-)
+from psa_casadi.report.words import phrases
 from psa_casadi.report.words.tables import Table
 from psa_casadi.units import convert
 
@@ -59,10 +46,8 @@ def gain_sentence(d: Diagnosis) -> str:
 
 def verdict_sentence(d: Diagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
-    error = (
-        f"the base model's held-out error is {number(d.base_errors.holdout_nrmse_percent, 2)} %"
-        " of the range"
-    )
+    share = phrases.number(d.base_errors.holdout_nrmse_percent, 2)
+    error = f"the base model's held-out error is {share} % of the range"
     if d.doubt and d.verdict == "adequate":
         return f"Nothing beyond the noise is seen to be missing; {d.doubt}."
     if d.doubt:
@@ -100,11 +85,11 @@ def naming_sentence(d: "Diagnosis | OdeDiagnosis", causes: Sequence[str]) -> str
     gain = "" if d.budget is not None else gain_sentence(d)
     if d.verdict == "ambiguous":
         first = d.causes[0]
-        rivals = either((first.effect, *first.cannot_be_told_from))
-        together = listing([plain(c.effect) for c in d.causes])
+        rivals = phrases.either((first.effect, *first.cannot_be_told_from))
+        together = phrases.listing([phrases.plain(c.effect) for c in d.causes])
         gone = f"with {together}, {gain}" if gain else f"{together} {removal}"
         return f"Something is missing, and these data do not decide whether it is {rivals}; {gone}."
-    are = f"{'cause is' if len(causes) == 1 else 'causes are'} {listing(causes)}"
+    are = f"{'cause is' if len(causes) == 1 else 'causes are'} {phrases.listing(causes)}"
     subject = "it" if len(causes) == 1 else "together they"
     gone = gain or f"{subject} {removal}"
     if d.verdict == "partly_explained":
@@ -123,34 +108,36 @@ def _without_name(d: Diagnosis) -> str:
     if b is not None and d.kept:
         one = len(d.kept) == 1
         said = (
-            f"{listing([plain(name) for name in d.kept])} {'removes' if one else 'remove'}"
-            f" {percent(within(b.together.share))} of the error above the noise and"
+            f"{phrases.listing([phrases.plain(name) for name in d.kept])}"
+            f" {'removes' if one else 'remove'}"
+            f" {phrases.percent(within(b.together.share))} of the error above the noise and"
             f" {'is' if one else 'are'} kept in the extended model without being"
             f" {'a cause' if one else 'causes'}; "
         )
     if b is not None and d.patch is not None and b.unnamed is not None:
-        more = "a further " if added(d) else ""
-        share = percent(within(b.unnamed.share))
+        more = "a further " if phrases.added(d) else ""
+        share = phrases.percent(within(b.unnamed.share))
         said += f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
     return said
 
 
 def named_cause(cause: "Cause | PortCause", where: str) -> str:
     """Name a cause with its place, how sure it is, and what it cannot be told from."""
-    sure = f"{where}, {confidence_text(cause.confidence)}"
+    sure = f"{where}, {phrases.confidence_text(cause.confidence)}"
     if cause.cannot_be_told_from:
-        sure += f"; or {either(cause.cannot_be_told_from)}"
-    return f"{plain(cause.effect)} ({sure})"
+        sure += f"; or {phrases.either(cause.cannot_be_told_from)}"
+    return f"{phrases.plain(cause.effect)} ({sure})"
 
 
 def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
     """Say which of two causes an exported plant holds, and what that makes of its displacement."""
-    apart = scale_of(d.experiments, a.plant_differs_m).text(a.plant_differs_m, 2)
+    apart = phrases.scale_of(d.experiments, a.plant_differs_m).text(a.plant_differs_m, 2)
     inside = any(c.name == a.cause for c in d.model.plant().components)
     holds = "holds" if inside else "leaves out"
     return (
-        f"an exported plant {holds} the {plain(a.cause)}; with {plain(a.instead)} in its place its"
-        f" displacement differs by up to {apart} ({number(a.plant_differs_percent, 2)} % of range),"
+        f"an exported plant {holds} the {phrases.plain(a.cause)}; with {phrases.plain(a.instead)}"
+        f" in its place its displacement differs by up to {apart}"
+        f" ({phrases.number(a.plant_differs_percent, 2)} % of range),"
         " which these data do not decide"
     )
 
@@ -159,9 +146,9 @@ def column_sentence(d: Diagnosis, c: Decision) -> str:
     """Say what a further column decided, and what the models miss of it in held-out samples."""
     if c.base_rms is None or c.noise is None or c.extended_rms is None:
         return c.sentence
-    after = f", extended {number(c.extended_rms)}" if added(d) else ""
-    errors = f"base {number(c.base_rms)}{after}, noise {number(c.noise)}"
-    return f"{c.sentence} Held-out rms: {with_unit(errors, c.unit)}."
+    after = f", extended {phrases.number(c.extended_rms)}" if phrases.added(d) else ""
+    errors = f"base {phrases.number(c.base_rms)}{after}, noise {phrases.number(c.noise)}"
+    return f"{c.sentence} Held-out rms: {phrases.with_unit(errors, c.unit)}."
 
 
 def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str:
@@ -173,16 +160,16 @@ def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str
     effect = next((c for c in d.model.components if c.name == cause.effect), None)
     if effect is not None and effect.count > 1:
         tones = sorted(d.model.values[p.name] for p in effect.parameters if p.unit == "Hz")
-        return f"at {', '.join(number(v) for v in tones)} Hz"
+        return f"at {', '.join(phrases.number(v) for v in tones)} Hz"
     weights = [n for n in cause.parameters if effect is not None and n in effect.linear]
     texts = []
     for name, e in cause.parameters.items():
         if name in weights:
             continue
-        unit, display = shown_in(d.model, name)
+        unit, display = phrases.shown_in(d.model, name)
         value, low, high = (convert(v, unit, display) for v in (e.value, *e.interval))
-        estimate = with_unit(number(value), display)
-        texts.append(f"{name} = {estimate} ({interval_text(low, high)})")
+        estimate = phrases.with_unit(phrases.number(value), display)
+        texts.append(f"{name} = {estimate} ({phrases.interval_text(low, high)})")
     if weights:
         texts.append(f"{len(weights)} weights, which shape its loop together")
     return ", ".join(texts)
@@ -190,56 +177,58 @@ def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str
 
 def patch_text(patch: Patch) -> str:
     """Say what the unnamed correction is, and what else it may be."""
-    others = listing(patch.open_to, "or")
+    others = phrases.listing(patch.open_to, "or")
     rest = f"; these data cannot distinguish it from {others}" if others else ""
     return f"{patch.sentence}, at the {patch.port}{rest}"
 
 
-def budget_sentence(d: Diagnosis, scale: Scale) -> str:
+def budget_sentence(d: Diagnosis, scale: phrases.Scale) -> str:
     """Say where the held-out error above the noise goes."""
     b = d.budget
     if b is None:
         return ""
     parts = [f"of {scale.text(b.excess_rms_m)} rms above the noise"]
-    if added(d):
+    if phrases.added(d):
         parts.append(_removed(b))
     if b.unnamed is not None and d.patch is not None:
-        more = "a further" if added(d) else "of it"
+        more = "a further" if phrases.added(d) else "of it"
         parts.append(
             f"an unnamed correction would remove {more} {b.unnamed.text}: {patch_text(d.patch)}"
         )
-    if added(d):
-        left = f"{scale.text(b.remains_rms_m)} ({number(b.remains_percent, 2)} % of the range)"
+    if phrases.added(d):
+        left = (
+            f"{scale.text(b.remains_rms_m)} ({phrases.number(b.remains_percent, 2)} % of the range)"
+        )
         parts.append(f"above the noise the extended model leaves {left}")
     return "; ".join(parts)
 
 
 def _removed(b: Budget) -> str:
     """Say what the causes remove; where they stand in for each other, what they do together."""
-    each = listing([f"{plain(c.what)} removes {c.text}" for c in b.causes])
+    each = phrases.listing([f"{phrases.plain(c.what)} removes {c.text}" for c in b.causes])
     alone = sum(c.share for c in b.causes)
     if len(b.causes) < 2 or b.together.share <= 0.0 or alone > 0.5 * b.together.share:
         return each
-    names = listing([plain(c.what) for c in b.causes])
+    names = phrases.listing([phrases.plain(c.what) for c in b.causes])
     return (
         f"{names} together remove {b.together.text}; each can do most of what another does, so that"
         f" beside the others {each}"
     )
 
 
-def budget_table(d: Diagnosis, scale: Scale) -> Table:
+def budget_table(d: Diagnosis, scale: phrases.Scale) -> Table:
     """Return the shares of the base model's held-out error: power above the noise, and rms."""
     b = d.budget
     if b is None:
         return Table(("", "share", "95 % interval"), ())
-    rows = [share_row(plain(c.what), c) for c in b.causes]
+    rows = [share_row(phrases.plain(c.what), c) for c in b.causes]
     if len(b.causes) > 1:
         rows.append(share_row("all causes together" if d.causes else "all together", b.together))
     if b.unnamed is not None and d.patch is not None:
         rows.append(share_row(f"unnamed: {d.patch.name}", b.unnamed))
-    remains = number(scale.factor * b.remains_rms_m)
+    remains = phrases.number(scale.factor * b.remains_rms_m)
     share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
-    shown = "under 1 %" if 0.0 < share < 0.005 else percent(share)
+    shown = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
     rows.append(("remains above the noise", f"{shown}, {remains} {scale.unit}", ""))
     return Table(("what", "removes", "95 % interval"), tuple(rows))
 

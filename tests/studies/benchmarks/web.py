@@ -19,8 +19,9 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page.document import render
 from psa_casadi.report.page.live import LiveModel, LiveRecord
 from psa_casadi.report.page.playground import playground
+from psa_casadi.report.words import colours
 from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.series import EXTENDED_COLOUR, Curve, Series
+from psa_casadi.report.words.series import Curve, Series
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
@@ -179,7 +180,7 @@ def _page(model: Model, n: int) -> str:
     measured = y + NOISE * np.random.default_rng(1).standard_normal(n)
     module: Future[bytes | None] = Future()
     module.set_result(web_module(model))
-    curve, none = Curve("model", EXTENDED_COLOUR, y), np.zeros(n, dtype=bool)
+    curve, none = Curve("model", colours.EXTENDED, y), np.zeros(n, dtype=bool)
     row = LiveRecord(Series("record", t, v, measured, (curve,), none, NOISE, False), {"voltage": v})
     live = LiveModel(model, module, [row])
     title = "A model in a page"
