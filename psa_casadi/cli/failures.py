@@ -1,7 +1,6 @@
 """How a command ends: 2 for the user's input, 1 for everything else, 130 for Ctrl-C."""
 
 import atexit
-import contextlib
 import errno
 import functools
 import io
@@ -12,7 +11,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn, ParamSpec
@@ -116,14 +115,11 @@ _MEMORY = ("bad_alloc", "failed to map segment", "Cannot allocate memory", "cann
 
 
 def prepare() -> None:
-    """Give a command streams that can be written to, and an end that leaves nothing behind."""
-    _open_streams()
-    answer_requests_to_end()
-    _take_temporary_folder()
-    sweep_rooms()
+    """Give a command streams that can be written to, and an end that leaves nothing behind.
 
-
-def _open_streams() -> None:
+    All temporary files, those of other packages and programs too, lie in a folder of ours. Where
+    none can be made, the first to need one says so.
+    """
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
             os.fstat(descriptor)
@@ -133,29 +129,16 @@ def _open_streams() -> None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):  # letters that it lacks; stderr spells them out
         sys.stdout.reconfigure(errors="replace")
-
-
-def _take_temporary_folder() -> None:
-    """Let all temporary files, those of other packages and programs too, lie in a folder of ours.
-
-    Where none can be made, the first to need one says so.
-    """
-    with contextlib.suppress(OSError):
-        held = contextlib.ExitStack()
+    answer_requests_to_end()
+    with suppress(OSError):
+        held = ExitStack()
         folder = str(held.enter_context(temporary_folder()))
         atexit.register(held.close)
         tempfile.tempdir = os.environ["TMPDIR"] = folder
+    sweep_rooms()
 
 
-def silence() -> None:
-    """Let what is still to be written vanish: nobody reads it any more."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(nowhere, stream.fileno())
-
-
-def refused_by_the_machine(error: BaseException) -> str | None:
+def _refused_by_the_machine(error: Exception) -> str | None:
     """Return what the machine refused and what to do; None where the error is not of this kind."""
     said = str(error)
     if isinstance(error, MemoryError) or any(word in said for word in _MEMORY):
@@ -202,47 +185,39 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
                 command(*args, **options)
         except (typer.Exit, typer.Abort):
             raise
-        except BrokenPipeError as error:
-            silence()
+        except BrokenPipeError as error:  # nobody reads any more what is still to be written
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in (sys.stdout, sys.stderr):
+                with suppress(OSError, ValueError):
+                    os.dup2(nowhere, stream.fileno())
             raise typer.Exit(1) from error
         except KeyboardInterrupt as stop:
             there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
             told = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
             tell(f"Interrupted: {told}")
             raise typer.Exit(INTERRUPTED) from None
-        except InputError as error:
-            if os.environ.get(DEBUG):
-                raise
-            _tell_problems(error.problems)
-            raise typer.Exit(2) from error
         except Exception as error:
             if os.environ.get(DEBUG):
                 raise
-            _tell_failure(error)
-            raise typer.Exit(1) from error
+            for line in _told(error):
+                tell(line)
+            raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
 
     return run
 
 
-def _tell_problems(problems: tuple[str, ...]) -> None:
-    if len(problems) == 1:
-        tell(f"Error: {problems[0]}")
-        return
-    count = sum(not p.startswith("... and") for p in problems)
-    tell(f"Error: {count} problems with what was given:")
-    for problem in problems:
-        tell(f"  - {problem}")
-
-
-def _tell_failure(error: Exception) -> None:
+def _told(error: Exception) -> list[str]:
+    """Return what is said of an error."""
+    if isinstance(error, InputError):
+        if len(error.problems) == 1:
+            return [f"Error: {error.problems[0]}"]
+        count = sum(not p.startswith("... and") for p in error.problems)
+        each = (f"  - {problem}" for problem in error.problems)
+        return [f"Error: {count} problems with what was given:", *each]
     if isinstance(error, (PsaError, MachineError)):
-        tell(f"Failed: {error}")
-        return
-    refused = refused_by_the_machine(error)
-    if refused is not None:
-        tell(f"Failed: {refused}")
-        return
-    tell(
-        f"Failed: an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi,"
-        f" not of the input; set {DEBUG}=1 to see where it happened, and report it."
+        return [f"Failed: {error}"]
+    fault = (
+        f"an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi, not of the"
+        f" input; set {DEBUG}=1 to see where it happened, and report it."
     )
+    return [f"Failed: {_refused_by_the_machine(error) or fault}"]
