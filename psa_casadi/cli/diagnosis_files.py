@@ -7,12 +7,7 @@ from pathlib import Path
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.design.experiment import experiment
-from psa_casadi.diagnosis.result import (
-    Alternative,
-    Diagnosis,
-    DiagnosisInterrupted,
-    NextExperiment,
-)
+from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.errors import PsaError
 from psa_casadi.files import atomic_write
@@ -21,7 +16,7 @@ from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added
 
 
-def alternatives(d: Diagnosis, output: Path | None) -> list[tuple[Alternative, Path]]:
+def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
     """Return the models with another cause, each with its file beside the extended model's."""
     if output is None:
         return []
@@ -31,7 +26,7 @@ def alternatives(d: Diagnosis, output: Path | None) -> list[tuple[Alternative, P
     ]
 
 
-def noted(d: Diagnosis, left_out: Sequence[str]) -> Diagnosis:
+def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
     """Say in the remarks which effects were not looked for."""
     if not left_out:
         return d
@@ -39,7 +34,7 @@ def noted(d: Diagnosis, left_out: Sequence[str]) -> Diagnosis:
     return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
 
 
-def models(d: Diagnosis, output: Path | None) -> list[str]:
+def models(d: result.Diagnosis, output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"
@@ -50,7 +45,7 @@ def models(d: Diagnosis, output: Path | None) -> list[str]:
     return lines
 
 
-def keep_unfinished(stop: DiagnosisInterrupted, outputs: Mapping[str, Path | None]) -> str:
+def keep_unfinished(stop: result.DiagnosisInterrupted, outputs: Mapping[str, Path | None]) -> str:
     """Write the best model so far, and say that."""
     output = outputs["--output"]
     if output is not None:
@@ -59,7 +54,9 @@ def keep_unfinished(stop: DiagnosisInterrupted, outputs: Mapping[str, Path | Non
     return kept(f"there is no verdict; {stop}", [output], missing, " (marked as interrupted)")
 
 
-def keep(d: Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]) -> str:
+def keep(
+    d: result.Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]
+) -> str:
     """Write what takes no time of a finished diagnosis, and say which files there are."""
     quick = ("--output", "--json")
     write(d, {o: p if o in quick else None for o, p in outputs.items()}, origin, written)
@@ -68,7 +65,7 @@ def keep(d: Diagnosis, outputs: Mapping[str, Path | None], origin: str, written:
 
 
 def write(
-    d: Diagnosis,
+    d: result.Diagnosis,
     outputs: Mapping[str, Path | None],
     origin: str,
     written: list[Path],
@@ -94,7 +91,9 @@ def write(
         written.append(path)
 
 
-def with_next(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) -> Diagnosis:
+def with_next(
+    d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]
+) -> result.Diagnosis:
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or d.verdict != "ambiguous":
         return d
@@ -114,11 +113,11 @@ def with_next(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) 
     played = design.record
     write_record(path, {"time [s]": played.time, "voltage [V]": played.voltage})
     reasons = (f"Apply {path} and diagnose all records together.", *each, *same)
-    following = NextExperiment(str(path), design.names, reasons, dict(design.chance))
+    following = result.NextExperiment(str(path), design.names, reasons, dict(design.chance))
     return replace(d, next_experiment=following)
 
 
-def write_patch(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
+def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
     """Write the model with the unnamed correction; say why where there is none to write."""
     if path is None:
         return ""
