@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.expected import judge
+from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading, StackName
 from psa_casadi.cli.screen import show, show_table, tell_written, working

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.expected import cases, expected, judge
+from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given, meant
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
 from psa_casadi.cli.screen import show, show_table, tell_written, width, working
@@ -88,7 +88,7 @@ def diagnose(
             _keep_apart(given, output, model)
             found = given.records(records, reading, held)
             start = given.model_or_stack(model, stack, needed=False)
-            wanted = expected(given, expect, max_error)
+            wanted = files.expected(given, expect, max_error)
             given.check()
         with working("diagnosing", given.quiet, DIAGNOSE) as progress, events_to(events) as watch:
             try:
@@ -113,7 +113,7 @@ def diagnose(
         took = clock.process_time()
         show(f"\nprocessor time with the start of Python: {took:.2f} s", given.quiet)
     subject = ", ".join(p.name for p in records)
-    judge("diagnose", subject, cases(d, *wanted), junit, began, tells=True)
+    judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
 
 
 def _finish(

@@ -1,19 +1,23 @@
-"""The files of `psa diagnose`: what was asked for, and what an interrupt leaves of it."""
+"""The files of `psa diagnose`, what an interrupt leaves of them, and what CI asks of a result."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
+from psa_casadi.cli.inputs import Given, meant
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.errors import PsaError
 from psa_casadi.files import atomic_write
 from psa_casadi.records import write_record
+from psa_casadi.report.documents.junit import Case
 from psa_casadi.report.words.design_words import sentences
-from psa_casadi.report.words.phrases import added
+from psa_casadi.report.words.phrases import added, listing, number
+from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 
 
 def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
@@ -127,3 +131,38 @@ def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str]
     except PsaError as error:
         return f"{path} was not written: {error}"
     return ""
+
+
+def expected(
+    given: Given, verdicts: str | None, max_error: str | None
+) -> tuple[tuple[str, ...], float | None]:
+    """Return the verdicts of which one must come out, and the largest held-out error [%]."""
+    words = [re.sub(r"[\s-]+", "_", w.strip().lower()) for w in (verdicts or "").split(",")]
+    wanted, there = tuple(dict.fromkeys(w for w in words if w)), f"there are {', '.join(VERDICTS)}."
+    if verdicts is not None and not wanted:
+        given.add(f"--expect names no verdict; {there}")
+    for word in wanted:
+        if word not in VERDICTS:
+            given.add(f"--expect: '{word}' is no verdict; {meant(word, VERDICTS)}{there}")
+    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
+    largest = float(found[1]) if found else 0.0
+    if max_error is not None and not largest > 0.0:
+        given.add(
+            f"--max-error is '{max_error}'; give a positive percentage of the range, as 0.5%."
+        )
+    return wanted, None if max_error is None else largest
+
+
+def cases(d: result.Diagnosis, verdicts: tuple[str, ...], max_error: float | None) -> list[Case]:
+    """Return verdict and held-out error of the extended model as tests, failed or passed."""
+    wrong = large = ""
+    if verdicts and d.verdict not in verdicts:
+        wrong = f"The verdict is {d.verdict}; expected {listing(verdicts, 'or')}."
+    error = d.extended_errors.holdout_nrmse_percent
+    shown = f"{number(error)} % of the range"
+    if max_error is not None and not error <= max_error:
+        large = f"The extended model's held-out error is {shown}; expected {max_error:g} % at most."
+    return [
+        Case("verdict", f"{d.verdict}: {verdict_sentence(d)}", wrong),
+        Case("held-out error", f"{shown} by the extended model", large),
+    ]

@@ -10,11 +10,12 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn, ParamSpec
+from typing import TYPE_CHECKING, NoReturn, ParamSpec
 
 import typer
 
@@ -22,8 +23,17 @@ from psa_casadi.cache import sweep_rooms
 from psa_casadi.cli import INTERRUPTED
 from psa_casadi.cli.screen import tell
 from psa_casadi.errors import InputError, MachineError, PsaError
-from psa_casadi.files import abandon, answer_requests_to_end, temporary_folder, written
+from psa_casadi.files import (
+    abandon,
+    answer_requests_to_end,
+    atomic_write,
+    temporary_folder,
+    written,
+)
 from psa_casadi.interruption import Work, interruptible_work
+
+if TYPE_CHECKING:
+    from psa_casadi.report.documents.junit import Case
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -221,3 +231,27 @@ def _told(error: Exception) -> list[str]:
         f" input; set {DEBUG}=1 to see where it happened, and report it."
     )
     return [f"Failed: {_refused_by_the_machine(error) or fault}"]
+
+
+def judge(
+    command: str,
+    subject: str,
+    cases: "Sequence[Case]",
+    junit: Path | None,
+    began: float,
+    *,
+    tells: bool = False,
+) -> None:
+    """Write what was found of a subject as tests, if a file is named; end with 1 if one failed.
+
+    `began` is when the command did, of `time.perf_counter`; with `tells` each failure is told.
+    """
+    from psa_casadi.report.documents.junit import junit_text
+
+    if junit is not None:
+        atomic_write(junit, junit_text(command, subject, cases, time.perf_counter() - began))
+    failures = [case.failure for case in cases if case.failure]
+    for failure in failures if tells else ():
+        tell(f"Not as expected: {failure}")
+    if failures:
+        raise typer.Exit(1)
