@@ -120,13 +120,12 @@ class Imported:
     @property
     def foreign(self) -> Foreign:
         """What a component declares of it."""
+        return Foreign(self.name, self._addresses)
 
-        def addresses() -> tuple[int, int]:
-            names = (self.name, f"fwd1_{self.name}")
-            value, slope = (ctypes.cast(self.library[n], c_void_p).value or 0 for n in names)
-            return value, slope
-
-        return Foreign(self.name, addresses)
+    def _addresses(self) -> tuple[int, int]:  # a method, as it is pickled
+        names = (self.name, f"fwd1_{self.name}")
+        value, slope = (ctypes.cast(self.library[n], c_void_p).value or 0 for n in names)
+        return value, slope
 
     @cached_property
     def function(self) -> ca.Function:
