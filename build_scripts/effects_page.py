@@ -35,24 +35,26 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     """Return the text of a page, the one of effects with all of them below."""
     if page.file.src_uri != PAGE:
         return markdown
-    places = dict.fromkeys(e.belongs_to for e in EFFECTS.values())
-    sections = [
-        "\n\n".join(
-            [f"## In the {place}", *(section(e) for e in EFFECTS.values() if e.belongs_to == place)]
-        )
-        for place in places
+    parts = [
+        markdown,
+        f"In the [playground]({PLAYGROUND}) each effect has a switch and sliders, under any"
+        " voltage ([how](web.md)).",
+        markdown_table(overview()),
     ]
-    return "\n\n".join(
-        [
-            markdown,
-            f"In the [playground]({PLAYGROUND}) each effect has a switch and sliders, under any"
-            " voltage ([how](web.md)).",
-            markdown_table(overview()),
-            *sections,
-            "## Several modes",
-            section(MODAL_SERIES[FEWEST]),
-        ]
-    )
+    for place in dict.fromkeys(e.belongs_to for e in EFFECTS.values()):
+        parts.append(f"## In the {place}")
+        parts += [section(e) for e in EFFECTS.values() if e.belongs_to == place]
+    return "\n\n".join([*parts, "## Several modes", section(MODAL_SERIES[FEWEST])])
+
+
+def overview() -> Table:
+    """Return what every effect looks like, in a line each."""
+    rows = tuple(  # a narrow column may break a name behind an underscore
+        (f"[<code>{e.name.replace('_', '_<wbr>')}</code>](#{e.name})", e.belongs_to,
+         _sentence(e.looks_like))
+        for e in EFFECTS.values()
+    )  # fmt: skip
+    return Table(("effect", "in the", "what it looks like"), rows)
 
 
 @cache
@@ -64,15 +66,6 @@ def picture(name: str) -> tuple[bytes, str]:
         path = Path(folder) / "signature.png"
         save_signature(effect, seen, path)
         return path.read_bytes(), size_sentence(seen)
-
-
-def overview() -> Table:
-    """Return what every effect looks like, in a line each."""
-    rows = tuple(
-        (f"[<code>{_breaking(e.name)}</code>](#{e.name})", e.belongs_to, _sentence(e.looks_like))
-        for e in EFFECTS.values()
-    )
-    return Table(("effect", "in the", "what it looks like"), rows)
 
 
 def section(effect: Component) -> str:
@@ -102,11 +95,6 @@ def markdown_table(table: Table) -> str:
     rows = [table.head, ["---"] * len(table.head), *table.rows]
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in cells)
-
-
-def _breaking(name: str) -> str:
-    """Return a name that a narrow column may break behind an underscore."""
-    return name.replace("_", "_<wbr>")
 
 
 def _sentence(text: str) -> str:

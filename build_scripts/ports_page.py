@@ -93,34 +93,27 @@ def port_table(model: Model) -> str:
 
 
 def _rows(inputs: Iterable[Input], outputs: Iterable[Output]) -> Iterator[tuple[str, ...]]:
-    for p in inputs:
-        yield f"`{p.name}`", "in", p.unit, number(p.start, 5), positive(p.name), p.description
-    for q in outputs:
-        yield f"`{q.name}`", "out", q.unit, "follows", positive(q.name), q.description
-
-
-def positive(name: str) -> str:
-    """Return where a port is positive; an estimate has the sign of what it estimates."""
-    return "what is estimated is" if name.endswith("_hat") else POSITIVE[name]
+    """Yield the row of each port; an estimate has the sign of what it estimates."""
+    ports: list[tuple[str, str, Input | Output]] = []
+    ports += [("in", number(p.start, 5), p) for p in inputs]
+    ports += [("out", "follows", q) for q in outputs]
+    for way, start, q in ports:
+        positive = "what is estimated is" if q.name.endswith("_hat") else POSITIVE[q.name]
+        yield f"`{q.name}`", way, q.unit, start, positive, q.description
 
 
 def _further(stack: Model) -> Iterator[tuple[str, ...]]:
     """Yield the ports that effects, options and sensors add to a stack, with what adds them."""
-    whole = stack_model(STACK)
-    outside = "`--include-sensor`"
+    whole, outside = stack_model(STACK), "`--include-sensor`"
     adding: list[tuple[str, Component | Structure]] = [
-        *(
-            (f"effect `{e.name}`{'' if e.in_plant else f', {outside}'}", e)
-            for e in EFFECTS.values()
-        ),
+        *((f"effect `{e.name}`", e) for e in EFFECTS.values()),
         (outside, whole.structure),
         ("`psa design mechanism --port`", port_model(whole).structure),
         ("`--validity-output`", COMPONENTS["validity"]),
+        *(("a record with the column", COMPONENTS[n]) for n in _SENSORS),
     ]
-    for sensor in (COMPONENTS[n] for n in _SENSORS):
-        kept = "" if sensor.in_plant else f", {outside}"
-        adding.append((f"a record with the column{kept}", sensor))
-    for how, source in adding:
+    for adds, source in adding:
+        how = adds if getattr(source, "in_plant", True) else f"{adds}, {outside}"
         inputs = [p for p in source.inputs if p.name not in stack.input_names]
         outputs = [q for q in source.outputs if q.name not in stack.output_names]
         yield from ((how, *row) for row in _rows(inputs, outputs))

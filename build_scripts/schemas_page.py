@@ -66,18 +66,13 @@ def kind(name: str, schema: Schema) -> str:
         return ", ".join(f"`{json.dumps(value)}`" for value in values)
     if "anyOf" in schema:
         return " or ".join(kind(name, s) for s in schema["anyOf"])
-    return _several(name, schema) or str(schema.get("type", "anything"))
-
-
-def _several(name: str, schema: Schema) -> str:
-    """Return what a list or a mapping holds; "" where a value is neither."""
     if "prefixItems" in schema:
         return f"[{', '.join(kind(name, s) for s in schema['prefixItems'])}]"
     if schema.get("type") == "array":
         kinds = [kind(name, s) for s in schema["items"].get("anyOf", [schema["items"]])]
         return f"list of {' or '.join(k + 's' * (k in _COUNTED) for k in kinds)}"
     named = schema.get("additionalProperties")
-    return f"by name: {kind(name, named)}" if named else ""
+    return f"by name: {kind(name, named)}" if named else str(schema.get("type", "anything"))
 
 
 def _members(name: str, schema: Schema) -> Table:

@@ -38,8 +38,16 @@ def cache_directory() -> Path:
 
 def _wanted() -> Path:
     """Return the cache that the user wants; raises RuntimeError for one without a home."""
-    override = os.environ.get(VARIABLE)
-    return Path(override).absolute() if override else _base() / "psa_casadi"
+    if override := os.environ.get(VARIABLE):
+        return Path(override).absolute()
+    if platform.system() == "Windows":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    elif platform.system() == "Darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:  # as its specification says
+        base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        base = base if base.is_absolute() else Path.home() / ".cache"
+    return base / "psa_casadi"
 
 
 def cached(
@@ -86,15 +94,6 @@ def writable_room(room: str) -> Path:
     return _private() / room
 
 
-def _base() -> Path:
-    if platform.system() == "Windows":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    if platform.system() == "Darwin":
-        return Path.home() / "Library" / "Caches"
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return given if given.is_absolute() else Path.home() / ".cache"  # as its specification says
-
-
 @functools.cache
 def _private() -> Path:
     """Return a folder for this process, removed when it ends."""
@@ -119,33 +118,26 @@ def _refuse(room: Path, error: OSError) -> None:
 def _found_or_made(
     room: Path, name: str, make: Callable[[Path], Path], usable: Callable[[Path], object]
 ) -> Path:
-    path = room / name
+    path, beside = room / name, room / f"{name}.sha256"
     _make_ours(room)
-    if not _is_whole(path):
+    try:
+        whole = _read(beside) == _checksum(name, _read(path))
+    except OSError:
+        whole = False
+    if not whole:
         if room in _REFUSED:
             raise OSError(errno.EACCES, "not written to any more", str(room))
         with temporary_folder(room) as work:
-            _keep(make(work), path)
+            made = make(work)
+            checksum = made.with_name(beside.name)
+            checksum.write_bytes(_checksum(name, made.read_bytes()))
+            for source, target in ((checksum, beside), (made, path)):
+                if target.is_dir() and not target.is_symlink():
+                    shutil.rmtree(target)
+                source.chmod(0o700)
+                replace_durably(source, target)
     usable(path)
     return path
-
-
-def _keep(made: Path, path: Path) -> None:
-    """Put a file and its checksum where they belong; a file without the right one is made again."""
-    checksum = made.with_name(f"{path.name}.sha256")
-    checksum.write_bytes(_checksum(path.name, made.read_bytes()))
-    for source, target in ((checksum, _checksum_path(path)), (made, path)):
-        if target.is_dir() and not target.is_symlink():
-            shutil.rmtree(target)
-        source.chmod(0o700)
-        replace_durably(source, target)
-
-
-def _is_whole(path: Path) -> bool:
-    try:
-        return _read(_checksum_path(path)) == _checksum(path.name, _read(path))
-    except OSError:
-        return False
 
 
 def _read(path: Path) -> bytes:
@@ -155,10 +147,6 @@ def _read(path: Path) -> bytes:
         raise OSError(errno.EINVAL, "no plain file", str(path))
     _demand_ours(path, status)
     return path.read_bytes()
-
-
-def _checksum_path(path: Path) -> Path:
-    return path.with_name(f"{path.name}.sha256")
 
 
 def _checksum(name: str, content: bytes) -> bytes:

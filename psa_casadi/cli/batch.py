@@ -9,7 +9,7 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import Hysteresis, Reading, Stiffness
+from psa_casadi.cli.options import Hysteresis, Reading
 from psa_casadi.cli.screen import show, tell_written, working
 
 #: Devices without a result that are told one by one.
@@ -25,7 +25,7 @@ def batch(
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     dask: str | None = None,
     model: Path | None = None,
-    stiffness: Stiffness = None,
+    stiffness: float | None = None,
     hysteresis: Hysteresis = None,
     reading: Reading,
     given: Given,

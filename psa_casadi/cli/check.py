@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.expected import judge
+from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import Columns, Junit, ModelFile, Reading, StackName
+from psa_casadi.cli.options import Reading, StackName
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.files import atomic_write
 
@@ -17,14 +17,14 @@ from psa_casadi.files import atomic_write
 def check(
     fmu: Path,
     *,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: StackName = None,
     evidence: bool = False,
     record: list[Path] | None = None,
-    columns: Columns = None,
+    columns: str | None = None,
     portable: bool = False,
     json: Path | None = None,
-    junit: Junit = None,
+    junit: Path | None = None,
     timeout: Annotated[float, typer.Option(min=0.1, max=1e6)] = 600.0,
     memory: Annotated[int, typer.Option(min=64)] = 4096,
     given: Given,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.options import NamesOnly, names
+from psa_casadi.cli.options import names
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.errors import InputError
 
@@ -14,7 +14,7 @@ def datasets(
     name: Annotated[str | None, typer.Argument(autocompletion=names("datasets"))] = None,
     *,
     output: Path | None = None,
-    quiet: NamesOnly = False,
+    quiet: bool = False,
 ) -> None:
     """List public records; show the source and licence of one; write its records to a folder.
 
@@ -22,6 +22,7 @@ def datasets(
     downloaded from their authors and checked.
 
     Options:
+        quiet: Print names only.
         name: Name of one dataset.
         output: Folder to write its records to, as CSV files.
     """

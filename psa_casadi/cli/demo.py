@@ -9,7 +9,7 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.screen import Quiet, show, show_table, width, working
+from psa_casadi.cli.screen import show, show_table, width, working
 from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write, make_folder
@@ -47,7 +47,7 @@ def demo(
     directory: Annotated[Path | None, typer.Argument(show_default="psa_demo")] = None,
     *,
     output: Path | None = None,
-    quiet: Quiet = False,
+    quiet: bool = False,
 ) -> None:
     """Identify, diagnose, extend, export and check a stack, on a synthetic record.
 

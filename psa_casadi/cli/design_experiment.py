@@ -7,7 +7,7 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import ModelFile, Reading, StackName, Still, names
+from psa_casadi.cli.options import Reading, StackName, names
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 
 
@@ -17,7 +17,7 @@ def experiment(
         typer.Argument(show_default=False, metavar="EFFECT", autocompletion=names("effects")),
     ] = None,
     *,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: StackName = None,
     record: list[Path] | None = None,
     separate: Annotated[list[str] | None, typer.Option(autocompletion=names("effects"))] = None,
@@ -37,7 +37,7 @@ def experiment(
     seed: int = 1,
     output: Path | None = None,
     report: Path | None = None,
-    still: Still = False,
+    still: bool = False,
     reading: Reading,
     given: Given,
 ) -> None:

@@ -5,14 +5,7 @@ from pathlib import Path
 
 from psa_casadi.cli.inputs import Given
 from psa_casadi.component import Component
-from psa_casadi.design.experiment.criteria import (
-    Optimality,
-    Rival,
-    SensorNoise,
-    noise_of_fit,
-    rival_of_fit,
-    rival_of_model,
-)
+from psa_casadi.design.experiment import criteria
 from psa_casadi.design.experiment.experiment import (
     Informative,
     Separated,
@@ -67,14 +60,16 @@ def limits_given(
     return Limits(samples=int(given.pop("samples")), **given)
 
 
-def noise_of(model: Model, limits: Limits, noise: float | None, correlation: float) -> SensorNoise:
+def noise_of(
+    model: Model, limits: Limits, noise: float | None, correlation: float
+) -> criteria.SensorNoise:
     """Return the noise [nm] as given, else a share of the stroke within the limits."""
     if noise is not None:
-        return SensorNoise(1e-9 * noise, correlation)
+        return criteria.SensorNoise(1e-9 * noise, correlation)
     time = limits.grid(100)
     ramp = limits.low + limits.span * time / time[-1]
     reached = simulate(model, time, ramp, as_exported=False).outputs["displacement"]
-    return SensorNoise(_NOISE_SHARE * float(reached.max() - reached.min()), correlation)
+    return criteria.SensorNoise(_NOISE_SHARE * float(reached.max() - reached.min()), correlation)
 
 
 def designed(
@@ -83,13 +78,13 @@ def designed(
     records: Sequence[Record],
     *,
     parameters: Sequence[str],
-    optimality: Optimality,
+    optimality: criteria.Optimality,
     limits: Limits,
-    noise: SensorNoise,
+    noise: criteria.SensorNoise,
     family: str,
     effort: Effort,
     progress: Callable[[str], None],
-) -> tuple[Informative | Separated, list[Rival]]:
+) -> tuple[Informative | Separated, list[criteria.Rival]]:
     """Return the record that tells effects apart, else the one that sharpens parameters.
 
     The rivals that it was designed for are fitted to records if there are any; without effects the
@@ -100,7 +95,7 @@ def designed(
     if not effects:
         own = [n for e in model.effects for n in e.fitted]
         names = dict.fromkeys([*free, *own, *(n for n in parameters if n in model.parameter_names)])
-        whole = rival_of_model(model.name, model, tuple(names))
+        whole = criteria.rival_of_model(model.name, model, tuple(names))
         found = informative_experiment(
             whole, noise, limits, names=parameters, optimality=optimality, kinds=kinds,
             effort=effort, progress=progress,
@@ -112,9 +107,9 @@ def designed(
             records, effects, model=model, progress=progress
         )
         best = min(contenders, key=lambda c: c.fit.rms).fit
-        noise, colour = noise_of_fit(best, experiments)
-        rivals = [rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in contenders]
-        base = rival_of_fit("base", fit, colour)
+        noise, colour = criteria.noise_of_fit(best, experiments)
+        rivals = [criteria.rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in contenders]
+        base = criteria.rival_of_fit("base", fit, colour)
     else:
         plain = model.without(e.name for e in effects)
         free = [n for n in free if n in plain.parameter_names]
@@ -128,7 +123,7 @@ def write_page(
     path: Path,
     design: Informative | Separated,
     model: Model,
-    rivals: Sequence[Rival],
+    rivals: Sequence[criteria.Rival],
     still: bool,
 ) -> None:
     """Write the page of a design, with the model that runs in it unless it is `still`."""

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import ModelFile, Reading, StackName, Still
+from psa_casadi.cli.options import Reading, StackName
 
 
 def input_(
     *,
     output: Path,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: StackName = None,
     target: Path | None = None,
     move: tuple[float, float] | None = None,
@@ -22,7 +22,7 @@ def input_(
     max_current: float | None = None,
     report: Path | None = None,
     check_fmu: bool = True,
-    still: Still = False,
+    still: bool = False,
     given: Given,
 ) -> None:
     """Design the voltage for a path or for a quickest move; test it on simulator and FMU.

@@ -10,18 +10,10 @@ import numpy as np
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.design.tracking import targets
 from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
 from psa_casadi.design.tracking.minimum_time import quickest_move
-from psa_casadi.design.tracking.targets import (
-    AmplifierLimits,
-    Response,
-    Target,
-    TrackingError,
-    binding,
-    error_of,
-    uncompensated,
-)
 from psa_casadi.design.tracking.tracking import track as tracked
 from psa_casadi.export.importer import masters
 from psa_casadi.report.page import designs
@@ -31,7 +23,7 @@ from psa_casadi.report.words.design_words import Titled, error_table, limits_tab
 from psa_casadi.report.words.phrases import number
 from psa_casadi.units import FloatArray
 
-_Rows = list[tuple[str, TrackingError]]
+_Rows = list[tuple[str, targets.TrackingError]]
 
 
 @dataclass(frozen=True)
@@ -39,7 +31,7 @@ class Task:
     """A stack, the limits, the files to write, and how to judge."""
 
     plant: "psa.Model"
-    limits: AmplifierLimits
+    limits: targets.AmplifierLimits
     output: Path
     report: Path | None
     still: bool
@@ -47,17 +39,17 @@ class Task:
     quiet: bool
 
 
-def track(task: Task, path: Target, minimax: bool) -> None:
+def track(task: Task, path: targets.Target, minimax: bool) -> None:
     """Design the voltage for a path."""
     with working("designing", task.quiet) as progress:
         found = tracked(task.plant, path, task.limits, minimax=minimax, progress=progress)
-        plain = uncompensated(task.plant, path).displacement
+        plain = targets.uncompensated(task.plant, path).displacement
         rows: _Rows = [("designed, full simulator", found.error)]
         for reached in _on_fmu(task, found.response, progress):
-            rows.append(("designed, exported FMU", error_of(path, reached)))
+            rows.append(("designed, exported FMU", targets.error_of(path, reached)))
     said = f"{len(path.time)} samples in {number(found.seconds)} s"
     if found.by_program:
-        rows.append(("designed, the program itself", error_of(path, found.predicted)))
+        rows.append(("designed, the program itself", targets.error_of(path, found.predicted)))
         how = [
             f"{said}, {found.iterations} iterations of IPOPT.",
             f"Kinks at reversals were rounded over {number(found.width)} V/s in the program only.",
@@ -73,28 +65,28 @@ def track(task: Task, path: Target, minimax: bool) -> None:
         ]
     rows += [
         ("inversion without limits, full simulator", found.inverse.error),
-        ("uncompensated, full simulator", error_of(path, plain)),
+        ("uncompensated, full simulator", targets.error_of(path, plain)),
     ]
-    summary = [_follows(found.error), *binding(found.response, task.limits), *how]
+    summary = [_follows(found.error), *targets.binding(found.response, task.limits), *how]
     badge = "least largest error" if minimax else "least squares"
     pictures = designs.tracking_pictures(found, plain)
     _finish(task, "Designed input", summary, rows, pictures, found.response, badge, path=path)
 
 
-def invert(task: Task, path: Target) -> None:
+def invert(task: Task, path: targets.Target) -> None:
     """Invert the model along a path; the limits cut the voltage."""
     with working("inverting", task.quiet) as progress:
         found = inverted(task.plant, path, task.limits)
         rows: _Rows = [("inversion, full simulator", found.error)]
         for reached in _on_fmu(task, found.response, progress):
-            rows.append(("inversion, exported FMU", error_of(path, reached)))
-    summary = [_follows(found.error), *binding(found.response, task.limits)]
+            rows.append(("inversion, exported FMU", targets.error_of(path, reached)))
+    summary = [_follows(found.error), *targets.binding(found.response, task.limits)]
     summary.append(f"{len(found.trials)} trials on the simulator.")
     pictures = designs.inversion_pictures(found, task.limits)
     _finish(task, "Inverted input", summary, rows, pictures, found.response, "inversion", path=path)
 
 
-def correct(task: Task, path: Target, trial: "psa.Record") -> None:
+def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
     """Correct the voltage of a trial by what it showed."""
     with working("correcting", task.quiet):
         found = corrected(task.plant, path, trial, task.limits)
@@ -104,7 +96,7 @@ def correct(task: Task, path: Target, trial: "psa.Record") -> None:
         f" {number(found.error.largest_percent)} % at most.",
         f"The voltage changes by {number(change)} V at most; only the next trial can show what that"
         " is worth.",
-        *binding(found.response, task.limits),
+        *targets.binding(found.response, task.limits),
     ]
     rows, pictures = [("the trial, measured", found.error)], designs.trial_pictures(found)
     _finish(
@@ -132,7 +124,7 @@ def move(task: Task, ends: tuple[float, float]) -> None:
     _finish(task, "Quickest move", summary, [], designs.move_pictures(found), found.response)
 
 
-def _follows(error: TrackingError) -> str:
+def _follows(error: targets.TrackingError) -> str:
     return (
         f"The designed voltage follows the path to {number(error.rms_percent)} % of its range rms,"
         f" {number(error.largest_percent)} % at most, by the full simulator."
@@ -140,7 +132,7 @@ def _follows(error: TrackingError) -> str:
 
 
 @contextmanager
-def _keeping(task: Task, response: Response) -> Iterator[None]:
+def _keeping(task: Task, response: targets.Response) -> Iterator[None]:
     """Write the voltage where an interrupt ends what comes after its design, and say that."""
     try:
         yield
@@ -150,7 +142,7 @@ def _keeping(task: Task, response: Response) -> Iterator[None]:
         raise KeyboardInterrupt(told) from None
 
 
-def _write(task: Task, response: Response) -> None:
+def _write(task: Task, response: targets.Response) -> None:
     columns = {
         "time [s]": response.time,
         "voltage [V]": response.voltage,
@@ -160,7 +152,7 @@ def _write(task: Task, response: Response) -> None:
 
 
 def _on_fmu(
-    task: Task, response: Response, progress: Callable[[str], None]
+    task: Task, response: targets.Response, progress: Callable[[str], None]
 ) -> Iterator[FloatArray]:
     """Yield the displacement (n,) [m] of the exported FMU, unless it is not to be checked."""
     if task.check_fmu:
@@ -171,8 +163,8 @@ def _on_fmu(
 
 
 def _finish(
-    task: Task, title: str, summary: Sequence[str], rows: _Rows,
-    pictures: Sequence[Picture], response: Response, *badges: str, path: Target | None = None,
+    task: Task, title: str, summary: Sequence[str], rows: _Rows, pictures: Sequence[Picture],
+    response: targets.Response, *badges: str, path: targets.Target | None = None,
 ) -> None:  # fmt: skip
     """Write CSV and page, show sentences and tables."""
     tables: list[Titled] = [error_table(rows)] if rows else []

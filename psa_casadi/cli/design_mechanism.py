@@ -5,7 +5,7 @@ from typing import Literal
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import ModelFile, StackName, Still
+from psa_casadi.cli.options import StackName
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.errors import InputError
 
@@ -13,7 +13,7 @@ from psa_casadi.errors import InputError
 def mechanism(
     *,
     output: Path,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: StackName = None,
     damping: float | None = None,
     bandwidth: float | None = None,
@@ -27,7 +27,7 @@ def mechanism(
     starts: int = 6,
     port: Path | None = None,
     report: Path | None = None,
-    still: Still = False,
+    still: bool = False,
     given: Given,
 ) -> None:
     """Design a prestress mechanism for a wanted damping, bandwidth or poles, within limits.

@@ -9,31 +9,20 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.expected import cases, expected, judge
+from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given, meant
-from psa_casadi.cli.options import (
-    Hysteresis,
-    Junit,
-    Origin,
-    Reading,
-    Records,
-    StackName,
-    StartModel,
-    Stiffness,
-    Still,
-    names,
-)
+from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
 from psa_casadi.cli.screen import show, show_table, tell_written, width, working
 from psa_casadi.cli.steps import DIAGNOSE, events_to
 
 
 def diagnose(
-    records: Records,
+    records: list[Path],
     *,
     holdout: list[Path] | None = None,
-    model: StartModel = None,
+    model: Path | None = None,
     stack: StackName = None,
-    stiffness: Stiffness = None,
+    stiffness: float | None = None,
     hysteresis: Hysteresis = None,
     output: Path | None = None,
     patch: Path | None = None,
@@ -46,8 +35,8 @@ def diagnose(
     events: Path | None = None,
     expect: Annotated[str | None, typer.Option(autocompletion=names("verdicts"))] = None,
     max_error: str | None = None,
-    junit: Junit = None,
-    still: Still = False,
+    junit: Path | None = None,
+    still: bool = False,
     reading: Reading,
     origin: Origin = "measured",
     given: Given,
@@ -58,6 +47,7 @@ def diagnose(
     not as they say.
 
     Options:
+        model: MODEL.json whose values the fits start from.
         holdout: Record kept for judging only (repeat the option for several); without it, a quarter
             of every record, in blocks.
         output: MODEL.json of the extended model.
@@ -98,7 +88,7 @@ def diagnose(
             _keep_apart(given, output, model)
             found = given.records(records, reading, held)
             start = given.model_or_stack(model, stack, needed=False)
-            wanted = expected(given, expect, max_error)
+            wanted = files.expected(given, expect, max_error)
             given.check()
         with working("diagnosing", given.quiet, DIAGNOSE) as progress, events_to(events) as watch:
             try:
@@ -123,7 +113,7 @@ def diagnose(
         took = clock.process_time()
         show(f"\nprocessor time with the start of Python: {took:.2f} s", given.quiet)
     subject = ", ".join(p.name for p in records)
-    judge("diagnose", subject, cases(d, *wanted), junit, began, tells=True)
+    judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
 
 
 def _finish(

@@ -1,27 +1,26 @@
-"""The files of `psa diagnose`: what was asked for, and what an interrupt leaves of it."""
+"""The files of `psa diagnose`, what an interrupt leaves of them, and what CI asks of a result."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
+from psa_casadi.cli.inputs import Given, meant
 from psa_casadi.design.experiment import experiment
-from psa_casadi.diagnosis.result import (
-    Alternative,
-    Diagnosis,
-    DiagnosisInterrupted,
-    NextExperiment,
-)
+from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.errors import PsaError
 from psa_casadi.files import atomic_write
 from psa_casadi.records import write_record
+from psa_casadi.report.documents.junit import Case
 from psa_casadi.report.words.design_words import sentences
-from psa_casadi.report.words.phrases import added
+from psa_casadi.report.words.phrases import added, listing, number
+from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 
 
-def alternatives(d: Diagnosis, output: Path | None) -> list[tuple[Alternative, Path]]:
+def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
     """Return the models with another cause, each with its file beside the extended model's."""
     if output is None:
         return []
@@ -31,7 +30,7 @@ def alternatives(d: Diagnosis, output: Path | None) -> list[tuple[Alternative, P
     ]
 
 
-def noted(d: Diagnosis, left_out: Sequence[str]) -> Diagnosis:
+def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
     """Say in the remarks which effects were not looked for."""
     if not left_out:
         return d
@@ -39,7 +38,7 @@ def noted(d: Diagnosis, left_out: Sequence[str]) -> Diagnosis:
     return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
 
 
-def models(d: Diagnosis, output: Path | None) -> list[str]:
+def models(d: result.Diagnosis, output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"
@@ -50,7 +49,7 @@ def models(d: Diagnosis, output: Path | None) -> list[str]:
     return lines
 
 
-def keep_unfinished(stop: DiagnosisInterrupted, outputs: Mapping[str, Path | None]) -> str:
+def keep_unfinished(stop: result.DiagnosisInterrupted, outputs: Mapping[str, Path | None]) -> str:
     """Write the best model so far, and say that."""
     output = outputs["--output"]
     if output is not None:
@@ -59,7 +58,9 @@ def keep_unfinished(stop: DiagnosisInterrupted, outputs: Mapping[str, Path | Non
     return kept(f"there is no verdict; {stop}", [output], missing, " (marked as interrupted)")
 
 
-def keep(d: Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]) -> str:
+def keep(
+    d: result.Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]
+) -> str:
     """Write what takes no time of a finished diagnosis, and say which files there are."""
     quick = ("--output", "--json")
     write(d, {o: p if o in quick else None for o, p in outputs.items()}, origin, written)
@@ -68,7 +69,7 @@ def keep(d: Diagnosis, outputs: Mapping[str, Path | None], origin: str, written:
 
 
 def write(
-    d: Diagnosis,
+    d: result.Diagnosis,
     outputs: Mapping[str, Path | None],
     origin: str,
     written: list[Path],
@@ -94,7 +95,9 @@ def write(
         written.append(path)
 
 
-def with_next(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) -> Diagnosis:
+def with_next(
+    d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]
+) -> result.Diagnosis:
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or d.verdict != "ambiguous":
         return d
@@ -114,11 +117,11 @@ def with_next(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) 
     played = design.record
     write_record(path, {"time [s]": played.time, "voltage [V]": played.voltage})
     reasons = (f"Apply {path} and diagnose all records together.", *each, *same)
-    following = NextExperiment(str(path), design.names, reasons, dict(design.chance))
+    following = result.NextExperiment(str(path), design.names, reasons, dict(design.chance))
     return replace(d, next_experiment=following)
 
 
-def write_patch(d: Diagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
+def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
     """Write the model with the unnamed correction; say why where there is none to write."""
     if path is None:
         return ""
@@ -128,3 +131,38 @@ def write_patch(d: Diagnosis, path: Path | None, progress: Callable[[str], None]
     except PsaError as error:
         return f"{path} was not written: {error}"
     return ""
+
+
+def expected(
+    given: Given, verdicts: str | None, max_error: str | None
+) -> tuple[tuple[str, ...], float | None]:
+    """Return the verdicts of which one must come out, and the largest held-out error [%]."""
+    words = [re.sub(r"[\s-]+", "_", w.strip().lower()) for w in (verdicts or "").split(",")]
+    wanted, there = tuple(dict.fromkeys(w for w in words if w)), f"there are {', '.join(VERDICTS)}."
+    if verdicts is not None and not wanted:
+        given.add(f"--expect names no verdict; {there}")
+    for word in wanted:
+        if word not in VERDICTS:
+            given.add(f"--expect: '{word}' is no verdict; {meant(word, VERDICTS)}{there}")
+    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
+    largest = float(found[1]) if found else 0.0
+    if max_error is not None and not largest > 0.0:
+        given.add(
+            f"--max-error is '{max_error}'; give a positive percentage of the range, as 0.5%."
+        )
+    return wanted, None if max_error is None else largest
+
+
+def cases(d: result.Diagnosis, verdicts: tuple[str, ...], max_error: float | None) -> list[Case]:
+    """Return verdict and held-out error of the extended model as tests, failed or passed."""
+    wrong = large = ""
+    if verdicts and d.verdict not in verdicts:
+        wrong = f"The verdict is {d.verdict}; expected {listing(verdicts, 'or')}."
+    error = d.extended_errors.holdout_nrmse_percent
+    shown = f"{number(error)} % of the range"
+    if max_error is not None and not error <= max_error:
+        large = f"The extended model's held-out error is {shown}; expected {max_error:g} % at most."
+    return [
+        Case("verdict", f"{d.verdict}: {verdict_sentence(d)}", wrong),
+        Case("held-out error", f"{shown} by the extended model", large),
+    ]

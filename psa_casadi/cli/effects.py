@@ -9,7 +9,7 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import NamesOnly, OwnEffects, names
+from psa_casadi.cli.options import names
 from psa_casadi.cli.screen import show, show_table, tell_written, width
 
 
@@ -18,12 +18,13 @@ def effects(
     *,
     figure: Path | None = None,
     model: Path | None = None,
-    effects: OwnEffects = None,
-    quiet: NamesOnly = False,
+    effects: list[str] | None = None,
+    quiet: bool = False,
 ) -> None:
     """List the effects that a diagnosis looks for; show one: equation, signature, size, remedy.
 
     Options:
+        quiet: Print names only.
         name: Name of one effect.
         figure: PNG picture of the effect's signature to write; needs NAME.
         model: MODEL.json of the stack for which NAME's size is told.

@@ -9,7 +9,7 @@ import typer
 
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import names
-from psa_casadi.cli.screen import Quiet, show, show_table, tell_written, working
+from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.files import make_folder
 
 
@@ -18,7 +18,7 @@ def examples(
     *,
     output: Path | None = None,
     copy_only: bool = False,
-    quiet: Quiet = False,
+    quiet: bool = False,
 ) -> None:
     """List examples and recipes; show one; with -o copy it to a folder and run an example there.
 

@@ -11,15 +11,7 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given, step_seconds
-from psa_casadi.cli.options import (
-    IncludeSensor,
-    ModelFile,
-    PartName,
-    Platforms,
-    Published,
-    StackName,
-    Start,
-)
+from psa_casadi.cli.options import PartName, Published, StackName, Start
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.files import atomic_write, make_folder
 
@@ -35,7 +27,7 @@ def c(
     hold: Literal["linear", "zero"] = "linear",
     substeps: int | None = None,
     name: str | None = None,
-    include_sensor: IncludeSensor = False,
+    include_sensor: bool = False,
     start: Start,
     published: Published,
     given: Given,
@@ -106,15 +98,15 @@ def _show_step(
 def fmu(
     *,
     output: Path,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: StackName = None,
     part: PartName = None,
     fmi: Literal["2", "3"] = "2",
-    platforms: Platforms = "host",
+    platforms: str = "host",
     solver: Literal["adaptive", "fixed"] = "adaptive",
     step: str | None = None,
     name: str | None = None,
-    include_sensor: IncludeSensor = False,
+    include_sensor: bool = False,
     parameter_sets: Annotated[int, typer.Option(min=0, max=999)] = 20,
     sets_to: Path | None = None,
     validity_output: bool = False,
@@ -207,11 +199,11 @@ def _start_words(model: "psa.Model") -> str:
 def modelica(
     *,
     output: Path,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: StackName = None,
     part: PartName = None,
     name: str = "PiezoStack",
-    include_sensor: IncludeSensor = False,
+    include_sensor: bool = False,
     start: Start,
     published: Published,
     given: Given,

@@ -7,7 +7,7 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import ModelFile, Platforms, Published, names
+from psa_casadi.cli.options import Published, names
 from psa_casadi.cli.screen import show, tell_written, working
 
 #: The stack of a system for which no model is given.
@@ -17,13 +17,13 @@ DEFAULT_STACK = "P-885.51"
 def ssp(
     *,
     output: Path,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: Annotated[
         str | None, typer.Option(show_default=DEFAULT_STACK, autocompletion=names("stacks"))
     ] = None,
     no_compensator: bool = False,
     picture: Path | None = None,
-    platforms: Platforms = "host",
+    platforms: str = "host",
     published: Published,
     given: Given,
 ) -> None:

@@ -1,7 +1,6 @@
 """How a command ends: 2 for the user's input, 1 for everything else, 130 for Ctrl-C."""
 
 import atexit
-import contextlib
 import errno
 import functools
 import io
@@ -11,11 +10,12 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn, ParamSpec
+from typing import TYPE_CHECKING, NoReturn, ParamSpec
 
 import typer
 
@@ -23,8 +23,17 @@ from psa_casadi.cache import sweep_rooms
 from psa_casadi.cli import INTERRUPTED
 from psa_casadi.cli.screen import tell
 from psa_casadi.errors import InputError, MachineError, PsaError
-from psa_casadi.files import abandon, answer_requests_to_end, temporary_folder, written
+from psa_casadi.files import (
+    abandon,
+    answer_requests_to_end,
+    atomic_write,
+    temporary_folder,
+    written,
+)
 from psa_casadi.interruption import Work, interruptible_work
+
+if TYPE_CHECKING:
+    from psa_casadi.report.documents.junit import Case
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -116,14 +125,11 @@ _MEMORY = ("bad_alloc", "failed to map segment", "Cannot allocate memory", "cann
 
 
 def prepare() -> None:
-    """Give a command streams that can be written to, and an end that leaves nothing behind."""
-    _open_streams()
-    answer_requests_to_end()
-    _take_temporary_folder()
-    sweep_rooms()
+    """Give a command streams that can be written to, and an end that leaves nothing behind.
 
-
-def _open_streams() -> None:
+    All temporary files, those of other packages and programs too, lie in a folder of ours. Where
+    none can be made, the first to need one says so.
+    """
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
             os.fstat(descriptor)
@@ -133,29 +139,16 @@ def _open_streams() -> None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):  # letters that it lacks; stderr spells them out
         sys.stdout.reconfigure(errors="replace")
-
-
-def _take_temporary_folder() -> None:
-    """Let all temporary files, those of other packages and programs too, lie in a folder of ours.
-
-    Where none can be made, the first to need one says so.
-    """
-    with contextlib.suppress(OSError):
-        held = contextlib.ExitStack()
+    answer_requests_to_end()
+    with suppress(OSError):
+        held = ExitStack()
         folder = str(held.enter_context(temporary_folder()))
         atexit.register(held.close)
         tempfile.tempdir = os.environ["TMPDIR"] = folder
+    sweep_rooms()
 
 
-def silence() -> None:
-    """Let what is still to be written vanish: nobody reads it any more."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(nowhere, stream.fileno())
-
-
-def refused_by_the_machine(error: BaseException) -> str | None:
+def _refused_by_the_machine(error: Exception) -> str | None:
     """Return what the machine refused and what to do; None where the error is not of this kind."""
     said = str(error)
     if isinstance(error, MemoryError) or any(word in said for word in _MEMORY):
@@ -202,47 +195,63 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
                 command(*args, **options)
         except (typer.Exit, typer.Abort):
             raise
-        except BrokenPipeError as error:
-            silence()
+        except BrokenPipeError as error:  # nobody reads any more what is still to be written
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in (sys.stdout, sys.stderr):
+                with suppress(OSError, ValueError):
+                    os.dup2(nowhere, stream.fileno())
             raise typer.Exit(1) from error
         except KeyboardInterrupt as stop:
             there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
             told = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
             tell(f"Interrupted: {told}")
             raise typer.Exit(INTERRUPTED) from None
-        except InputError as error:
-            if os.environ.get(DEBUG):
-                raise
-            _tell_problems(error.problems)
-            raise typer.Exit(2) from error
         except Exception as error:
             if os.environ.get(DEBUG):
                 raise
-            _tell_failure(error)
-            raise typer.Exit(1) from error
+            for line in _told(error):
+                tell(line)
+            raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
 
     return run
 
 
-def _tell_problems(problems: tuple[str, ...]) -> None:
-    if len(problems) == 1:
-        tell(f"Error: {problems[0]}")
-        return
-    count = sum(not p.startswith("... and") for p in problems)
-    tell(f"Error: {count} problems with what was given:")
-    for problem in problems:
-        tell(f"  - {problem}")
-
-
-def _tell_failure(error: Exception) -> None:
+def _told(error: Exception) -> list[str]:
+    """Return what is said of an error."""
+    if isinstance(error, InputError):
+        if len(error.problems) == 1:
+            return [f"Error: {error.problems[0]}"]
+        count = sum(not p.startswith("... and") for p in error.problems)
+        each = (f"  - {problem}" for problem in error.problems)
+        return [f"Error: {count} problems with what was given:", *each]
     if isinstance(error, (PsaError, MachineError)):
-        tell(f"Failed: {error}")
-        return
-    refused = refused_by_the_machine(error)
-    if refused is not None:
-        tell(f"Failed: {refused}")
-        return
-    tell(
-        f"Failed: an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi,"
-        f" not of the input; set {DEBUG}=1 to see where it happened, and report it."
+        return [f"Failed: {error}"]
+    fault = (
+        f"an unexpected {type(error).__name__} ({error}). This is a fault of psa_casadi, not of the"
+        f" input; set {DEBUG}=1 to see where it happened, and report it."
     )
+    return [f"Failed: {_refused_by_the_machine(error) or fault}"]
+
+
+def judge(
+    command: str,
+    subject: str,
+    cases: "Sequence[Case]",
+    junit: Path | None,
+    began: float,
+    *,
+    tells: bool = False,
+) -> None:
+    """Write what was found of a subject as tests, if a file is named; end with 1 if one failed.
+
+    `began` is when the command did, of `time.perf_counter`; with `tells` each failure is told.
+    """
+    from psa_casadi.report.documents.junit import junit_text
+
+    if junit is not None:
+        atomic_write(junit, junit_text(command, subject, cases, time.perf_counter() - began))
+    failures = [case.failure for case in cases if case.failure]
+    for failure in failures if tells else ():
+        tell(f"Not as expected: {failure}")
+    if failures:
+        raise typer.Exit(1)

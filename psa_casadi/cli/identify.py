@@ -7,16 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import (
-    Hysteresis,
-    Origin,
-    Reading,
-    Records,
-    StackName,
-    StartModel,
-    Stiffness,
-    Still,
-)
+from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
 from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.cli.steps import IDENTIFY
 from psa_casadi.files import atomic_write
@@ -26,18 +17,18 @@ if TYPE_CHECKING:
 
 
 def identify(
-    records: Records,
+    records: list[Path],
     *,
     output: Path | None = None,
-    model: StartModel = None,
+    model: Path | None = None,
     stack: StackName = None,
-    stiffness: Stiffness = None,
+    stiffness: float | None = None,
     hysteresis: Hysteresis = None,
     method: Literal["prediction-error", "paper"] = "prediction-error",
     profile: list[str] | None = None,
     json: Path | None = None,
     report: Path | None = None,
-    still: Still = False,
+    still: bool = False,
     reading: Reading,
     origin: Origin = "measured",
     given: Given,
@@ -45,6 +36,7 @@ def identify(
     """Fit the model of a stack to records; show which parameters the data determine.
 
     Options:
+        model: MODEL.json whose values the fits start from.
         output: MODEL.json to write.
         method: How the parameters are found.
         profile: Parameter whose profile likelihood is wanted; may be repeated.

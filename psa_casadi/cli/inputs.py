@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import psa_casadi as psa
-from psa_casadi.cli.options import OwnEffects, Published, Reading, Start
-from psa_casadi.cli.screen import Quiet, tell
+from psa_casadi.cli.options import Published, Reading, Start
+from psa_casadi.cli.screen import tell
 from psa_casadi.errors import InputError
 from psa_casadi.files import why_not_written
 
@@ -29,8 +29,8 @@ class Given:
     the modules that --effects names, `fitted` is the number of records that are not held out.
     """
 
-    effects: OwnEffects = None
-    quiet: Quiet = False
+    effects: list[str] | None = None
+    quiet: bool = False
     fitted: int = field(default=0, init=False)
     _problems: list[str] = field(default_factory=list, init=False)
 

@@ -1,16 +1,39 @@
 """A command is a function: what its arguments are for stands in its docstring, under `Options:`.
 
-Arguments before the star are words of the command line, those behind it are options. One whose type
-is a dataclass stands for the options that are its fields. What several commands have is below.
+Arguments before the star are words of the command line, those behind it options. One whose type is
+a dataclass stands for the options that are its fields. What a command does not say of an option
+that several have:
+
+Options:
+    records: Records of one device: CSV, Excel, MATLAB and other files.
+    model: MODEL.json, as `psa identify`, `psa diagnose` and `psa design` write it.
+    stack: Named stack in place of a model; `psa stacks` lists them.
+    part: Part around a stack, in place of a model: flexure_stage, position_controller,
+        hysteresis_compensator, voltage_amplifier, charge_amplifier.
+    platforms: host, all, or names such as x86_64-linux,x86_64-windows.
+    include_sensor: Keep effects of sensor and environment.
+    stiffness: Stiffness of the free stack [N/m]; fixes the force scale.
+    hysteresis: Form of the base's hysteresis; best is the one that the records prefer. By default
+        Bouc-Wen, or as the model has it.
+    origin: What the report calls the records.
+    still: Page without the model that runs in it: nothing is compiled for it.
+    junit: JUnit XML to write, which CI servers show as tests.
+    columns: Which array of the file is which column, if the names differ:
+        time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:
+        displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms; table=2 takes one of
+        several tables in a file, table=all each as a record.
+    effects: Module that holds effects of your own, as in mypackage.effects; repeat the option for
+        several.
+    quiet: No progress and no summary; errors still show.
 """
 
 import inspect
 import re
+import sys
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, is_dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import typer
@@ -23,7 +46,8 @@ _ENTRY = re.compile(r"^    (\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function as typer takes it, with its errors told in sentences."""
-    about, helps = _described(function)
+    about, own = _described(function)
+    helps = {**_SHARED, **own}
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[Any, tuple[str, ...]]] = {}
     for p in inspect.signature(function).parameters.values():
@@ -31,7 +55,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             group: Any = p.annotation
             fields = inspect.signature(group).parameters
             groups[p.name] = group, tuple(fields)
-            told = {**_described(group)[1], **helps}
+            told = {**_SHARED, **_described(group)[1], **own}
             parameters += [_declared(q, told) for q in fields.values()]
         else:
             parameters.append(_declared(p, helps))
@@ -52,6 +76,9 @@ def _described(described: object) -> tuple[str, dict[str, str]]:
     return about, {name: " ".join(text.split()) for name, text in _ENTRY.findall(section)}
 
 
+_SHARED = _described(sys.modules[__name__])[1]
+
+
 def _declared(p: inspect.Parameter, helps: dict[str, str]) -> inspect.Parameter:
     """Return a parameter with what typer is to know of it; a flag that is off has no opposite."""
     if p.annotation is typer.Context:
@@ -63,8 +90,9 @@ def _declared(p: inspect.Parameter, helps: dict[str, str]) -> inspect.Parameter:
     if option and known.default is ...:
         name = p.name.strip("_").replace("_", "-")
         off = f"/--no-{name}" if p.default is True else ""
-        known.param_decls = [*(["-o"] if name == "output" else []), f"--{name}{off}"]
-    known.help = known.help or helps[p.name]
+        short = [f"-{name[0]}"] if name in ("output", "quiet") else []
+        known.param_decls = [*short, f"--{name}{off}"]
+    known.help = known.help or helps.get(p.name)  # there are none with `python -OO`
     kind = get_args(p.annotation)[0] if settings else p.annotation
     return p.replace(annotation=Annotated[kind, known], kind=inspect.Parameter.KEYWORD_ONLY)
 
@@ -93,75 +121,10 @@ def names(kind: str) -> Callable[[str], list[str]]:
     return complete
 
 
-NamesOnly = Annotated[bool, typer.Option("--quiet", "-q", help="Print names only.")]
-OwnEffects = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="Module that holds effects of your own, as in mypackage.effects; repeat the option for"
-        " several."
-    ),
-]
-Records = Annotated[
-    list[Path],
-    typer.Argument(
-        help="Records of one device: CSV, Excel, MATLAB and other files.", show_default=False
-    ),
-]
-ModelFile = Annotated[
-    Path | None,
-    typer.Option(help="MODEL.json, as `psa identify`, `psa diagnose` and `psa design` write it."),
-]
-StartModel = Annotated[
-    Path | None, typer.Option(help="MODEL.json whose values the fits start from.")
-]
-StackName = Annotated[
-    str | None,
-    typer.Option(
-        help="Named stack in place of a model; `psa stacks` lists them.",
-        autocompletion=names("stacks"),
-    ),
-]
-PartName = Annotated[
-    str | None,
-    typer.Option(
-        help="Part around a stack, in place of a model: flexure_stage, position_controller,"
-        " hysteresis_compensator, voltage_amplifier, charge_amplifier.",
-        autocompletion=names("parts"),
-    ),
-]
-Platforms = Annotated[
-    str, typer.Option(help="host, all, or names such as x86_64-linux,x86_64-windows.")
-]
-IncludeSensor = Annotated[bool, typer.Option(help="Keep effects of sensor and environment.")]
-Stiffness = Annotated[
-    float | None, typer.Option(help="Stiffness of the free stack [N/m]; fixes the force scale.")
-]
-Hysteresis = Annotated[
-    Literal["bouc-wen", "spectrum", "best"] | None,
-    typer.Option(
-        help="Form of the base's hysteresis; best is the one that the records prefer. By default"
-        " Bouc-Wen, or as the model has it.",
-        show_default=False,
-    ),
-]
-Origin = Annotated[
-    Literal["measured", "synthetic"], typer.Option(help="What the report calls the records.")
-]
-Still = Annotated[
-    bool, typer.Option(help="Page without the model that runs in it: nothing is compiled for it.")
-]
-Junit = Annotated[
-    Path | None, typer.Option(help="JUnit XML to write, which CI servers show as tests.")
-]
-Columns = Annotated[
-    str | None,
-    typer.Option(
-        help="Which array of the file is which column, if the names differ:"
-        " time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:"
-        " displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms; table=2 takes one"
-        " of several tables in a file, table=all each as a record."
-    ),
-]
+StackName = Annotated[str | None, typer.Option(autocompletion=names("stacks"))]
+PartName = Annotated[str | None, typer.Option(autocompletion=names("parts"))]
+Hysteresis = Literal["bouc-wen", "spectrum", "best"] | None
+Origin = Literal["measured", "synthetic"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +135,7 @@ class Reading:
         sample_time: Time from sample to sample [s]; it goes before a file's.
     """
 
-    columns: Columns = None
+    columns: str | None = None
     sample_time: float | None = None
 
 

@@ -7,13 +7,13 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import Origin, Reading, Records, StackName
+from psa_casadi.cli.options import Origin, Reading, StackName
 from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.files import atomic_path, atomic_write
 
 
 def sample(
-    records: Records,
+    records: list[Path],
     *,
     model: Path | None = None,
     stack: StackName = None,

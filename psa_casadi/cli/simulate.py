@@ -4,7 +4,7 @@ from pathlib import Path
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.options import ModelFile, Reading, StackName, Start
+from psa_casadi.cli.options import Reading, StackName, Start
 from psa_casadi.cli.screen import show, tell_written, working
 
 
@@ -12,7 +12,7 @@ def simulate(
     *,
     input_: Path,
     output: Path,
-    model: ModelFile = None,
+    model: Path | None = None,
     stack: StackName = None,
     reading: Reading,
     start: Start,

@@ -6,18 +6,19 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.options import NamesOnly, names
+from psa_casadi.cli.options import names
 from psa_casadi.cli.screen import show, show_table, width
 
 
 def stacks(
     name: Annotated[str | None, typer.Argument(autocompletion=names("stacks"))] = None,
     *,
-    quiet: NamesOnly = False,
+    quiet: bool = False,
 ) -> None:
     """List the stacks that can be used by name; show the figures of one with their sources.
 
     Options:
+        quiet: Print names only.
         name: Name of one stack.
     """
     from psa_casadi.report.words.tables import stack_table, stacks_table

@@ -41,6 +41,7 @@ def test_the_help_shows_its_texts_whole_in_80_columns(path: tuple[str, ...]) -> 
     joined = " ".join(shown.split())
     assert "\\" not in shown
     assert [text for text in written(EVERY[path]) if text not in joined] == []
+    assert [p.name for p in EVERY[path].params if not getattr(p, "help", "")] == []
     lines = [line.strip() for line in shown.splitlines()]
     if not hasattr(EVERY[path], "commands"):
         (example,) = (line for line in lines if line.startswith("Example: "))

@@ -59,7 +59,7 @@ def _exchanged(fmu: Fmu) -> Problems:
             yield "the derivatives are not finite"
         if _differ(model.get([f"der({n})" for n in names]), slope):
             yield "the values of the variables der(x) differ from the derivatives"
-        if any(model.completed_integrator_step()):
+        if any(model.fmi.completedIntegratorStep()):
             yield "the end of an integrator step asks for an event or for the end"
         model.require("EnterEventMode")
         *more, timed = model.update_discrete_states()

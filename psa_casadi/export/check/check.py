@@ -11,16 +11,9 @@ from typing import Any
 from psa_casadi.component import Component
 from psa_casadi.components.outputs import OUTPUT as VALIDITY
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.export.check import binaries
+from psa_casadi.export.check import binaries, description
 from psa_casadi.export.check.agreement import fixed_truth, stated_step, truth_of
 from psa_casadi.export.check.apart import OVERTIME, rows_apart
-from psa_casadi.export.check.description import (
-    DESCRIBED,
-    published_as,
-    reproducible,
-    wrong_dependencies,
-    wrong_start_values,
-)
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.measured import Task
 from psa_casadi.export.check.rows import (
@@ -174,18 +167,20 @@ def _described(
         except PsaError as error:
             yield str(error)
 
-    for name, check in DESCRIBED.items():
+    for name, check in description.DESCRIBED.items():
         yield Check(name, partial(check, archive))
     if not chosen and (archive.directory / MODEL_ENTRY).is_file():
         yield Check("model inside", read_model)
     if chosen:
         chosen[:] = [as_exported(archive, chosen[0])]
         model = chosen[0]
-        yield Check("start values", partial(wrong_start_values, archive, model))
-        yield Check("dependencies of the model", partial(wrong_dependencies, archive, model))
+        yield Check("start values", partial(description.wrong_start_values, archive, model))
+        yield Check(
+            "dependencies of the model", partial(description.wrong_dependencies, archive, model)
+        )
         if model.evidence is not None and fixed_step_of(archive.directory) is None:
             yield Check("evidence inside", partial(wrong_evidence, archive, model))
-        yield Check("reproducible", partial(reproducible, archive, model))
+        yield Check("reproducible", partial(description.reproducible, archive, model))
 
 
 def as_exported(archive: Archive, model: Model) -> Model:
@@ -204,7 +199,7 @@ def as_exported(archive: Archive, model: Model) -> Model:
     exported = model.plant() if own and own.isdisjoint(described) else model
     if VALIDITY in archive.names("output") and exported.evidence is not None:
         exported = with_validity(exported)
-    return published_as(archive, exported)
+    return description.published_as(archive, exported)
 
 
 def _variables(c: Component) -> Iterable[Any]:

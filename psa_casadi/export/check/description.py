@@ -12,24 +12,12 @@ from fmpy.model_description import ValidationError
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import CheckRow
+from psa_casadi.export.common import publication
 from psa_casadi.export.common.markup import generation_tool
-from psa_casadi.export.common.publication import (
-    LICENSE_ENTRY,
-    SOURCES_NOTICE,
-    code_license,
-    copyright_line,
-    terms_of_code,
-)
 from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu import sources
 from psa_casadi.export.fmu.archive import planned_step
 from psa_casadi.export.fmu.description import Key, at_the_start, dependencies, without_sampled
-from psa_casadi.export.fmu.sources import (
-    FIXED_ENTRY,
-    FROM_CASADI,
-    exported_texts,
-    fixed_entry,
-    fixed_step_of,
-)
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.model.compose import Model
 from psa_casadi.units import parse_unit
@@ -115,14 +103,18 @@ def missing_notices(archive: Archive) -> Iterator[str]:
             yield f"the description states no {name}"
     if not str(archive.description.generationTool).startswith("psa_casadi"):
         return
-    places = [LICENSE_ENTRY]
-    places += [f"sources/{SOURCES_NOTICE}"] if (archive.directory / "sources").is_dir() else []
+    places = [publication.LICENSE_ENTRY]
+    places += (
+        [f"sources/{publication.SOURCES_NOTICE}"]
+        if (archive.directory / "sources").is_dir()
+        else []
+    )
     for place in places:
         path = archive.directory / place
         if not path.is_file():
             yield f"{place} is missing"
-        elif code_license() not in path.read_text(encoding="utf-8", errors="replace"):
-            yield f"{place} lacks the notice '{copyright_line()}' with its terms"
+        elif publication.code_license() not in path.read_text(encoding="utf-8", errors="replace"):
+            yield f"{place} lacks the notice '{publication.copyright_line()}' with its terms"
 
 
 def published_as(archive: Archive, model: Model) -> Model:
@@ -131,7 +123,7 @@ def published_as(archive: Archive, model: Model) -> Model:
     They are given at the export, and say nothing of what the model computes.
     """
     said = {f.name: getattr(archive.description, f.name) or "" for f in fields(Publication)}
-    unstated = terms_of_code()
+    unstated = publication.terms_of_code()
     own = {name: text for name, text in said.items() if text != unstated.get(name)}
     return replace(model, publication=Publication(**own))
 
@@ -173,7 +165,7 @@ def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
     found = dependencies(model.structure)
     truth = named({unknown: without_sampled(known) for unknown, known in found.items()})
     initial = named(at_the_start(model))
-    if fixed_step_of(archive.directory) is not None:  # there parameters are constants
+    if sources.fixed_step_of(archive.directory) is not None:  # there parameters are constants
         for claims in (*truth.values(), *initial.values()):
             for parameter in model.parameter_names:
                 claims.pop(parameter, None)
@@ -219,11 +211,11 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     }
     untouched = {}
     if _other_casadi(archive):
-        places = {name: f"sources/{name}" for name in FROM_CASADI}
+        places = {name: f"sources/{name}" for name in sources.FROM_CASADI}
         untouched = {n: found[p].decode("utf-8") for n, p in places.items() if p in found}
-    step = fixed_step_of(archive.directory)
+    step = sources.fixed_step_of(archive.directory)
     fixed = planned_step(model, archive.identifier, archive.version, step) if step else None
-    token, texts, xml = exported_texts(
+    token, texts, xml = sources.exported_texts(
         model, archive.identifier, archive.version, fixed, given=untouched
     )
     if token != archive.token:
@@ -231,7 +223,7 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     expected = {f"sources/{name}": text for name, text in texts.items()}
     expected[_XML] = xml
     if fixed:
-        expected[FIXED_ENTRY] = fixed_entry(fixed).decode("utf-8")
+        expected[sources.FIXED_ENTRY] = sources.fixed_entry(fixed).decode("utf-8")
     for name, text in sorted(expected.items()):
         if name not in found:
             yield f"{name} is missing"

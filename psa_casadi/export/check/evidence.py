@@ -8,14 +8,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check.measured import ERROR_LIMIT, Playback
 from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, stopped
 from psa_casadi.export.common.parameter_sets import MOST_SAMPLES
-from psa_casadi.export.fmu.evidence import (
-    OUTPUTS,
-    SETS,
-    VALIDATION,
-    evidence_texts,
-    run_inputs,
-    run_start,
-)
+from psa_casadi.export.fmu import evidence as carried
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.identification.fitting.prediction import measured
@@ -33,16 +26,20 @@ _NONE = (
 def wrong_evidence(archive: Archive, model: Model) -> Iterator[str]:
     """The files of evidence are what the model's evidence makes them."""
     folder = archive.directory
-    samples = min(len(list((folder / SETS).glob("sample_*.ssv"))), MOST_SAMPLES)
-    expected = evidence_texts(model, samples)
+    samples = min(len(list((folder / carried.SETS).glob("sample_*.ssv"))), MOST_SAMPLES)
+    expected = carried.evidence_texts(model, samples)
     for name, text in sorted(expected.items()):
         if not (folder / name).is_file():
             yield f"{name} is missing"
         elif (folder / name).read_bytes() != text.encode("utf-8"):
             yield f"{name} is not what the model says"
     if model.evidence is not None and model.evidence.reference is not None:
-        yield from (f"{n} is missing" for n in (OUTPUTS, VALIDATION) if not (folder / n).is_file())
-    found = {p.relative_to(folder).as_posix() for p in (folder / SETS).glob("*")}
+        yield from (
+            f"{n} is missing"
+            for n in (carried.OUTPUTS, carried.VALIDATION)
+            if not (folder / n).is_file()
+        )
+    found = {p.relative_to(folder).as_posix() for p in (folder / carried.SETS).glob("*")}
     yield from (f"{name} is not among the model's" for name in sorted(found - set(expected)))
 
 
@@ -65,15 +62,15 @@ def repeated(
         found.append(Check("records as stated", lambda: strange).row())
     try:
         if evidence.reference is not None:
-            times, values = run_inputs(model)
-            text = (archive.directory / OUTPUTS).read_text(encoding="utf-8")
+            times, values = carried.run_inputs(model)
+            text = (archive.directory / carried.OUTPUTS).read_text(encoding="utf-8")
             names = text.partition("\n")[0].split(",")
             table = np.loadtxt(text.splitlines()[1:], delimiter=",", ndmin=2)
             if table.shape != (len(times), len(names)) or "displacement" not in names:
-                raise InputError(f"{OUTPUTS} has not a row of outputs for each time")
+                raise InputError(f"{carried.OUTPUTS} has not a row of outputs for each time")
             inputs = Signals(model.input_names, times, values)
             expected = table[:, names.index("displacement")]
-            start = run_start(model)
+            start = carried.run_start(model)
             found.append(Playback("reference run", times, inputs, start, "displacement", expected))
     except BREAKDOWNS as error:
         found.append(stopped("reference run", f"the check stopped: {error}"))

@@ -9,22 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from psa_casadi.errors import InputError
+from psa_casadi.export.check import structure
 from psa_casadi.export.check.agreement import Run, Truth
 from psa_casadi.export.check.binaries import binary_checks
 from psa_casadi.export.check.calls import CALLS
 from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, Check, CheckRow, stopped
-from psa_casadi.export.check.structure import (
-    adjoint_error,
-    directional_error,
-    equation_error,
-    event_indicators,
-    incomplete_dependencies,
-    input_line_error,
-    settled_start_error,
-    wrong_indicators,
-    wrong_nominals,
-    wrong_start,
-)
 from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
@@ -158,11 +147,11 @@ def _of_fmu(fmu: Fmu, task: Task, loaded: list[Fmu]) -> Iterator[Check]:
         return
     for name, listed in _CALLS.items():
         yield Check(name, partial(listed, fmu))
-    yield Check("directional derivatives", partial(directional_error, fmu), 1e-5)
+    yield Check("directional derivatives", partial(structure.directional_error, fmu), 1e-5)
     if fmu.version == 3:
-        yield Check("adjoint derivatives", partial(adjoint_error, fmu), 1e-10)
+        yield Check("adjoint derivatives", partial(structure.adjoint_error, fmu), 1e-10)
     if INPUT_LINE.name in fmu.references:
-        yield Check("line of the input", partial(input_line_error, fmu), _LINE_LIMIT)
+        yield Check("line of the input", partial(structure.input_line_error, fmu), _LINE_LIMIT)
     if task.truth:
         yield from _of_model(fmu, task.truth)
     for playback in task.playbacks:
@@ -170,11 +159,13 @@ def _of_fmu(fmu: Fmu, task: Task, loaded: list[Fmu]) -> Iterator[Check]:
 
 
 def _of_model(fmu: Fmu, truth: Truth) -> Iterator[Check]:
-    yield Check("start of a run", partial(wrong_start, fmu, truth))
+    yield Check("start of a run", partial(structure.wrong_start, fmu, truth))
     if truth.settled_starts:
-        yield Check("settled start", partial(settled_start_error, fmu, truth), _START_LIMIT)
-    yield Check("event indicators of the model", partial(wrong_indicators, fmu, truth))
-    yield Check("equations", partial(equation_error, fmu, truth), _EQUATION_LIMIT)
+        yield Check(
+            "settled start", partial(structure.settled_start_error, fmu, truth), _START_LIMIT
+        )
+    yield Check("event indicators of the model", partial(structure.wrong_indicators, fmu, truth))
+    yield Check("equations", partial(structure.equation_error, fmu, truth), _EQUATION_LIMIT)
     for run in truth.runs:
         yield Check(run.name, partial(_compared, fmu, truth, run), run.limit)
     if truth.problem:
@@ -226,7 +217,7 @@ _INTERFACES = {
 }
 _CALLS: dict[str, Callable[[Fmu], Iterable[str]]] = {
     **CALLS,
-    "nominal values": wrong_nominals,
-    "event indicators": event_indicators,
-    "dependencies complete": incomplete_dependencies,
+    "nominal values": structure.wrong_nominals,
+    "event indicators": structure.event_indicators,
+    "dependencies complete": structure.incomplete_dependencies,
 }

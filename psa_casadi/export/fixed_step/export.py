@@ -19,14 +19,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.publication import code_license, refuse_foreign
 from psa_casadi.export.common.templates import filled
-from psa_casadi.export.fixed_step.code import (
-    CodePlan,
-    check_names,
-    limit_words,
-    names_of,
-    source_code,
-    timed,
-)
+from psa_casadi.export.fixed_step import code
 from psa_casadi.export.fixed_step.expressions import PRECISIONS, Precision
 from psa_casadi.export.fixed_step.probe import (
     STEPS,
@@ -49,14 +42,14 @@ USELESS = 0.1
 _SAME = 1e-9
 _HELD = {"linear": False, "zero": True}
 #: Plans a model's step, or says why it has none.
-Attempt = Callable[[Model], tuple[CodePlan, str] | str]
+Attempt = Callable[[Model], tuple[code.CodePlan, str] | str]
 
 
 @dataclass(frozen=True, eq=False)
 class FixedStep:
     """A planned step with its sources by file name, and its measured errors."""
 
-    plan: CodePlan
+    plan: code.CodePlan
     texts: dict[str, str]
     errors: tuple[VoltageError, ...]
 
@@ -110,23 +103,23 @@ def fixed_step(
     # the voltage is limited to where the step is as good as on the reference ones
     limit = reach(best.plan, best.texts, max(GOOD, best.worst.error))
     plan = replace(best.plan, limit=limit)
-    sources = (header_code(plan, best.errors), source_code(plan))
+    sources = (header_code(plan, best.errors), code.source_code(plan))
     return FixedStep(plan, dict(zip(best.texts, sources, strict=True)), best.errors)
 
 
-def header_code(plan: CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
+def header_code(plan: code.CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
     """Return the header; its comment tells the `errors` that were measured."""
     model = plan.model
     return filled(
         "fixed_step.h",
-        **names_of(plan),
+        **code.names_of(plan),
         model=model,
         numbers={name: repr(value) for name, value in model.values.items()},
         errors=errors,
         steps=STEPS,
         voltages=VOLTAGES,
         shown=shown_output(model) if errors else "",
-        limit_words=limit_words(plan.limit),
+        limit_words=code.limit_words(plan.limit),
         licence="\n".join(code_license().splitlines()),
         tool=generation_tool(),
     )
@@ -160,14 +153,14 @@ def _check(name: str, step: float, precision: str, hold: str, substeps: int | No
         raise InputError(f"The substeps are {substeps}; give a number from 1 to 1000.")
 
 
-def _planned(model: Model, attempt: Attempt) -> tuple[CodePlan, str]:
+def _planned(model: Model, attempt: Attempt) -> tuple[code.CodePlan, str]:
     """Return the plan of a step and its source.
 
     Raises InputError where the model does not fit, with the effect to blame and the reason.
     """
     found = attempt(model)
     if not isinstance(found, str):
-        check_names(found[0])
+        code.check_names(found[0])
         return found
     own, blamed = {c.name for c in (*BASE, *SIMPLIFIED)}, []
     for name in (c.name for c in model.components if c.name not in own):
@@ -189,21 +182,21 @@ def _planned(model: Model, attempt: Attempt) -> tuple[CodePlan, str]:
 
 def _plan_or_reason(
     model: Model, *, name: str, step: float, substeps: int, held: bool, precision: Precision
-) -> tuple[CodePlan, str] | str:
+) -> tuple[code.CodePlan, str] | str:
     if not model.output_names:
         return "it has no outputs"
     expression = step_of(model, step / substeps)
     if isinstance(expression, str):
         return expression
     every = _steps_of_a_period(model, step)
-    plan = CodePlan(model, expression, name, step, substeps, held, precision, every)
-    if precision.single and timed(plan):
+    plan = code.CodePlan(model, expression, name, step, substeps, held, precision, every)
+    if precision.single and code.timed(plan):
         return (
             "its equations depend on the time itself, which single precision knows to 0.2 ms after"
             " an hour; double precision does not have this limit"
         )
     try:
-        return plan, source_code(plan)
+        return plan, code.source_code(plan)
     except Unprintable as reason:
         return f"its equations have what the code cannot express, {reason}"
 

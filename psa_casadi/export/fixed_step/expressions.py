@@ -57,21 +57,30 @@ class Printer:
     symbols: Mapping[str, Expression]
     places: Mapping[str, Sequence[str]]
     used: set[tuple[str, int]] = field(default_factory=set)
+    _graph: Graph = field(default_factory=Graph)
+    _folded: dict[int, float] = field(default_factory=dict)
     _variables: dict[int, int] = field(default_factory=dict)
 
     def lines(self, outputs: Sequence[Expression]) -> tuple[list[str], list[str]]:
         """Return a declaration and assignments in their order, and the C text of each output."""
-        graph = Graph()
-        numbers = graph.read(self.symbols, outputs)
-        folded: dict[int, float] = {}
-        needed = [
-            n for n in self._needed(graph, numbers, folded) if graph.nodes[n][0] not in _LOGICAL
-        ]
-        self._variables = {}
+        self._graph, self._folded, self._variables = Graph(), {}, {}
+        numbers = self._graph.read(self.symbols, outputs)
+        nodes, fixed = self._graph.nodes, self._graph.fixed
+        for n, (kind, *arguments) in enumerate(nodes):
+            if fixed[n] and kind not in LEAVES:
+                self._folded[n] = _constant(kind, [self._known(a) for a in arguments])
+        wanted: set[int] = set()
+        stack = list(numbers)
+        while stack:
+            n = stack.pop()
+            if n not in wanted and not fixed[n] and nodes[n][0] not in LEAVES:
+                wanted.add(n)
+                stack += [int(a) for a in nodes[n][1:]]
+        needed = [n for n in sorted(wanted) if nodes[n][0] not in _LOGICAL]
         lines, free, count = [], list[int](), 0
-        ends = _last_uses(graph, needed, numbers)
+        ends = self._last_uses(needed, numbers)
         for n in needed:
-            value = self._value(graph, folded, n)
+            value = self._value(n)
             free += sorted((self._variables[q] for q in ends.get(n, ())), reverse=True)
             if not free:
                 free.append(count)
@@ -80,54 +89,42 @@ class Printer:
             lines.append(f"s{self._variables[n]} = {value};")
         names = ", ".join(f"s{k}" for k in range(count))
         declared = textwrap.wrap(f"{self.precision.ctype} {names};", 90) if count else []
-        return declared + lines, [self._name(graph, folded, n) for n in numbers]
+        return declared + lines, [self._name(n) for n in numbers]
 
-    def _needed(self, graph: Graph, numbers: Sequence[int], folded: dict[int, float]) -> list[int]:
-        """Return the numbers to compute, sorted; constants are computed here."""
-        for n, node in enumerate(graph.nodes):
-            if graph.fixed[n] and node[0] not in LEAVES:
-                folded[n] = _constant(node[0], [_known(graph, folded, a) for a in node[1:]])
-        needed: set[int] = set()
-        stack = list(numbers)
-        while stack:
-            n = stack.pop()
-            if n in needed or graph.fixed[n] or graph.nodes[n][0] in LEAVES:
-                continue
-            needed.add(n)
-            stack += [int(a) for a in graph.nodes[n][1:]]
-        return sorted(needed)
+    def _known(self, n: int) -> float:
+        value = self._graph.value(n)
+        return self._folded[n] if value is None else value
 
-    def _name(self, graph: Graph, folded: Mapping[int, float], n: int) -> str:
-        kind = graph.nodes[n][0]
-        if graph.fixed[n]:
-            return self.precision.literal(_known(graph, folded, n))
+    def _name(self, n: int) -> str:
+        kind, *arguments = self._graph.nodes[n]
+        if self._graph.fixed[n]:
+            return self.precision.literal(self._known(n))
         if kind in LEAVES:
-            self.used.add((kind, graph.nodes[n][1]))
-            return self.places[kind][graph.nodes[n][1]]
+            self.used.add((kind, arguments[0]))
+            return self.places[kind][arguments[0]]
         if kind in _LOGICAL:
             one, none = self.precision.literal(1.0), self.precision.literal(0.0)
-            return f"({self._condition(graph, folded, n)} ? {one} : {none})"
+            return f"({self._condition(n)} ? {one} : {none})"
         return f"s{self._variables[n]}"
 
-    def _condition(self, graph: Graph, folded: Mapping[int, float], n: int) -> str:
-        kind, *arguments = graph.nodes[n]
+    def _condition(self, n: int) -> str:
+        kind, *arguments = self._graph.nodes[n]
         if kind in _COMPARED:
-            a, b = (self._name(graph, folded, q) for q in arguments)
+            a, b = map(self._name, arguments)
             return f"({a} {_COMPARED[kind]} {b})"
         if kind in _LOGICAL:
-            inner = [self._condition(graph, folded, q) for q in arguments]
+            inner = [self._condition(q) for q in arguments]
             if kind == "v_not":
                 return f"(!{inner[0]})"
             return f"({inner[0]} {'|' if kind == 'v_or' else '&'} {inner[1]})"
-        return f"({self._name(graph, folded, n)} != {self.precision.literal(0.0)})"
+        return f"({self._name(n)} != {self.precision.literal(0.0)})"
 
-    def _value(self, graph: Graph, folded: Mapping[int, float], n: int) -> str:
-        kind, *arguments = graph.nodes[n]
-        none = self.precision.literal(0.0)
+    def _value(self, n: int) -> str:
+        kind, *arguments = self._graph.nodes[n]
+        one, none = self.precision.literal(1.0), self.precision.literal(0.0)
         if kind == "v_if":
-            condition = self._condition(graph, folded, arguments[0])
-            return f"{condition} ? {self._name(graph, folded, arguments[1])} : {none}"
-        given = [self._name(graph, folded, a) for a in arguments]
+            return f"{self._condition(arguments[0])} ? {self._name(arguments[1])} : {none}"
+        given = [self._name(a) for a in arguments]
         if kind == "neg":
             return f"-({given[0]})"
         if kind in ("+", "-", "*", "/"):
@@ -137,38 +134,30 @@ class Printer:
             sign = "<" if kind == "v_fmin" else ">"
             return f"{given[0]} {sign} {given[1]} ? {given[0]} : {given[1]}"
         if kind == "v_sign":
-            one = self.precision.literal(1.0)
             return f"{given[0]} > {none} ? {one} : ({given[0]} < {none} ? -{one} : {none})"
         return f"{_FUNCTIONS[kind]}{self.precision.suffix}({', '.join(given)})"
 
+    def _last_uses(self, computed: Sequence[int], outputs: Sequence[int]) -> dict[int, list[int]]:
+        """Return the numbers of which each of `computed` is the last user, by it.
 
-def _last_uses(
-    graph: Graph, computed: Sequence[int], outputs: Sequence[int]
-) -> dict[int, list[int]]:
-    """Return the numbers of which each of `computed` is the last user, by it.
+        Logical ones have no variable: who uses them uses what they compare.
+        """
+        places = set(computed)
 
-    Logical ones have no variable: who uses them uses what they compare.
-    """
-    places = set(computed)
+        def used_by(n: int) -> set[int]:
+            found = set[int]()
+            kind, *arguments = self._graph.nodes[n]
+            for a in arguments if kind not in LEAVES else ():
+                found |= {a} if a in places else used_by(a)
+            return found
 
-    def used_by(n: int) -> set[int]:
-        found = set[int]()
-        for a in graph.nodes[n][1:] if graph.nodes[n][0] not in LEAVES else ():
-            found |= {a} if a in places else used_by(a)
-        return found
-
-    kept = {n for q in outputs for n in ({q} if q in places else used_by(q))}
-    last = {a: n for n in computed for a in used_by(n)}
-    ends: dict[int, list[int]] = {}
-    for a, n in last.items():
-        if a not in kept:
-            ends.setdefault(n, []).append(a)
-    return ends
-
-
-def _known(graph: Graph, folded: Mapping[int, float], n: int) -> float:
-    value = graph.value(n)
-    return folded[n] if value is None else value
+        kept = {n for q in outputs for n in ({q} if q in places else used_by(q))}
+        last = {a: n for n in computed for a in used_by(n)}
+        ends: dict[int, list[int]] = {}
+        for a, n in last.items():
+            if a not in kept:
+                ends.setdefault(n, []).append(a)
+        return ends
 
 
 def _constant(kind: str, given: Sequence[float]) -> float:

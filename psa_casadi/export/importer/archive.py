@@ -40,7 +40,8 @@ def archive_problems(path: Path) -> dict[str, tuple[str, ...]]:
 
     Where names or sizes are wrong the content is not looked at. Raises nothing for any content.
     """
-    names, size, damage = Problems(), Problems(), Problems()
+    found = {row: Problems() for row in ("archive names", "archive size", "archive intact")}
+    names, size, damage = found.values()
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -48,11 +49,10 @@ def archive_problems(path: Path) -> dict[str, tuple[str, ...]]:
                 names.add(sentence)
             for sentence in _wrong_sizes(entries, path.stat().st_size):
                 size.add(sentence)
-            if not names.sentences() and not size.sentences() and (bad := archive.testzip()):
+            if not names and not size and (bad := archive.testzip()):
                 damage.add(f"{bad!a} is damaged")
     except _DAMAGE as error:
         damage.add(f"the archive is damaged ({' '.join(ascii(str(error))[1:-1].split())})")
-    found = {"archive names": names, "archive size": size, "archive intact": damage}
     return {row: problems.sentences() for row, problems in found.items()}
 
 
@@ -117,8 +117,9 @@ class Archive:
         self.path = path
         self._held = ExitStack()
         try:
-            self.directory = unpacked or self._unpacked()
-            self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
+            self.directory = unpacked or self._held.enter_context(temporary_folder())
+            if unpacked is None:
+                unpack(path, self.directory)
             self._read()
         except Exception as error:  # fmpy raises it for any damage
             self._held.close()
@@ -127,20 +128,15 @@ class Archive:
             problem = f"{path}: cannot be read as an FMU ({error}); export it again."
             raise InputError(problem) from error
 
-    def _unpacked(self) -> Path:
-        """Return a temporary folder with the files of the archive."""
-        folder = self._held.enter_context(temporary_folder())
-        unpack(self.path, folder)
-        for name in _TEXTS:
-            if (folder / name).is_file() and (folder / name).stat().st_size > LONGEST_TEXT:
-                raise InputError(
-                    f"{self.path}: {name} has more than {LONGEST_TEXT >> 20} MiB and is not read;"
-                    " export the FMU again."
-                )
-        return folder
-
     def _read(self) -> None:
         """Read what the description says first; raises InputError if it is of no known kind."""
+        for text in (self.directory / name for name in _TEXTS):
+            if text.is_file() and text.stat().st_size > LONGEST_TEXT:
+                raise InputError(
+                    f"{self.path}: {text.relative_to(self.directory).as_posix()} has more than"
+                    f" {LONGEST_TEXT >> 20} MiB and is not read; export the FMU again."
+                )
+        self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
         said = str(self.description.fmiVersion)
         interface = self.description.coSimulation or self.description.modelExchange
         if said[:2] not in ("2.", "3.") or interface is None:
@@ -187,18 +183,15 @@ class Archive:
         """Return the names of the variables of one causality, in the order of the description."""
         return [v.name for v in self.description.modelVariables if v.causality == causality]
 
-    def varying(self, variability: str) -> list[str]:
-        """Return the names of the variables of one variability: tunable, constant, ..."""
-        return [v.name for v in self.description.modelVariables if v.variability == variability]
-
     def states(self) -> list[str]:
         """Return the names of the continuous states, in the order of the state vector."""
         return list(self._states)
 
     def sampled(self) -> list[str]:
         """Return the names of the sampled states: local variables that are discrete."""
-        local = set(self.names("local"))
-        return [name for name in self.varying("discrete") if name in local]
+        kind = ("local", "discrete")
+        every = self.description.modelVariables
+        return [v.name for v in every if (v.causality, v.variability) == kind]
 
     def indicators(self) -> list[str]:
         """Return the names of the variables that repeat the event indicators, in their order."""
@@ -215,10 +208,3 @@ class Archive:
         for path in sorted((self.directory / "binaries").rglob("*")):
             if path.is_file() and path.suffix in (".so", ".dll", ".dylib"):
                 yield path
-
-    def host_binary(self) -> Path | None:
-        """Return the path of the library for this machine, if there is one."""
-        folders = (fmpy.platform_tuple, fmpy.platform)[: 1 if self.version == 3 else 2]
-        name = self.identifier + fmpy.sharedLibraryExtension
-        places = [self.directory / "binaries" / folder / name for folder in folders]
-        return next((p for p in places if p.is_file()), None)

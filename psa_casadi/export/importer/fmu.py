@@ -12,6 +12,7 @@ from ctypes import c_double, c_uint
 from pathlib import Path
 from typing import Any, Self
 
+import fmpy
 import numpy as np
 from fmpy import fmi1, fmi2, fmi3
 
@@ -57,19 +58,19 @@ class Fmu(Archive):
 
         Raises InputError if the FMU has no binary for this machine, or one that cannot be loaded.
         """
-        if interface not in self._loaded:
-            self._loaded[interface] = self._load(interface)
-        return self._loaded[interface]
-
-    def _load(self, interface: int) -> Any:
-        binary = self.host_binary()
+        if interface in self._loaded:
+            return self._loaded[interface]
+        folders = (fmpy.platform_tuple, fmpy.platform)[: 1 if self.version == 3 else 2]
+        name = self.identifier + fmpy.sharedLibraryExtension
+        places = [self.directory / "binaries" / folder / name for folder in folders]
+        binary = next((p for p in places if p.is_file()), None)
         if binary is None:
             raise InputError(
                 f"{self.path}: has no binary for this machine; export it for this platform."
             )
         try:
             with chdir("."):  # fmpy does not leave the folder of a library that does not load
-                return _CLASSES[self.version, interface](
+                self._loaded[interface] = _CLASSES[self.version, interface](
                     guid=self.token, modelIdentifier=self.identifier, instanceName="psa_casadi",
                     unzipDirectory=str(self.directory.absolute()), libraryPath=str(binary),
                 )  # fmt: skip
@@ -77,6 +78,7 @@ class Fmu(Archive):
             raise InputError(
                 f"{self.path}: its binary cannot be loaded ({error}); export it here."
             ) from error
+        return self._loaded[interface]
 
     def open(self, interface: int, **options: Any) -> "Instance":
         """Return an instance; raises FmuError if the FMU refuses, InputError as `loaded`."""
@@ -212,11 +214,6 @@ class Instance:
         *flags, time = (self.fmi.newDiscreteStates if two else self.fmi.updateDiscreteStates)()
         self.next_event_time = time if flags[4] else None
         return [bool(flag) for flag in flags]
-
-    def completed_integrator_step(self) -> tuple[bool, bool]:
-        """Tell that the importer's step ended; return whether to enter event mode, and to end."""
-        event, end = self.fmi.completedIntegratorStep()
-        return event, end
 
     def vector(self, function: str, count: int) -> FloatArray:
         """Return a vector that a function of model exchange fills."""

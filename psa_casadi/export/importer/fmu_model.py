@@ -42,16 +42,6 @@ class Read:
     outputs: tuple[Output, ...]
     parameters: tuple[Parameter, ...]
 
-    @property
-    def names(self) -> list[str]:
-        """Names of all variables of the model."""
-        return [
-            *(q.name for q in self.states),
-            *(i.name for i in self.inputs),
-            *(o.name for o in self.outputs),
-            *(p.name for p in self.parameters),
-        ]
-
 
 def read_variables(fmu: Fmu, free: Free | None, values: Mapping[str, float]) -> Read:
     """Return the variables of an FMU; see `fmu_model`. Raises InputError with every mistake."""
@@ -79,19 +69,18 @@ def read_variables(fmu: Fmu, free: Free | None, values: Mapping[str, float]) -> 
             fixed=tuple((n, float(v)) for n, v in values.items() if n not in wanted),
         ),
         states=tuple(
-            State(_name(v.name, taken, "_state"), _unit(v), _words(v), fmu.nominals[v.name])
-            for v in states
+            State(_name(v.name, taken, "_state"), *_said(v), fmu.nominals[v.name]) for v in states
         ),
         inputs=tuple(
-            Input(_name(v.name), _unit(v), _words(v), _number(v.start), fmu.nominals[v.name])
-            for v in inputs
+            Input(_name(v.name), *_said(v), _number(v.start), fmu.nominals[v.name]) for v in inputs
         ),
-        outputs=tuple(
-            Output(plain_name(v.name), _unit(v), _words(v), fmu.nominals[v.name]) for v in outputs
-        ),
+        outputs=tuple(Output(plain_name(v.name), *_said(v), fmu.nominals[v.name]) for v in outputs),
         parameters=tuple(parameters),
     )
-    _refuse_twice(read.names, problems)
+    declared: Iterable[Any] = (*read.states, *read.inputs, *read.outputs, *read.parameters)
+    every = [v.name for v in declared]
+    for name in sorted({n for n in every if every.count(n) > 1}):
+        problems.add(f"Two variables of the FMU become '{name}' here; rename one in its model.")
     problems.raise_if_any()
     return read
 
@@ -172,10 +161,8 @@ def _parameter(
         )
     log = low > 0 and high >= _DECADE * low
     scale = None if value else 0.1 * (high - low)
-    return Parameter(
-        _name(variable.name), value, _unit(variable), (low, high), _words(variable),
-        log=log, scale=scale,
-    )  # fmt: skip
+    unit, words = _said(variable)
+    return Parameter(_name(variable.name), value, unit, (low, high), words, log=log, scale=scale)
 
 
 def plain_name(name: str) -> str:
@@ -192,28 +179,19 @@ def _name(name: str, taken: Iterable[str] = (), suffix: str = "_of_fmu") -> str:
     return plain + "_of_fmu" if plain == "time" or plain in BALANCES else plain
 
 
-def _unit(variable: Any) -> str:
-    """Return the unit, "1" where this package does not know it or it is no SI unit."""
+def _said(variable: Any) -> tuple[str, str]:
+    """Return unit and description; "1" where this package does not know it or it is no SI unit."""
     said = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
+    words = str(variable.description or variable.name)
     try:
         unit = parse_unit(said)
     except InputError:
-        return "1"
-    return said if unit.ratio == 1 and not unit.offset else "1"
-
-
-def _words(variable: Any) -> str:
-    return str(variable.description or variable.name)
+        return "1", words
+    return said if unit.ratio == 1 and not unit.offset else "1", words
 
 
 def _number(start: Any) -> float:
     return float(start) if start not in (None, "") else 0.0
-
-
-def _refuse_twice(names: Iterable[str], problems: Problems) -> None:
-    every = list(names)
-    for name in sorted({n for n in every if every.count(n) > 1}):
-        problems.add(f"Two variables of the FMU become '{name}' here; rename one in its model.")
 
 
 #: Points at which it is looked whether a rate is another state, and nothing else.
@@ -267,8 +245,15 @@ def fmu_model(
         outputs=read.outputs,
         foreign=imported.foreign,
     )
-    starts = zip((s.name for s in read.states), _starts(imported, read), strict=True)
-    return compose([component], name=own).with_starts(dict(starts))
+    names = read.selected.parameters
+    declared = {n: p.value for n, p in zip(names, read.parameters, strict=True)}
+    try:
+        with imported.initialised(declared) as instance:
+            starts = instance.vector("GetContinuousStates", len(read.states)).tolist()
+    except PsaError as error:
+        raise InputError(f"{fmu.path}: cannot be initialised ({error}); check `values`.") from error
+    model = compose([component], name=own)
+    return model.with_starts(dict(zip((s.name for s in read.states), starts, strict=True)))
 
 
 def _sizes(read: Read) -> tuple[float, ...]:
@@ -276,20 +261,6 @@ def _sizes(read: Read) -> tuple[float, ...]:
     nominals = [*(v.nominal for v in read.states), *(v.nominal for v in read.inputs)]
     sizes = [*(nominal_value(n, {}) for n in nominals), *(p.typical({}) for p in read.parameters)]
     return tuple(abs(size) or 1.0 for size in sizes)
-
-
-def _starts(imported: Imported, read: Read) -> list[float]:
-    """Return the states with which the FMU starts at its declared values. Raises InputError."""
-    values = {
-        n: p.value for n, p in zip(imported.selected.parameters, read.parameters, strict=True)
-    }
-    try:
-        with imported.initialised(values) as instance:
-            return list(instance.vector("GetContinuousStates", len(read.states)))
-    except PsaError as error:
-        raise InputError(
-            f"{imported.fmu.path}: cannot be initialised ({error}); check `values`."
-        ) from error
 
 
 @dataclass(frozen=True, eq=False)

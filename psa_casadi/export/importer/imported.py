@@ -99,16 +99,33 @@ class Imported:
     @cached_property
     def library(self) -> ctypes.CDLL:
         """The compiled functions, loaded, and given what they need of the FMU."""
+        s, of, fmu, version = self.selected, self.fmu.references, self.fmu, self.fmu.version
+        known = {"inputs": s.inputs, "shown": (*s.rates, *s.outputs),
+                 "known": (*s.states, *s.inputs)}  # fmt: skip
+        arrays: dict[str, Any] = {
+            name: (c_uint * len(names))(*(of[n] for n in names)) for name, names in known.items()
+        }
+        arrays["sizes"] = (c_double * len(self.sizes))(*self.sizes)
+        functions = [(f, n) for f, v, n in _FUNCTIONS if v in (0, version)]
+        if fmu.description.modelExchange.providesDirectionalDerivative:
+            functions.append((f"slope{version}", "GetDirectionalDerivative"))
+        called = {f: getattr(fmu.library, f"fmi{version}{name}") for f, name in functions}
+        pointers = {k: ctypes.cast(q, c_void_p) for k, q in (called | arrays).items()}
+        prepare = _PREPARE(self._prepared)
+        self._kept = arrays, prepare  # C points to these
         library = ctypes.CDLL(self.path)
-        self._kept = self._references()  # C points to these
-        self._prepare = _PREPARE(self._prepared)
-        library.psa_import(ctypes.byref(self._given()))
+        library.psa_import(ctypes.byref(_Given(version=version, prepare=prepare, **pointers)))
         return library
 
     @property
     def foreign(self) -> Foreign:
         """What a component declares of it."""
         return Foreign(self.name, self._addresses)
+
+    def _addresses(self) -> tuple[int, int]:  # a method, as it is pickled
+        names = (self.name, f"fwd1_{self.name}")
+        value, slope = (ctypes.cast(self.library[n], c_void_p).value or 0 for n in names)
+        return value, slope
 
     @cached_property
     def function(self) -> ca.Function:
@@ -149,40 +166,6 @@ class Imported:
             return None
         self.instances[slot, place] = found
         return int(found.fmi.component)
-
-    def _addresses(self) -> tuple[int, int]:
-        value, slope = self.library[self.name], self.library[f"fwd1_{self.name}"]
-        return _address(value), _address(slope)
-
-    def _references(self) -> dict[str, ctypes.Array[c_uint] | ctypes.Array[c_double]]:
-        """Return the arrays that `psa_imported` points to; they must outlive it."""
-        s, of = self.selected, self.fmu.references
-
-        def array(names: Sequence[str]) -> ctypes.Array[c_uint]:
-            return (c_uint * len(names))(*(of[n] for n in names))
-
-        return {
-            "inputs": array(s.inputs),
-            "shown": array((*s.rates, *s.outputs)),
-            "known": array((*s.states, *s.inputs)),
-            "sizes": (c_double * len(self.sizes))(*self.sizes),
-        }
-
-    def _given(self) -> _Given:
-        version, library = self.fmu.version, self.fmu.library
-        own = [(f, n) for f, v, n in _FUNCTIONS if v in (0, version)]
-        if self.fmu.description.modelExchange.providesDirectionalDerivative:
-            own.append((f"slope{version}", "GetDirectionalDerivative"))
-        called = {
-            field: ctypes.cast(getattr(library, f"fmi{version}{name}"), c_void_p)
-            for field, name in own
-        }
-        arrays = {k: ctypes.cast(a, c_void_p) for k, a in self._kept.items()}
-        return _Given(version=version, prepare=self._prepare, **called, **arrays)
-
-
-def _address(function: Any) -> int:
-    return ctypes.cast(function, c_void_p).value or 0
 
 
 def digest_of(file: Path) -> str:

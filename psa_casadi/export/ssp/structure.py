@@ -8,13 +8,7 @@ from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 from psa_casadi.characters import check_text
-from psa_casadi.export.common.markup import (
-    base_unit,
-    describe,
-    generation_tool,
-    number,
-    xml_text,
-)
+from psa_casadi.export.common import markup
 from psa_casadi.export.common.parameter_sets import parameter_set
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.ssp.drawing import OUTSIDE, Layout, Point, Port, Wire, WiredParts
@@ -70,7 +64,7 @@ def structure_description(
     parts = [
         {
             "name": box.name,
-            "about": describe(wiring.parts[box.name]),
+            "about": markup.describe(wiring.parts[box.name]),
             "ports": ports(box.name),
             "corners": {n: _place(getattr(box, n)) for n in ("x1", "y1", "x2", "y2")},
         }
@@ -84,7 +78,7 @@ def structure_description(
         published={
             _PUBLISHED.get(name, name): said for name, said in wiring.publication.stated.items()
         },
-        tool=generation_tool(),
+        tool=markup.generation_tool(),
         about=f"{wiring.name.replace('_', ' ')}: {', '.join(names)}",
         ports=ports(OUTSIDE),
         bindings=bindings,
@@ -92,8 +86,8 @@ def structure_description(
         wires=[connection(*pair) for pair in zip(layout.wires, layout.paths, strict=True)],
         step=_decimal(step),
         tolerance=_decimal(TOLERANCE),
-        units={name: base_unit(parse_unit(name)) for name in sorted(used)},
-        stop_time=number(stop_time),
+        units={name: markup.base_unit(parse_unit(name)) for name in sorted(used)},
+        stop_time=markup.number(stop_time),
         interval=_decimal(stop_time / _ROWS),
     )
     check_text(text, "SystemStructure.ssd, an XML file,")
@@ -158,23 +152,23 @@ def parameter_files(
         elements = [lifted[n] for n in sorted(lifted)]
         entries[values] = _set_text(f"{name}_shared", elements, units)
         ET.register_namespace("ssm", _MAPPING)
-        attributes = {"version": "1.0", "generationTool": generation_tool()}
+        attributes = {"version": "1.0", "generationTool": markup.generation_tool()}
         root = ET.Element(f"{{{_MAPPING}}}ParameterMapping", attributes)
         for source in sorted(shared):
             for part in shared[source]:
                 target = {"source": source, "target": f"{part}.{source}"}
                 ET.SubElement(root, f"{{{_MAPPING}}}MappingEntry", target)
-        entries[mapping] = xml_text(root).encode("utf-8")
+        entries[mapping] = markup.xml_text(root).encode("utf-8")
         bindings.append(Binding(OUTSIDE, values, mapping))
     return entries, tuple(bindings)
 
 
 def _set_text(name: str, elements: Sequence[ET.Element], units: Mapping[str, ET.Element]) -> bytes:
     """Return a parameter set of some parameters, with the units that they have."""
-    attributes = {"version": "1.0", "name": name, "generationTool": generation_tool()}
+    attributes = {"version": "1.0", "name": name, "generationTool": markup.generation_tool()}
     root = ET.Element(f"{{{_VALUES}}}ParameterSet", attributes)
     ET.SubElement(root, f"{{{_VALUES}}}Parameters").extend(elements)
     used = {e.get("unit", "") for e in root.iter(f"{{{_VALUES}}}Real")} - {""}
     if used:
         ET.SubElement(root, f"{{{_VALUES}}}Units").extend([units[n] for n in sorted(used)])
-    return xml_text(root).encode("utf-8")
+    return markup.xml_text(root).encode("utf-8")
