@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.components import SIMPLIFIED
 from psa_casadi.effects.drive import CHARGE_LEAKAGE, DRIVE_LAG, VOLTAGE_SATURATION
 from psa_casadi.effects.environment import MAINS_HUM, TEMPERATURE
-from psa_casadi.effects.sensor import SENSOR_JUMP, SENSOR_LAG, SENSOR_NONLINEARITY, SENSOR_RIPPLE
+from psa_casadi.effects.sensor import SENSOR_JUMP, SENSOR_NONLINEARITY, SENSOR_RIPPLE
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.scales import stroke_scale
@@ -100,25 +100,6 @@ def test_a_drive_lag_stands_beside_the_base_at_every_amplitude(
     angle = 2 * np.pi * frequency * lag
     expected = 1.0 / (1.0 + 1j * angle - shape * angle**2)
     assert abs(ratio - expected) < 0.01
-
-
-@pytest.mark.parametrize("frequency", [50.0, 300.0, 5000.0])
-def test_a_sensor_lag_turns_the_phase_of_a_first_order_lag(frequency: float) -> None:
-    """The reading is the displacement, with its hysteresis, over 1 + i w T; the plant is alike."""
-    lag = 2e-4
-    model = with_effect(SENSOR_LAG, sensor_lag_time=lag)
-    t = np.linspace(0.0, 40.0 / frequency, 8001)
-    voltage = 30.0 * np.sin(2 * np.pi * frequency * t)
-    found = simulated(model, t, voltage)
-    late = t > 20.0 / frequency
-    shown, true = (
-        tone(t[late], found[name][late], frequency)
-        for name in ("measured_displacement", "displacement")
-    )
-    angle, floor = 2 * np.pi * frequency * lag, 2 * np.pi * frequency * 1e-6
-    expected = (1 + 1j * floor) / (1 + 1j * (angle + floor))
-    assert shown / true == pytest.approx(expected, rel=1e-3)
-    assert np.angle(shown / true) == pytest.approx(-np.arctan(angle), rel=0.03)
 
 
 def test_a_leaking_charge_drive_droops_to_what_does_not_leak() -> None:

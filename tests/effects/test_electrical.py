@@ -53,15 +53,6 @@ def test_a_current_tells_the_capacitance(fast: Record) -> None:
     assert "keeps the 3 uF given" in found.sentence(3e-6)
 
 
-@slow
-def test_several_records_have_each_its_zero(fast: Record) -> None:
-    assert fast.current is not None
-    second = replace(fast.slice(0, 900), current=fast.current[:900] - 0.05)
-    found = capacitance_of([fast, second])
-    assert found is not None
-    assert found.value == pytest.approx(C_P, rel=0.005)
-
-
 @pytest.mark.parametrize("capacitance", [1e-8, 1.6e-6, 5e-5])
 def test_a_slow_current_of_any_size_and_a_lossy_ceramic(capacitance: float) -> None:
     """A loss tangent of 3 % turns the current's phase; it makes no other capacitance of it."""
