@@ -46,7 +46,12 @@ Inputs = Mapping[str, Callable[[float], float]]
 def by_fmpy(
     path: Path, step: float, count: int, inputs: Inputs, outputs: Sequence[str]
 ) -> FloatArray:
-    """Return outputs ("part.port" or of the system) at the points k step, shape (count + 1, ny)."""
+    """Return outputs ("part.port" or of the system) at the points k step, shape (count + 1, ny).
+
+    fmpy and ecos step all parts side by side with inputs held (Jacobi's scheme). fmpy hands the
+    system's inputs on after a step, so they are given to it one step early; it writes the values at
+    the end of a step beside the time of its start, which is put right here.
+    """
     early = {name: partial(lambda f, t: f(t + step), f) for name, f in inputs.items()}
     rows = simulate_ssp(str(path), stop_time=(count - 0.5) * step, step_size=step, input=early)
     if len(rows) != count:

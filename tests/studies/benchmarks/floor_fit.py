@@ -1,7 +1,9 @@
 """The floor of records: the held-out error that a linear fit of many features reaches.
 
-What has no prior size (the history before a record, how many knots a curve has, how many modes
-there are) is chosen by the evidence of the fitted samples.
+The features are written from the voltage alone and share nothing with the package's models: plays
+with their squares and cubes, relaxations over decades, discrete modes, a fine curve over the
+displacement. What has no prior size (the history before a record, how many knots a curve has, how
+many modes there are) is chosen by the evidence of the fitted samples.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,6 @@
-"""Causes in the sensor and around it, and the noise: from displacement to reading [um]."""
+"""Causes by their place: amplifier and cable [V], ceramic (its free strain is expressed in volts),
+mechanics and sensor [um], and the noise. A record hides a cause by its name with its values.
+"""
 
 import math
 

@@ -185,7 +185,15 @@ def draw_density(limits: tuple[float, float], rng: np.random.Generator) -> Densi
 
 
 def preisach(u: Floats, history: History, density: Density) -> Floats:
-    """Return the output along a voltage, centred and with a part without hysteresis."""
+    """Preisach hysteresis of a continuous density, by its Everett function.
+
+        E(a, b) = integral of the density over b <= beta <= alpha <= a
+        y = y_r + E(u, u_r) on the way up, y_r - E(u_r, u) on the way down
+
+    (u_r, y_r): the last reversal that is not wiped out; the output is centred and has a part
+    without hysteresis. Source: D. H. Everett, Trans. Faraday Soc. 51 (1955) 1551; I. D. Mayergoyz,
+    "Mathematical Models of Hysteresis", ch. 1.
+    """
     way = np.clip(np.concatenate((np.array(history), u)), density.low, density.high)
     base, sign, upper, lower = _branches(way, density)
     out = base + sign * density.everett.ev(upper, lower) * (upper > lower)

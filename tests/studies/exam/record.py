@@ -124,7 +124,11 @@ def named(*causes: Cause) -> dict[str, Cause]:
 def filtered(
     numerator: Sequence[float], denominator: Sequence[float], signal: Floats, step: float
 ) -> Floats:
-    """Return numerator(s)/denominator(s) of a signal, at rest before its first sample."""
+    """Return numerator(s)/denominator(s) of a signal, at rest before its first sample.
+
+    Exact steps; the signal is a straight line between two samples. Source: K. J. Astrom, B.
+    Wittenmark, "Computer-Controlled Systems", first-order hold.
+    """
     b, a, _ = cont2discrete((np.array(numerator), np.array(denominator)), step, method="foh")
     rest = numerator[-1] / denominator[-1] * signal[0]
     out = rest + lfilter(np.ravel(b), np.ravel(a), signal - signal[0])

@@ -1,4 +1,6 @@
-"""An outside method on the data set: PySINDy's sparse regression of what the fitted base leaves.
+"""Answers to the data set: by `psa diagnose` (the record alone, every effect), and by PySINDy.
+
+An outside method is PySINDy's sparse regression of what the fitted base leaves.
 
 Discrepancy modelling (Kaheman, Kaiser, Strom, Kutz and Brunton 2019, "Learning discrepancy models
 from experimental data") with sequentially thresholded least squares. Each term of the library
