@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from psa_casadi.report.documents.schemas import schema_texts
+from psa_casadi.report.documents.files import schema_texts
 
 FOLDER = Path(__file__).resolve().parents[1] / "psa_casadi" / "data" / "schemas"
 

@@ -15,7 +15,7 @@ from psa_casadi.cli.app import app
 from psa_casadi.posterior import chains
 from psa_casadi.posterior.chains import chains_of
 from psa_casadi.posterior.task import Block, Density, Task, Within, task_of
-from psa_casadi.report.documents.schemas import schema_texts
+from psa_casadi.report.documents.files import schema_texts
 from tests.model.stack_models import stack
 
 FloatArray = NDArray[np.float64]

@@ -21,7 +21,7 @@ from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
 from psa_casadi.model.parts import PARTS, part_model
-from psa_casadi.report.documents.schemas import FILES, schema_texts
+from psa_casadi.report.documents.files import FILES, schema_texts
 
 
 def _options(group: TyperGroup, name: str) -> dict[str, list[str]]:

@@ -18,8 +18,7 @@ from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import dumps
 from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.report.documents.files import check_file, identification_file
-from psa_casadi.report.documents.schemas import FILES, schema_texts
+from psa_casadi.report.documents.files import FILES, check_file, identification_file, schema_texts
 from psa_casadi.strict_json import json_text
 from psa_casadi.variables import Publication
 from tests.model.evidence_models import evident_model
