@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from psa_casadi.component import Component, Equations
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.units import FloatArray
 from psa_casadi.variables import Input, Output, Parameter, State
+
+FloatArray = NDArray[np.float64]
 
 PERIOD, LAG, GAIN, PROPORTIONAL, INTEGRAL = 1e-3, 4e-3, 2.0, 0.6, 150.0
 
