@@ -167,7 +167,7 @@ def test_texts(build: Any, text: str) -> None:
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
     graph = Graph()
     (node,) = graph.read([build(a, b)])
-    assert Printer(graph, {"a": "a", "b": "b"}).text(node) == text
+    assert Printer(graph, {"a": "a", "b": "b"}).definition(node) == text
 
 
 def test_what_is_used_twice_does_not_make_the_text_grow_exponentially() -> None:
