@@ -16,8 +16,8 @@ from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.evidence import (
     META_DATA,
     PAGE,
-    EvidenceFiles,
     evidence_files,
+    related_files,
     with_validity,
 )
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
@@ -121,19 +121,20 @@ def _companions(model: Model, fmi: int, samples: int, fixed: FixedStep | None) -
     A model that cannot be simulated with its own values is exported without a reference run, and so
     is one with a fixed step, which takes neither the run's parameters nor any step of its rows.
     """
-    evidence = EvidenceFiles()
+    evidence: dict[str, bytes] = {}
     try:
         evidence = evidence_files(model, samples)
-        entries, step = reference_entries(model, evidence.related), held_step(model)
+        related = related_files(model, evidence)
+        entries, step = reference_entries(model, related), held_step(model)
     except SimulationError:
-        entries, step = {}, None
+        entries, step, related = {}, None, related_files(model, evidence)
     if fixed is not None:
         entries = {FIXED_ENTRY: fixed_entry(fixed)}
         page = documentation(model, reference_run=False, step=step, use=use_of(fixed))
     else:
-        more = {n: evidence.related[n].meaning for n in (PAGE, META_DATA) if n in evidence.related}
+        more = {n: related[n][2] for n in (PAGE, META_DATA) if n in related}
         page = documentation(model, reference_run=bool(entries), step=step, more=more)
-        entries |= evidence.entries
+        entries |= evidence
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
     entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])

@@ -30,7 +30,7 @@ from psa_casadi.export.fixed_step.code import bounded, function_code, limit_word
 from psa_casadi.export.fixed_step.export import FixedStep
 from psa_casadi.export.fixed_step.probe import STEPS, shown_output
 from psa_casadi.export.fmu.description import model_description
-from psa_casadi.export.fmu.evidence import seen_duration, seen_inputs
+from psa_casadi.export.fmu.evidence import seen_inputs
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import (
@@ -226,9 +226,10 @@ def _seen(model: Model) -> list[str]:
     """Return what the records behind the model have shown, for its log."""
     rows = [", ".join(_number(v) for v in row) for row in [*seen_inputs(model), (0.0, 0.0, 0.0)]]
     body = ", ".join(f"{{{row}}}" for row in rows)
+    duration = model.evidence.seen.duration if model.evidence else math.inf
     return [
         f"const psa_range psa_seen[PSA_NU + 1] = {{{body}}};",
-        f"const double psa_seen_duration = {_number(seen_duration(model))};",
+        f"const double psa_seen_duration = {_number(duration)};",
     ]
 
 
