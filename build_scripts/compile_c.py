@@ -22,7 +22,7 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
-from psa_casadi.export.fmu.sources import STRICT, write_sources
+from psa_casadi.export.fmu.sources import STRICT, exported_texts
 from psa_casadi.export.web import WEB_FLAGS, module_texts
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.compiler import generate_c
@@ -113,8 +113,11 @@ def write_all(sources: Path) -> list[Work]:
     """
     headers = Path(fmpy.__file__).parent / "c-code"
     every_effect = compose((*BASE, *EFFECTS.values()))
-    write_sources(compose(BASE), sources / "fmi2", fmi=2)
-    write_sources(every_effect, sources / "fmi3", name="psa", fmi=3)
+    for model, fmi in ((compose(BASE), 2), (every_effect, 3)):
+        folder = sources / f"fmi{fmi}"
+        folder.mkdir(parents=True)
+        for name, text in exported_texts(model, "psa", fmi)[1].items():
+            (folder / name).write_text(text, encoding="utf-8")
     write_library(every_effect, sources / "library")
     write_imported(sources / "imported")
     work = [

@@ -33,7 +33,7 @@ from psa_casadi.export.fmu import sources
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
-from psa_casadi.export.fmu.sources import STRICT, write_sources
+from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS, stack_model
@@ -49,15 +49,13 @@ STACK = "P-885.51"
 @pytest.mark.parametrize("name", slow_but(["flexure"], ["slow_creep", "flexure"]))
 def test_sources_compile_alone_without_warnings(name: str, tmp_path: Path) -> None:
     """By gcc; zig's compiler is tried by `build_scripts.compile_c`."""
-    written = write_sources(model_named(name).plant(), tmp_path / "sources")
-    line = next(
-        t for t in (tmp_path / "sources" / "README.txt").read_text().splitlines() if " cc " in t
-    )
+    for place, content in entries(name, 2).items():
+        if place.startswith("sources/"):
+            (tmp_path / Path(place).name).write_bytes(content)
+    line = next(t for t in (tmp_path / "README.txt").read_text().splitlines() if " cc " in t)
     command = ["gcc", *line.split()[1:], *STRICT]
-    output = command[command.index("-o") + 1]
-    run_compiler(command, tmp_path / "sources")
-    assert (tmp_path / "sources" / output).stat().st_size > 10_000
-    assert {p.name for p in written} >= {"model.c", "model_config.h", "fmi_data.c", "fmi2.c"}
+    run_compiler(command, tmp_path)
+    assert (tmp_path / command[command.index("-o") + 1]).stat().st_size > 10_000
 
 
 @pytest.mark.usefixtures("without_binary")

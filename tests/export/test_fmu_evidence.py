@@ -82,10 +82,10 @@ def test_parameter_sets_are_as_their_schema_has_them() -> None:
 
 
 def test_a_model_without_evidence_has_no_such_files() -> None:
-    assert evidence.evidence_files(psa.stack_model("demo"), 20).entries == {}
+    assert evidence.evidence_files(psa.stack_model("demo"), 20) == {}
     none = evidence.evidence_files(evident_model().plant(), 0)
-    assert not [n for n in none.entries if n.startswith(evidence.SETS)]
-    assert evidence.UNCERTAINTY not in none.related
+    assert not [n for n in none if n.startswith(evidence.SETS)]
+    assert evidence.UNCERTAINTY not in none
 
 
 def test_what_a_person_says_of_a_record_stays_text() -> None:

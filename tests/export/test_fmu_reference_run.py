@@ -131,7 +131,7 @@ def _errors(found: npt.NDArray[np.float64], expected: Table) -> dict[str, float]
 )
 def test_reference_outputs_agree_with_the_independent_reference(name: str) -> None:
     model = model_named(name).plant()
-    inside = reference_entries(model)
+    inside = reference_entries(model, {})
     inputs, outputs = (table(inside[f"{FOLDER}/{n}"]) for n in (INPUTS, OUTPUTS))
     truth = expected_outputs(model, outputs["time"], _kinks(_signals(inputs)))
     assert max(_errors(truth, outputs).values()) < 1e-6
