@@ -1,23 +1,14 @@
 """FMUs of several models against computations that share no code with them."""
 
-import fmpy
-import numpy as np
 import pytest
 
 from psa_casadi.export.check.agreement import has_reference
 from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.reference import simulate
 from tests.export.fmu_models import exported, model_named
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
-MODELS = (
-    "PTBS200", "WYDS0808020", STACK, "manipulator", "single_mass", "slow_creep", "flexure",
-    "every_effect",
-)  # fmt: skip
-
-
 #: The two versions are two faces of one core: each kind of model in one of them, one in both. Other
 #: stacks are checked in `test_cli_commands` and played in `test_fmu_accuracy`.
 CHECKED = (
@@ -40,30 +31,7 @@ def test_check_passes(name: str, fmi: int) -> None:
     assert all(r.remark.endswith(f"against the {against}") for r in steps)
 
 
-@pytest.mark.parametrize("interface", slow_but(["CoSimulation"], ["CoSimulation", "ModelExchange"]))
-def test_fmpy_agrees(interface: str) -> None:
-    """fmpy's own co-simulation master, and its CVode for model exchange, on two jumps."""
-    rows = [(0.0, 0.0), (5e-3, 0.0), (5e-3, 100.0), (15e-3, 100.0), (15e-3, 20.0), (30e-3, 20.0)]
-    table = np.array(
-        [(t, v, 0.0) for t, v in rows],
-        dtype=[(n, float) for n in ("time", "voltage", "load_force")],
-    )
-    result = fmpy.simulate_fmu(
-        str(exported(STACK)), stop_time=0.03, fmi_type=interface, relative_tolerance=1e-9,
-        output_interval=1e-3, input=table, output=["displacement"],
-    )  # fmt: skip
-    times, first = np.unique(result["time"], return_index=True)
-    truth = simulate(
-        model_named(STACK).values,
-        lambda t: 0.0 if t < 5e-3 else 100.0 if t < 15e-3 else 20.0,
-        times,
-        breakpoints=(5e-3, 15e-3),
-    ).displacement
-    assert len(times) >= 31
-    assert np.max(np.abs(result["displacement"][first] - truth)) < 1e-6 * np.ptp(truth)
-
-
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", dict(CHECKED))
 def test_nominal_values_of_parameters_are_within_their_bounds(name: str) -> None:
     for v in variable_table(model_named(name)):
         if v.kind == "parameter" and v.bounds and v.bounds[1] > 0.0:
