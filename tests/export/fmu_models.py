@@ -14,6 +14,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
+from tests.model.sampled_models import controller, loop
 
 _FOLDER = tempfile.TemporaryDirectory()
 
@@ -29,20 +30,22 @@ _MANIPULATOR = {
 def model_named(name: str) -> Model:
     """Return a stack by its name, or one of: manipulator, single_mass, flexure, slow_creep.
 
-    Or "every_effect": the base with all effects, each with a small gain.
+    Or "every_effect": the base with all effects, each with a small gain; or "loop", "controller":
+    sampled ones.
     """
     if name in STACKS:
         return compose(BASE, {k: figure.value for k, figure in STACKS[name].values.items()})
-    if name == "manipulator":
-        return compose(BASE, _MANIPULATOR)
-    if name == "single_mass":
-        return compose(SIMPLIFIED)
-    if name == "flexure":
-        return compose([COMPONENTS["flexure"]], name="flexure")
-    if name == "every_effect":
-        gains = {c.gain: 1e-3 for c in EFFECTS.values() if c.gain}
-        return compose((*BASE, *EFFECTS.values()), gains, name=name)
-    return compose((*BASE, EFFECTS["slow_creep"]), {"creep_gain": 0.05})
+    gains = {c.gain: 1e-3 for c in EFFECTS.values() if c.gain}
+    made: dict[str, Callable[[], Model]] = {
+        "manipulator": lambda: compose(BASE, _MANIPULATOR),
+        "single_mass": lambda: compose(SIMPLIFIED),
+        "flexure": lambda: compose([COMPONENTS["flexure"]], name="flexure"),
+        "every_effect": lambda: compose((*BASE, *EFFECTS.values()), gains, name=name),
+        "slow_creep": lambda: compose((*BASE, EFFECTS["slow_creep"]), {"creep_gain": 0.05}),
+        "loop": loop,
+        "controller": controller,
+    }
+    return made[name]()
 
 
 @cache

@@ -6,7 +6,6 @@ Beyond the rated voltage it is as good as it says, or limited and told.
 import ctypes
 import re
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -157,16 +156,6 @@ def test_wrong_wishes_end_in_a_sentence(wrong: dict[str, object], said: str) -> 
     model = with_effect("backlash") if "substeps" in wrong else stack("P-885.51")
     with pytest.raises(psa.InputError, match=said):
         fixed_step(model, **given)  # type: ignore[arg-type]  # wrong on purpose
-
-
-def test_the_command_writes_two_files_and_tells_the_error(tmp_path: Path) -> None:
-    arguments = ["export", "c", "--stack", "P-885.51", "--step", "10us", "--name", "stack"]
-    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "code")])
-    assert done.exit_code == 0, done.output
-    assert sorted(p.name for p in (tmp_path / "code").iterdir()) == ["stack.c", "stack.h"]
-    assert "step: 1e-05 s, 1 substep, double precision" in done.output
-    assert "left out: sensor" in done.output
-    assert f"{errors(base())['jumps']:.1e}" in done.output
 
 
 @pytest.mark.parametrize(

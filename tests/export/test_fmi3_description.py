@@ -1,17 +1,13 @@
 """modelDescription.xml of FMI 3.0: valid, complete, and the same model as that of FMI 2.0."""
 
 from functools import cache
-from typing import Any
 from xml.etree import ElementTree as ET
 
-import casadi as ca
-import numpy as np
 import pytest
 
 from psa_casadi.component import Component, Equations
-from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.description import dependencies, model_description
-from psa_casadi.model.compose import Model, Structure, compose
+from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.variables import Input, Output, Parameter, State
 from tests.export.fmu_models import model_named
@@ -68,54 +64,6 @@ def test_structure_lists_every_unknown_in_order(name: str) -> None:
     assert list(found.get("EventIndicator", {})) == [f"switch.{n}" for n in s.switches]
     kinds = {k for knowns in found["InitialUnknown"].values() for k in knowns.values()}
     assert kinds <= {"dependent", "constant"}
-
-
-def _values(model: Model, point: dict[str, float]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    s = model.structure
-    vectors = [
-        np.array([point[n] for n in names])
-        for names in (model.state_names, model.input_names, model.parameter_names)
-    ]
-    switches = _switches(s)(point["time"], *vectors)
-    parts = [*s.f(point["time"], *vectors), switches]
-    return np.concatenate([np.array(part).ravel() for part in parts])
-
-
-@cache
-def _switches(structure: Structure) -> Any:
-    s = structure
-    values = ca.vertcat(ca.SX(0, 1), *s.switches.values())
-    return ca.Function("z", [s.time, s.x, s.u, s.p], [values])
-
-
-@pytest.mark.parametrize("name", ["demo", "every_effect", "single_mass", "flexure"])
-def test_dependencies_are_complete(name: str) -> None:
-    """Whatever moves an unknown, parameters included, is listed: tried at three random points."""
-    model, generator = model_named(name), np.random.default_rng(6)
-    found = entries_of(name)
-    table = variable_table(model)
-    unknowns = [v.name for k in ("derivative", "output", "indicator") for v in table if v.kind == k]
-    listed = {
-        **found["ContinuousStateDerivative"],
-        **found["Output"],
-        **found.get("EventIndicator", {}),
-    }
-    sizes = {v.name: abs(v.nominal or 1.0) for v in table}
-    starts = {v.name: v.start or 0.1 * sizes[v.name] for v in table if v.kind == "parameter"}
-    moved = set()
-    for _ in range(3):
-        point = {n: v * generator.uniform(0.95, 1.05) for n, v in starts.items()}
-        point |= {
-            v.name: sizes[v.name] * generator.uniform(-1.0, 1.0)
-            for v in table
-            if v.kind in ("time", "state", "input")
-        }
-        here = _values(model, point)
-        for known in point:
-            changed = _values(model, {**point, known: 1.01 * point[known]}) != here
-            moved |= {(u, known) for u, c in zip(unknowns, changed, strict=True) if c}
-    assert len(moved) > 2 * len(unknowns)
-    assert [pair for pair in sorted(moved) if pair[1] not in listed[pair[0]]] == []
 
 
 def test_kinds_of_dependence() -> None:

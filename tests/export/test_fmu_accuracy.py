@@ -5,6 +5,7 @@ moves is not asked for more digits than its absolute tolerance holds)."""
 
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,6 @@ from psa_casadi.reference import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
-from tests.export import sampled_fmus
 from tests.export.fmi3_instances import Instance3, Update
 from tests.export.fmu_models import exported, model_named
 from tests.model.sampled_models import PERIOD, loop
@@ -46,7 +46,7 @@ GRID = _grid(2e-2, 1e-4)
 _TONES = ((50.0, 0.30, 0.0), (170.0, 0.12, 1.0), (610.0, 0.05, 2.0))
 _WAVE = sum((a * (np.sin(2 * np.pi * f * GRID + p) - np.sin(p)) for f, a, p in _TONES), 0.0 * GRID)
 #: Times, and voltages as shares of the rated one.
-SIGNALS: dict[str, tuple[FloatArray, FloatArray]] = {
+SIGNALS: dict[str, tuple[FloatArray, Any]] = {
     # up, down, held and reversed: four kinks, two reversals, one of them within a step
     "ramps": (np.array([0.0, 4e-3, 7e-3, 1e-2, 1.05e-2, 2e-2]),
               np.array([0.0, 1.0, 0.3, 0.3, 0.9, 0.1])),
@@ -216,7 +216,7 @@ REQUESTED = pytest.mark.parametrize("tolerance", [None, 1e-8, 1e-12])
 
 def _alternating(fmu: Fmu, start: float, sizes: FloatArray, tolerance: float | None) -> FloatArray:
     """Hold 100 V and 0 V in turn from each communication point on; return the displacements."""
-    levels = 100.0 * (1 - np.arange(len(sizes)) % 2)
+    levels = np.where(np.arange(len(sizes)) % 2, 0.0, 100.0)
     return _held(fmu, _sums(start, sizes), sizes, levels, tolerance)
 
 
@@ -289,7 +289,7 @@ def test_a_step_below_the_resolution_of_time_is_refused() -> None:
 def test_sampled_states_far_from_zero(fmi: int) -> None:
     """A million seconds on, each instant is where it is near 0 to the rounding of the time."""
     times = np.arange(24) * (PERIOD / 4.0)
-    with Fmu(sampled_fmus.exported("loop", fmi)) as fmu:
+    with Fmu(exported("loop", fmi)) as fmu:
         runs = []
         for start in (0.0, 1e6 * PERIOD, 1e9 * PERIOD):
             with fmu.start(CO_SIMULATION, tolerance=1e-9, start_time=start) as slave:
@@ -308,7 +308,7 @@ def test_sampled_states_far_from_zero(fmi: int) -> None:
 @VERSIONS
 def test_instants_that_cannot_be_counted_are_refused(fmi: int) -> None:
     """By the start, by a step, by the period, in model exchange, and outside of an FMU."""
-    with Fmu(sampled_fmus.exported("loop", fmi)) as fmu:
+    with Fmu(exported("loop", fmi)) as fmu:
         for start in (1e14 * PERIOD, 1e300):
             with (
                 fmu.open(CO_SIMULATION) as slave,

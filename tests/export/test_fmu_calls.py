@@ -13,7 +13,6 @@ from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
     ERROR,
-    MODEL_EXCHANGE,
     OK,
     Fmu,
     FmuError,
@@ -137,18 +136,3 @@ def test_rate_is_forgotten_after_its_step(slave: Instance) -> None:
     assert slave.get(["voltage"])[0] == pytest.approx(10.0)
     slave.step(1e-3, 1e-3)
     assert slave.get(["voltage"])[0] == pytest.approx(10.0)
-
-
-def test_snapshot_of_another_model_or_interface_is_refused(slave: Instance) -> None:
-    snapshot = slave.save()
-    data = slave.serialize(snapshot)
-    fmu = Fmu(slave.fmu.path)
-    with fmu, fmu.start(MODEL_EXCHANGE) as other, pytest.raises(FmuError, match="other interface"):
-        other.restore(snapshot)
-    with (
-        Fmu(exported("PTBS200")) as fmu,
-        fmu.open(CO_SIMULATION) as stranger,
-        pytest.raises(FmuError, match="another model"),
-    ):
-        stranger.deserialize(data)
-    slave.drop(snapshot)

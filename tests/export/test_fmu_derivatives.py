@@ -17,6 +17,7 @@ from psa_casadi.export.importer.fmu import (
     MODEL_EXCHANGE,
     OK,
     Fmu,
+    Instance,
 )
 from tests.export.fmi3_instances import Instance3, Update, loaded
 from tests.export.fmu_models import exported, model_named
@@ -67,7 +68,7 @@ def _scales(names: Sequence[str], name: str) -> FloatArray:
 
 
 def _jacobian(
-    instance: Instance3, unknowns: Sequence[str], knowns: Sequence[str], *, backwards: bool = False
+    instance: Instance, unknowns: Sequence[str], knowns: Sequence[str], *, backwards: bool = False
 ) -> FloatArray:
     """Return d unknowns / d knowns, one product for each column or each row."""
     if backwards:
@@ -84,35 +85,12 @@ def _worst(found: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
     return float((np.abs((found - truth) * scales) / rows[:, None]).max())
 
 
-@pytest.mark.parametrize("name", slow_but(MODELS[:1], MODELS))
-def test_point_derivatives_in_model_exchange_are_exact(name: str) -> None:
-    kinds, point = _names(name), _point(name)
-    unknowns = [*kinds["derivative"], *kinds["output"], *kinds["indicator"]]
-    knowns = [*kinds["state"], *kinds["input"], *kinds["parameter"]]
-    columns = []
-    with Instance3(loaded(name), MODEL_EXCHANGE) as instance:
-        instance.start(point)
-        for known in knowns:
-            step, slope = 4e-3 * (abs(point[known]) or 1.0), np.zeros(len(unknowns))
-            for k, weight in EIGHTH.items():
-                values = []
-                for sign in (1.0, -1.0):
-                    instance.set({known: point[known] + sign * k * step})
-                    values.append(instance.get(unknowns))
-                slope += weight * (values[0] - values[1]) / step
-            instance.set({known: point[known]})
-            columns.append(slope)
-        exact = _jacobian(instance, unknowns, knowns)
-        back = _jacobian(instance, unknowns, knowns, backwards=True)
-    scales = _scales(knowns, name)
-    assert _worst(exact, np.array(columns).T, scales) < 1e-10
-    assert _worst(back, exact, scales) < 1e-13
-
-
-def test_both_versions_and_interfaces_agree_at_a_point() -> None:
+def test_both_versions_interfaces_and_directions_agree_at_a_point() -> None:
+    """That they are exact: `test_fmu_casadi`, and `psa check` for the indicators."""
     name = MODELS[0]
     kinds, point = _names(name), _point(name)
     unknowns = [*kinds["derivative"], *kinds["output"], *kinds["indicator"]]
+    knowns = [*kinds["state"], *kinds["input"], *kinds["parameter"]]
     with (
         Instance3(loaded(name), MODEL_EXCHANGE) as exchange,
         Instance3(loaded(name), CO_SIMULATION) as stepping,
@@ -121,14 +99,10 @@ def test_both_versions_and_interfaces_agree_at_a_point() -> None:
     ):
         for instance in (exchange, stepping):
             instance.start(point)
-        for known in ("u", "voltage", "C_p"):
-            found = [i.directional(unknowns, [known], [1.0]) for i in (exchange, stepping)]
-            result = (len(unknowns) * c_double)()
-            older.require(
-                "GetDirectionalDerivative", older.references(unknowns), c_size_t(len(unknowns)),
-                older.references([known]), c_size_t(1), (1 * c_double)(1.0), result,
-            )  # fmt: skip
-            assert found[0].tobytes() == found[1].tobytes() == bytes(result)
+        found = [_jacobian(i, unknowns, knowns) for i in (exchange, stepping, older)]
+        assert found[0].tobytes() == found[1].tobytes() == found[2].tobytes()
+        back = _jacobian(exchange, unknowns, knowns, backwards=True)
+    assert _worst(back, found[0], _scales(knowns, name)) < 1e-13
 
 
 def test_what_cannot_be_differentiated_is_refused() -> None:

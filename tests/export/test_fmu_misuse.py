@@ -22,7 +22,6 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.model.compose import compose
-from tests.export import sampled_fmus
 from tests.export.fmu_models import exported, model_named
 from tests.tiers import slow
 
@@ -80,7 +79,7 @@ def _use(instance: Instance, moved: str) -> str:
 @pytest.mark.parametrize("model", ["stack", "sampled"])
 def test_forged_snapshots_do_no_harm(model: str) -> None:
     """Every word of a state replaced, with a checksum that is right."""
-    path = exported(STACK) if model == "stack" else sampled_fmus.exported("loop", 3)
+    path = exported(STACK) if model == "stack" else exported("loop", 3)
     moved = "voltage" if model == "stack" else "reference"
     refused: dict[tuple[int, bytes], int] = {}
     said, slowest = set(), 0.0

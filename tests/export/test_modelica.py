@@ -35,7 +35,12 @@ def _without_version(text: str) -> list[str]:
 
 
 def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
-    path = export_modelica(stack_model("P-885.51"), tmp_path / "stack.mo")
+    path = tmp_path / "PiezoStack.mo"
+    arguments = ["export", "modelica", "--stack", "P-885.51", "-o", str(path)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "left out: sensor" in result.output
+    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in result.output
     expected = _without_version(_GOLDEN.read_text(encoding="utf-8"))
     found = _without_version(path.read_text(encoding="utf-8"))
     diff = "".join(difflib.unified_diff(expected, found, "accepted", "found", n=1))
@@ -112,16 +117,6 @@ def test_a_start_that_is_not_finite_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="start of state 'z' is inf, which Modelica cannot write"):
         export_modelica(compose([endless]), tmp_path / "x.mo")
     assert not list(tmp_path.iterdir())
-
-
-def test_the_command_writes_the_package_and_says_what_is_in_it(tmp_path: Path) -> None:
-    path = tmp_path / "PiezoStack.mo"
-    arguments = ["export", "modelica", "--stack", "P-885.51", "-o", str(path)]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    assert "left out: sensor" in result.output
-    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in result.output
-    assert path.read_text(encoding="utf-8") == modelica_text(stack_model("P-885.51"))
 
 
 @pytest.mark.parametrize(("start", "rests"), [(0.0, True), (2.0, True), (1.0, False)])

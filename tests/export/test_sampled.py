@@ -26,8 +26,8 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output, Parameter, State
+from tests.export.fmu_models import exported
 from tests.export.modelica_runs import load
-from tests.export.sampled_fmus import exported
 from tests.model.sampled_models import (
     ALONE,
     CONTROLLER,
@@ -182,24 +182,6 @@ def test_derivatives_hold_the_sampled_states(fmi: int) -> None:
         slave.step(0.5 * PERIOD, 0.25 * PERIOD)
         through = slave.directional(["position"], ["position"], [1.0])
         assert through[0] == pytest.approx(np.exp(-0.25 * PERIOD / 4e-3), rel=1e-6)
-
-
-@VERSIONS
-def test_description(fmi: int) -> None:
-    described = fmpy.read_model_description(str(exported("loop", fmi)))
-    found = {v.name: v for v in described.modelVariables}
-    for name in ("integral", "command"):
-        v = found[name]
-        assert (v.causality, v.variability, v.initial) == ("local", "discrete", "exact")
-        assert (v.unit, float(v.start)) == ("V", 0.0)
-    listed = {e.variable.name: {d.name for d in e.dependencies} for e in described.outputs}
-    through = {"integral", "command"}
-    known = {"position", "reference", "k_p"}
-    assert listed == {"shown": {"position"}, "voltage": known}
-    rates = {e.variable.name: {d.name for d in e.dependencies} for e in described.derivatives}
-    assert rates == {"der(position)": {"disturbance", "gain", "lag"} | known}
-    initial = {e.variable.name: {d.name for d in e.dependencies} for e in described.initialUnknowns}
-    assert initial["voltage"] == known | through
 
 
 @pytest.mark.usefixtures("code_runs_here")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
@@ -186,31 +185,6 @@ def test_no_history_is_the_relaxed_start() -> None:
     assert set(memory_after(STACK, [], at=0.0).values()) == {0.0}
 
 
-@slow
-def test_an_exported_model_starts_settled_and_stays_while_its_voltage_does(tmp_path: Path) -> None:
-    """By fmpy: no transient at 60 V, where the way up and back down has left the hysteresis."""
-    fmpy = pytest.importorskip("fmpy")
-    settled = settled_at(STACK, 60.0, [120.0])
-    path = psa.export_fmu(settled, tmp_path / "held.fmu", name="held")
-    t = np.linspace(0.0, 0.02, 201)
-    played = np.array([(0.0, 60.0), (0.02, 60.0)], dtype=[("time", float), ("voltage", float)])
-    found = fmpy.simulate_fmu(
-        str(path), stop_time=0.02, output_interval=1e-4, input=played, output=["displacement"]
-    )["displacement"]
-    down = np.concatenate([np.linspace(0.0, 120.0, 401), np.linspace(120.0, 60.0, 201)[1:]])
-    way = np.linspace(0.0, 3.0, down.size)
-    expected = reference.simulate(
-        STACK.values, lambda time: float(np.interp(time, way, down)), way,
-        mechanics="cascade", breakpoints=[2.0],
-    ).states["x"]  # fmt: skip
-    span = float(np.ptp(expected))
-    assert len(found) == len(t)
-    assert np.ptp(found) < 1e-7 * span
-    # the reference comes down at 60 V/s, a lag of microseconds behind
-    assert found[0] == pytest.approx(expected[-1], abs=1e-3 * span)
-    assert abs(found[0] - simulate(STACK, t, np.full(t.size, 60.0)).displacement[0]) > 0.01 * span
-
-
 def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> None:
     settled = settled_at(STACK, 60.0, [120.0])
     assert settled.own_starts()["voltage"] == 60.0
@@ -237,9 +211,10 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     starts = settled_at(STACK, 60.0, [120.0]).own_starts()
     assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
     assert 'input Real voltage(unit="V", start=60.0' in text
-    refused = CliRunner().invoke(app, [*command, "--history", "120"])
-    assert refused.exit_code == 2
-    assert "--start-voltage" in refused.output
+    for history, said in (("120", "--start-voltage"), ("high", "--history is 'high'")):
+        refused = CliRunner().invoke(app, [*command, "--history", history])
+        assert refused.exit_code == 2
+        assert said in refused.output
 
 
 @pytest.mark.parametrize(
@@ -253,23 +228,6 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
 def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], said: str) -> None:
     with pytest.raises(InputError, match=said):
         memory_after(STACK, turns, at=5.0, **options)
-
-
-def test_the_command_takes_a_history(tmp_path: Path) -> None:
-    t, voltage = _falling()
-    given, out = tmp_path / "v.csv", tmp_path / "out.csv"
-    write_record(given, {"time [s]": t, "voltage [V]": voltage})
-    command = ["simulate", "--stack", "P-885.51", "--input", str(given), "-o", str(out)]
-    done = CliRunner().invoke(app, [*command, "--history", "120,0,120", "--rest", "3"])
-    assert done.exit_code == 0, done.output
-    memory = memory_after(STACK, [120.0, 0.0, 120.0], at=120.0, rest=3.0)
-    expected = simulate(STACK, t, voltage, memory=memory).displacement
-    written = read_record(out).displacement
-    assert written is not None
-    np.testing.assert_allclose(written, expected, rtol=0, atol=1e-9)
-    refused = CliRunner().invoke(app, [*command, "--history", "high"])
-    assert refused.exit_code == 2
-    assert "--history is 'high'" in refused.output
 
 
 OPTIONS = ["--start-voltage", "60", "--history", "120,0"]
