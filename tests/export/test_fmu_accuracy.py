@@ -24,7 +24,6 @@ from psa_casadi.reference import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
-from tests.export.fmi3_instances import Instance3, Update
 from tests.export.fmu_models import exported, model_named
 from tests.model.sampled_models import PERIOD, loop
 from tests.studies.benchmarks.work_precision_methods import STEP_SHARE, TIGHTEST_STEP
@@ -143,31 +142,6 @@ def test_jumps_and_steps_from_a_microsecond_to_a_quarter_hour(name: str, toleran
     assert error < FACTOR * tolerance
 
 
-def test_input_derivatives_raise_the_order() -> None:
-    """The error of a held sine falls with the step; with slopes, with its square."""
-
-    def signal(t: FloatArray) -> FloatArray:
-        return 60.0 - 60.0 * np.cos(2 * np.pi * 50.0 * t)
-
-    fine = _grid(2e-2, 2.5e-5)
-    truth = simulate(model_named("P-885.51").values, lambda t: float(signal(np.array(t))), fine)
-    errors: dict[bool, list[float]] = {False: [], True: []}
-    with Fmu(exported("P-885.51")) as fmu:
-        for rates, found in errors.items():
-            for step in (2e-4, 1e-4, 5e-5):
-                times = _grid(2e-2, step)
-                inputs = Signals(("voltage",), times, signal(times)[:, None])
-                x = co_simulate(fmu, times, inputs, ["displacement"], tolerance=1e-8, rates=rates)[
-                    :, 0
-                ]
-                known = truth.displacement[np.searchsorted(fine, times - 1e-9)]
-                found.append(float(np.max(np.abs(x - known)) / np.ptp(truth.displacement)))
-    held, sloped = errors[False], errors[True]
-    assert all(1.8 < a / b < 2.4 for a, b in pairwise(held))
-    assert all(a / b > 3.4 for a, b in pairwise(sloped))
-    assert sloped[0] < held[0] / 30.0
-
-
 @pytest.mark.parametrize("name", slow_but([ONE], ["PTBS200", ONE, "slow_creep", "flexure"]))
 def test_output_derivatives_are_those_of_the_outputs(name: str) -> None:
     """Against differences of fourth order over 4 us of a run with the same ramps as inputs."""
@@ -251,30 +225,6 @@ def test_long_steps(fmi: int, tolerance: float | None) -> None:
     error = np.abs(found - rest[0.0, 1.0]).max() / np.ptp(found)
     assert error < 10.0 * (tolerance or 1e-6)
     assert np.array_equal(rest[0.0, 1e4], rest[1e6, 1e4])
-
-
-def test_a_jump_within_a_long_step() -> None:
-    """An input that is set 1,000 s into a step or later is taken as well as one at its start."""
-    moments: list[tuple[float, bool]] = []
-
-    def jump(slave: Instance3, update: Update) -> None:
-        if not moments and update.time > 1e6 + 1e3:
-            moments.append((update.time, update.set_requested))
-            slave.set({"voltage": 30.0})
-
-    with Fmu(exported(STACK, 3)) as fmu:
-        with Instance3(fmu, watcher=jump).start(tolerance=1e-10, start_time=1e6) as slave:
-            slave.set({"voltage": 100.0})
-            slave.step(1e6, 1e4)
-            varied = slave.get(["displacement"])[0]
-        with fmu.start(CO_SIMULATION, tolerance=1e-10) as other:
-            for k, voltage in enumerate((100.0, 30.0)):
-                other.set({"voltage": voltage})
-                other.step(5e3 * k, 5e3)
-            plain = other.get(["displacement"])[0]
-    assert len(moments) == 1
-    assert moments[0][1]
-    assert varied == pytest.approx(plain, rel=1e-8)
 
 
 def test_a_step_below_the_resolution_of_time_is_refused() -> None:

@@ -79,33 +79,6 @@ def test_other_communication_steps_are_refused(fmi: int) -> None:
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
-def test_a_saved_state_goes_on_with_the_same_bits(fmi: int) -> None:
-    def three_steps(slave: object) -> FloatArray:
-        rows = []
-        for k in range(3):
-            slave.set({"voltage": 40.0 + 10.0 * k})  # type: ignore[attr-defined]
-            slave.step((2 + k) * STEP, STEP)  # type: ignore[attr-defined]
-            rows.append(slave.get(["displacement", "current"]))  # type: ignore[attr-defined]
-        return np.array(rows)
-
-    with exported(fmi).start(CO_SIMULATION) as slave:
-        slave.set({"voltage": 70.0})
-        slave.step(0.0, 2 * STEP)
-        snapshot = slave.save()
-        data = slave.serialize(snapshot)
-        first = three_steps(slave)
-        slave.restore(snapshot)
-        slave.drop(snapshot)
-        assert three_steps(slave).tobytes() == first.tobytes()
-        with exported(fmi).open(CO_SIMULATION) as other:
-            copy = other.deserialize(data)
-            other.restore(copy)
-            other.drop(copy)
-            assert three_steps(other).tobytes() == first.tobytes()
-        assert np.ptp(first[:, 0]) > 1e-8
-
-
-@pytest.mark.parametrize("fmi", VERSIONS)
 def test_parameters_cannot_be_set(fmi: int) -> None:
     with exported(fmi).start(CO_SIMULATION) as slave:
         with pytest.raises(FmuError, match="'k_L' is constant"):

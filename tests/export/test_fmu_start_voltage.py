@@ -20,7 +20,6 @@ from tests.tiers import slow
 
 STACK = "P-885.51"
 BOTH = pytest.mark.parametrize("fmi", [2, 3])
-INTERFACES = pytest.mark.parametrize("interface", [CO_SIMULATION, MODEL_EXCHANGE])
 
 
 def settled(model: Model, voltage: float) -> dict[str, float]:
@@ -32,23 +31,6 @@ def apart(fmu: Fmu, instance: Instance, expected: dict[str, float]) -> float:
     """Return the largest difference from values, in nominal ones."""
     size = np.array([fmu.nominals[n] for n in expected])
     return float(np.max(np.abs(instance.get(list(expected)) - list(expected.values())) / size))
-
-
-@BOTH
-@INTERFACES
-@pytest.mark.parametrize("voltage", [60.0, -15.0])
-def test_an_instance_begins_settled_at_the_voltage(
-    fmi: int, interface: int, voltage: float
-) -> None:
-    """In both versions and interfaces, as `psa.settled_at`; at the exported value as ever."""
-    model = model_named(STACK).plant()
-    expected = settled(model, voltage) | {"voltage": voltage, START_VOLTAGE: voltage}
-    with Fmu(exported(STACK, fmi)) as fmu:
-        with fmu.start(interface, values={START_VOLTAGE: voltage}) as instance:
-            assert apart(fmu, instance, expected) < 1e-8
-        with fmu.start(interface, values={START_VOLTAGE: 0.0}) as instance:
-            assert apart(fmu, instance, dict.fromkeys(expected, 0.0)) == 0.0
-        assert max(abs(expected[n]) / fmu.nominals[n] for n in model.state_names) > 0.05
 
 
 def begun(fmu: Fmu, voltage: float) -> Instance:

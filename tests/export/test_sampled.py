@@ -19,7 +19,6 @@ from psa_casadi.export.importer.fmu import (
     MODEL_EXCHANGE,
     Fmu,
     FmuError,
-    Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.export.modelica.package import modelica_text
@@ -255,34 +254,6 @@ def test_fmpy_simulates_both_interfaces(fmi: int, kind: str) -> None:
     found = np.array([[last[float(t)][n] for n in OUTPUTS] for t in times])
     assert len(times) > 40
     assert error(found, times, 0.0) < 1e-6
-
-
-@VERSIONS
-def test_rollback_between_instants(fmi: int) -> None:
-    """A state taken between two instants replays the same bits, in another instance too."""
-    with Fmu(exported("loop", fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
-        slave.set({"reference": 1.0})
-        slave.step(0.0, 1.5 * PERIOD)
-        snapshot = slave.save()
-        data = slave.serialize(snapshot)
-        first = _replay(slave)
-        assert len({row[2] for row in first}) > 3  # instants fell into it
-        slave.restore(snapshot)
-        assert _replay(slave) == first
-        slave.drop(snapshot)
-        with fmu.open(CO_SIMULATION) as other:
-            copy = other.deserialize(data)
-            other.restore(copy)
-            other.drop(copy)
-            assert _replay(other) == first
-
-
-def _replay(instance: Instance) -> list[tuple[float, ...]]:
-    rows = []
-    for k in range(8):
-        instance.step((1.5 + 0.7 * k) * PERIOD, 0.7 * PERIOD)
-        rows.append(tuple(instance.get([*OUTPUTS, "command"])))
-    return rows
 
 
 @VERSIONS
