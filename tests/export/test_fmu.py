@@ -1,4 +1,4 @@
-"""FMUs of several models against computations that share no code with them."""
+"""FMUs of several models, unusual ones too, against computations that share no code with them."""
 
 from collections.abc import Callable
 from functools import cache

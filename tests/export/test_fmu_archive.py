@@ -10,7 +10,6 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -32,7 +31,7 @@ from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu import sources
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.description import dependencies, model_description
+from psa_casadi.export.fmu.description import dependencies
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
 from psa_casadi.export.fmu.sources import STRICT
@@ -286,29 +285,6 @@ def test_documentation_escapes_what_users_write() -> None:
     assert "<script" not in page
     assert "x &lt; y &amp; &lt;script&gt;" in page
     assert "<title>a&lt;b&gt;</title>" in page
-
-
-@cache
-def xml_of(name: str) -> ET.Element:
-    return ET.fromstring(model_description(model_named(name), "m", "{t}", fmi=3))
-
-
-@pytest.mark.parametrize("name", ["P-885.51", "every_effect", "flexure"])
-def test_both_versions_describe_one_model(name: str) -> None:
-    """Every attribute that both versions know is the same, units and types included."""
-    other = ET.fromstring(model_description(model_named(name), "m", "{t}", ()))
-    shared = ("name", "valueReference", "description", "causality", "variability", "initial")
-    values = ("unit", "displayUnit", "declaredType", "min", "max", "nominal", "start")
-    expected = []
-    for scalar in other.iter("ScalarVariable"):
-        real = scalar.find("Real")
-        assert real is not None
-        expected.append([*map(scalar.get, shared), *map(real.get, values)])
-    found = [[v.get(a) for a in (*shared, *values)] for v in xml_of(name).iter("Float64")]
-    assert found == expected
-    for part in ("UnitDefinitions", "LogCategories", "DefaultExperiment"):
-        texts = [ET.tostring(r.find(part)) for r in (xml_of(name), other)]  # type: ignore[arg-type]
-        assert texts[0] == texts[1]
 
 
 def test_kinds_of_dependence() -> None:

@@ -275,15 +275,6 @@ def test_without_lief_the_binaries_are_not_inspected(monkeypatch: pytest.MonkeyP
     assert "Left out, as lief is not installed (`pip install lief`): functions present" in said
 
 
-@slow
-@harmless
-@pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
-def test_a_need_of_a_newer_library(tmp_path: Path) -> None:
-    change = {_binary(2): _edit("GLIBC_2.2.5\0", "GLIBC_2.99\0\0")}
-    found = _failures(check_fmu(rewritten(exported(STACK, 2), tmp_path / "b.fmu", change)))
-    assert "needs GLIBC_2.99" in found["GNU libc"]
-
-
 @pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
 def test_the_oldest_system_that_a_binary_loads_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

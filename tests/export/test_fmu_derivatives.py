@@ -1,4 +1,8 @@
-"""Directional and adjoint derivatives, at a point and through a co-simulation step."""
+"""Directional and adjoint derivatives, at a point and through a co-simulation step.
+
+CasADi's own importer must see the right Jacobians, also those by parameters. It takes the sparsity
+from the dependencies in modelDescription.xml, and is silently wrong where one is missing.
+"""
 
 import math
 import zipfile
@@ -92,7 +96,7 @@ def _worst(found: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
 
 
 def test_both_versions_interfaces_and_directions_agree_at_a_point() -> None:
-    """That they are exact: `test_fmu_casadi`, and `psa check` for the indicators."""
+    """That they are exact: `test_jacobians`, and `psa check` for the indicators."""
     name = MODELS[0]
     kinds, point = _names(name), _point(name)
     unknowns = [*kinds["derivative"], *kinds["output"], *kinds["indicator"]]

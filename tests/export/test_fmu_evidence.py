@@ -1,6 +1,7 @@
 """The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them.
 
-And what an FMU says outside of what the records behind its model have shown.
+What an FMU says outside of what the records behind its model have shown, and `psa check
+--evidence`, which plays run and records again.
 """
 
 import re

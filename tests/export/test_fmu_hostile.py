@@ -1,4 +1,7 @@
-"""FMUs whose code exits, crashes, hangs, fills memory or writes where it should not: told apart."""
+"""FMUs with ill will: code that exits, crashes, hangs or fills memory, archives that lead outside.
+
+Every end is told apart; of a hostile archive nothing is unpacked.
+"""
 
 import os
 import signal

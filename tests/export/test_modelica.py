@@ -1,4 +1,4 @@
-"""The Modelica package: its text, its refusals, the acausal stack in a circuit."""
+"""The Modelica package: its text, its refusals, its equations read back, a stack in a circuit."""
 
 import difflib
 import re

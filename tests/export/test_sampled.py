@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
-import fmpy
 import numpy as np
 import pytest
 import rumoca
@@ -238,22 +237,6 @@ def test_model_exchange(fmi: int, step: float, start: float) -> None:
     with Fmu(exported("loop", fmi)) as fmu:
         found = integrate(fmu, times, reference(SLOPE), OUTPUTS, tolerance=1e-11)
     assert error(found, times, SLOPE) < 1e-9
-
-
-@VERSIONS
-@pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
-def test_fmpy_simulates_both_interfaces(fmi: int, kind: str) -> None:
-    inputs = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], dtype=[
-        ("time", float), ("disturbance", float), ("reference", float)])  # fmt: skip
-    result = fmpy.simulate_fmu(
-        str(exported("loop", fmi)), stop_time=0.03, fmi_type=kind, relative_tolerance=1e-9,
-        output_interval=0.7e-3, step_size=0.7e-3, input=inputs, output=list(OUTPUTS),
-    )  # fmt: skip
-    last = {float(row["time"]): row for row in result}  # after the events of a time
-    times = np.array(sorted(last))
-    found = np.array([[last[float(t)][n] for n in OUTPUTS] for t in times])
-    assert len(times) > 40
-    assert error(found, times, 0.0) < 1e-6
 
 
 @VERSIONS
