@@ -3,8 +3,7 @@
 fmpy integrates model exchange with inputs that it sets once a step, not at every right-hand side,
 so its CVode is shown voltages that jump and are constant in between.
 
-CasADi's importer: `test_fmu_derivatives`. ecos is a co-simulation engine; its Python package names no
-dependency on the TBB library that it needs, so that is loaded first.
+CasADi's importer is in `test_fmu_derivatives`. ecos is a co-simulation engine.
 """
 
 from typing import Any

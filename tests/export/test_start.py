@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from psa_casadi import reference
 from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
@@ -139,30 +138,6 @@ def test_initial_slope_sees_motion_and_no_step() -> None:
 STACK = stack_model("P-885.51")
 
 
-def _falling() -> tuple[FloatArray, FloatArray]:
-    t = np.linspace(0.0, 1.0, 1001)
-    return t, 60.0 + 60.0 * np.cos(np.pi * t)
-
-
-@slow
-def test_a_record_that_begins_at_the_top_follows_the_reference_played_from_zero() -> None:
-    """Independent: the reference integrates the way up and the record in one piece."""
-    t, voltage = _falling()
-    whole_t = np.concatenate([np.linspace(0.0, 1.0, 501), 1.0 + t[1:]])
-    whole_v = np.concatenate([np.linspace(0.0, 120.0, 501), voltage[1:]])
-    expected = reference.simulate(
-        STACK.values, lambda time: float(np.interp(time, whole_t, whole_v)), whole_t,
-        mechanics="cascade", breakpoints=[1.0],
-    ).states["x"][500:]  # fmt: skip
-    span = float(np.ptp(expected))
-    memory = memory_after(STACK, [], at=120.0)
-    after = simulate(STACK, t, voltage, memory=memory).displacement
-    relaxed = simulate(STACK, t, voltage).displacement
-    # the reference comes to the first sample in motion, the record begins at rest
-    assert np.abs(after - expected)[1:].max() < 2e-5 * span
-    assert np.abs(relaxed - expected).max() > 0.05 * span
-
-
 def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
     creeping = STACK.with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02, "creep_time": 0.1})
     model = creeping.with_effect(EFFECTS["hysteresis_memory"], {"memory_gain": 0.05})
@@ -179,10 +154,6 @@ def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
     # the record begins in motion: the fast states start there, as `start_state` has it
     found = simulate(model, t, voltage, memory=memory).displacement
     assert np.abs(found - whole)[50:].max() < 1e-4 * np.ptp(whole)
-
-
-def test_no_history_is_the_relaxed_start() -> None:
-    assert set(memory_after(STACK, [], at=0.0).values()) == {0.0}
 
 
 def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> None:
@@ -286,20 +257,6 @@ def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
     assert "step from there to 60 V" in said
     _, said = _simulated(folder, "held.json", "--history", "120,0")
     assert "where the history 120,0 V leaves them" in said
-
-
-def test_the_option_that_is_named_begins_as_the_fmu_does(folder: Path) -> None:
-    """A relaxed start at 60 V and one that rose there from 0 V remember other things."""
-    inputs = Signals(("voltage",), TIME, VOLTAGE[:, None])
-    with Fmu(exported("P-885.51")) as fmu:
-        truth = co_simulate(
-            fmu, TIME, inputs, ["displacement"], tolerance=1e-9, values={"start_voltage": 60.0}
-        )[:, 0]
-    relaxed, said = _simulated(folder, "plain.json")
-    assert "give --start-voltage 60 here too to begin as it does" in said
-    named, _ = _simulated(folder, "plain.json", "--start-voltage", "60")
-    assert np.abs(named - truth).max() < 1e-5 * np.ptp(truth)
-    assert np.abs(relaxed - truth).max() > 0.05 * np.ptp(truth)
 
 
 def test_a_history_is_played_from_relaxed_whatever_start_the_model_has() -> None:
