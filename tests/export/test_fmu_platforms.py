@@ -69,14 +69,6 @@ def test_emulated_binary_gives_the_native_result(name: str, fmi: int) -> None:
     assert difference(emulated(name).run(fmi), native().run(fmi)) < LIMIT
 
 
-@pytest.mark.parametrize("fmi", VERSIONS)
-def test_state_from_a_file_continues_bit_for_bit(fmi: int, tmp_path: Path) -> None:
-    kept = tmp_path / "state"
-    whole, first = native().run(fmi), native().run(fmi, steps=(0, HALF), keep=kept)
-    second = native().run(fmi, steps=(HALF, STEPS), state=kept)
-    assert np.vstack([first, second]).tobytes() == whole.tobytes()
-
-
 def _moved(fmi: int, source: Runner, target: Runner, state: Path) -> None:
     """Run the first half on one platform and the second on another, from the first's state."""
     first = source.run(fmi, steps=(0, HALF), keep=state)
@@ -109,19 +101,6 @@ def test_sources_and_states_on_32_bits(tmp_path: Path) -> None:
     wide.run(fmi, steps=(0, HALF), keep=kept)
     second = narrow.run(fmi, program=program, steps=(HALF, STEPS), state=kept)
     assert difference(second, whole[HALF:]) < LIMIT
-
-
-@pytest.mark.parametrize("fmi", VERSIONS)
-def test_damaged_state_is_refused(fmi: int, tmp_path: Path) -> None:
-    kept = tmp_path / "state"
-    native().run(fmi, steps=(0, HALF), keep=kept)
-    whole = kept.read_bytes()
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 1
-    for damaged in (b"", whole[:-1], whole + b"\0", bytes(flipped), bytes(len(whole))):
-        kept.write_bytes(damaged)
-        with pytest.raises(AssertionError, match="loading the state failed"):
-            native().run(fmi, steps=(HALF, STEPS), state=kept)
 
 
 @pytest.mark.parametrize("name", ["x86_64-windows", "x86-windows"])
@@ -230,22 +209,8 @@ def functions(fmi: int) -> frozenset[str]:
     return frozenset(re.findall(rf"^\s*FMI{fmi}_Export\s+\w+TYPE\s+(\w+);", text, re.MULTILINE))
 
 
-def elf(fmi: int, name: str) -> lief.ELF.Binary:
-    found = lief.parse(str(binary(fmi, PLATFORMS[name])))
-    assert isinstance(found, lief.ELF.Binary)
-    return found
-
-
-def pe(fmi: int, name: str) -> lief.PE.Binary:
-    found = lief.parse(str(binary(fmi, PLATFORMS[name])))
-    assert isinstance(found, lief.PE.Binary)
-    return found
-
-
-def macho(fmi: int, name: str) -> lief.MachO.Binary:
-    found = lief.parse(str(binary(fmi, PLATFORMS[name])))
-    assert isinstance(found, lief.MachO.Binary)
-    return found
+def read(fmi: int, name: str) -> object:
+    return lief.parse(str(binary(fmi, PLATFORMS[name])))
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
@@ -255,7 +220,8 @@ def test_linux(name: str, fmi: int) -> None:
 
     RISC-V has them from 2.27 on.
     """
-    library = elf(fmi, name)
+    library = read(fmi, name)
+    assert isinstance(library, lief.ELF.Binary)
     assert {s.name for s in library.exported_symbols} == functions(fmi)
     assert {s.name for s in library.imported_symbols} <= C_LIBRARY
     assert set(library.libraries) == {"libc.so.6", "libm.so.6"}
@@ -273,7 +239,8 @@ def test_linux(name: str, fmi: int) -> None:
 @pytest.mark.parametrize("name", WINDOWS)
 def test_windows(name: str, fmi: int) -> None:
     """FMI functions only, undecorated; from the universal C runtime and the kernel, no date."""
-    library = pe(fmi, name)
+    library = read(fmi, name)
+    assert isinstance(library, lief.PE.Binary)
     export = library.get_export()
     assert export is not None
     assert {e.name for e in export.entries} == functions(fmi)
@@ -293,7 +260,8 @@ def test_macos(name: str, fmi: int) -> None:
     The linker exports two symbols of its own, which name the header of the file. What has no effect
     in a library is the load command for a dynamic linker; nothing else is beside the usual ones.
     """
-    library = macho(fmi, name)
+    library = read(fmi, name)
+    assert isinstance(library, lief.MachO.Binary)
     exported = {str(s.name) for s in library.exported_symbols}
     assert exported - {"__mh_dylib_header", "___dso_handle"} == {f"_{f}" for f in functions(fmi)}
     linker = {"dyld_stub_binder", "_bzero", "___bzero"}
