@@ -2,7 +2,7 @@
 
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +12,7 @@ from lxml import etree  # type: ignore[import-untyped]
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
+from psa_casadi.export.fmu.platforms import compile_library, host_platform
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from tests.model.sampled_models import controller, loop
@@ -78,3 +79,17 @@ def rewritten(source: Path, target: Path, changes: dict[str, Callable[[bytes], b
             raise ValueError(f"the change of {name} has no effect")
     write_archive(target, entries)
     return target
+
+
+def recompiled(target: Path, fmi: int, edits: Mapping[str, Sequence[tuple[str, str]]]) -> Path:
+    """Change source files of the FMU of P-885.51, compile all, and put the binary in place."""
+    inside = entries("P-885.51", fmi)
+    texts = {n[8:]: c.decode() for n, c in inside.items() if n.startswith("sources/")}
+    for file, changes in edits.items():
+        for old, new in changes:
+            if old not in texts[file]:
+                raise ValueError(f"{file} has no '{old}'")
+            texts[file] = texts[file].replace(old, new, 1)
+    library = compile_library(texts, "psa", host_platform())
+    binary = next(n for n in inside if n.startswith("binaries/"))
+    return rewritten(exported("P-885.51", fmi), target, {binary: lambda _: library})

@@ -5,7 +5,7 @@ import platform
 import shutil
 import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,13 +20,13 @@ from psa_casadi.export.check.binaries import FUNCTIONS, read_binary
 from psa_casadi.export.check.check import CheckReport, check_fmu
 from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu, write_archive
-from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library, host_platform
+from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.report.words.text import check_sentence
 from psa_casadi.units import FloatArray
 from tests.export.broken_descriptions import DESCRIPTIONS, STACK
 from tests.export.c_host.build import binary
-from tests.export.fmu_models import entries, exported, model_named, rewritten
+from tests.export.fmu_models import entries, exported, model_named, recompiled, rewritten
 from tests.tiers import slow, slow_but
 
 XML = "modelDescription.xml"
@@ -53,22 +53,6 @@ def _edit(old: str, new: str) -> Callable[[bytes], bytes]:
 
 def _binary(fmi: int) -> str:
     return next(n for n in entries(STACK, fmi) if n.startswith("binaries/"))
-
-
-def _recompiled(target: Path, fmi: int, edits: Mapping[str, tuple[tuple[str, str], ...]]) -> Path:
-    """Change source files, compile all, and put the binary in place."""
-    texts = {
-        n.removeprefix("sources/"): content.decode()
-        for n, content in entries(STACK, fmi).items()
-        if n.startswith("sources/")
-    }
-    for file, changes in edits.items():
-        for old, new in changes:
-            if old not in texts[file]:
-                raise ValueError(f"{file} has no '{old}'")
-            texts[file] = texts[file].replace(old, new, 1)
-    library = compile_library(texts, "psa", host_platform())
-    return rewritten(exported(STACK, fmi), target, {_binary(fmi): lambda _: library})
 
 
 @pytest.fixture(autouse=True)
@@ -182,7 +166,7 @@ def test_wrong_sources(faults: tuple[str, ...], tmp_path: Path) -> None:
     edits: dict[str, tuple[tuple[str, str], ...]] = {}
     for file, old, new, _ in (CORE[fault] for fault in faults):
         edits[file] = (*edits.get(file, ()), (old, new))
-    report = check_fmu(_recompiled(tmp_path / "b.fmu", 2, edits))
+    report = check_fmu(recompiled(tmp_path / "b.fmu", 2, edits))
     assert report.compared
     found = set(_failures(report))
     assert all(CORE[fault][3] <= found for fault in faults), found
@@ -220,7 +204,7 @@ MISSING = {
 @slow
 @harmless
 def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
-    found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, FACE)))
+    found = _failures(check_fmu(recompiled(tmp_path / "b.fmu", 3, FACE)))
     assert {"adjoint derivatives", "life cycle", "event indicators"} == set(found), found
     assert "stays negative after an event" in found["event indicators"]
 
@@ -228,7 +212,7 @@ def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
 @slow
 @harmless
 def test_a_function_under_another_name(tmp_path: Path) -> None:
-    found = _failures(check_fmu(_recompiled(tmp_path / "b.fmu", 3, MISSING)))
+    found = _failures(check_fmu(recompiled(tmp_path / "b.fmu", 3, MISSING)))
     assert {"functions present", "no other symbols", "binary loads"} == set(found), found
     assert "fmi3ActivateModelPartition is missing" in found["functions present"]
     assert "fmi3ActivateModelPartitions is exported" in found["no other symbols"]

@@ -20,7 +20,6 @@ from psa_casadi.components import BASE
 from psa_casadi.export.check.calls import parameter_changes
 from psa_casadi.export.check.structure import directional_error, incomplete_dependencies
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.fmu.platforms import compile_library, host_platform
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
@@ -33,7 +32,7 @@ from psa_casadi.export.importer.fmu import (
 )
 from psa_casadi.model.compose import compose
 from tests.export.fmi3_instances import Instance3, Update, loaded, try_step
-from tests.export.fmu_models import entries, exported, model_named, rewritten
+from tests.export.fmu_models import exported, model_named, recompiled
 from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
@@ -128,12 +127,8 @@ static int counted(char *text, size_t size, const char *format, va_list argument
 @pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
 def test_a_step_writes_no_sentence_that_nobody_reads(fmi: int, tmp_path: Path) -> None:
     """To write one takes a good part of a microsecond, more than a short step's share."""
-    inside = {n.removeprefix("sources/"): c for n, c in entries(STACK, fmi).items()}
-    texts = {n: c.decode() for n, c in inside.items() if n.endswith((".c", ".h"))}
-    texts["log.c"] = _COUNTING + texts["log.c"].replace(" vsnprintf(", " counted(")
-    library = compile_library(texts, "psa", host_platform())
-    binary = next(n for n in inside if n.startswith("binaries/"))
-    changed = rewritten(exported(STACK, fmi), tmp_path / "c.fmu", {binary: lambda _: library})
+    edits = ((" vsnprintf(", " counted("), ("#include", f"{_COUNTING}#include"))
+    changed = recompiled(tmp_path / "c.fmu", fmi, {"log.c": edits})
     with Fmu(changed) as fmu, fmu.start(CO_SIMULATION) as slave:
         count = ctypes.c_int.in_dll(fmu.library, "psa_sentences")
         slave.step(0.0, 1e-3)

@@ -32,6 +32,7 @@ from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.prepare import prepared
 from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import loads
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
@@ -39,6 +40,13 @@ from psa_casadi.variables import Interval
 from tests.export.fmu_models import assert_valid, exported, rewritten
 from tests.model.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
 from tests.tiers import slow, slow_but
+
+
+def stated() -> Evidence:
+    """Return the evidence of the model."""
+    found = evident_model().evidence
+    assert found is not None
+    return found
 
 
 def test_experiments_name_files_that_are_there() -> None:
@@ -57,7 +65,7 @@ def test_experiments_name_files_that_are_there() -> None:
 
 def test_meta_data_and_page_say_the_same() -> None:
     """Names and order as the schema of SSP Traceability 1.0 has them (SRMD.xsd, STC.xsd)."""
-    found, model = files_inside(evident_fmu()), evident_model()
+    found = files_inside(evident_fmu())
     root = ET.fromstring(found[evidence.META_DATA])
     space = "{http://ssp-standard.org/SSPTraceability1/%s}"
     assert root.tag == space % "SimulationResourceMetaData" + "SimulationResourceMetaData"
@@ -69,15 +77,14 @@ def test_meta_data_and_page_say_the_same() -> None:
         for entry in part:
             assert entry.tag == space % "SSPTraceabilityCommon" + "ClassificationEntry"
             entries.setdefault(entry.attrib["keyword"], []).append(entry.text or "")
-    page = found[evidence.PAGE].decode()
-    assert model.evidence is not None
-    assert model.evidence.held_out is not None
+    page, held = found[evidence.PAGE].decode(), stated().held_out
+    assert held is not None
     (record,) = entries["record"]
     assert noisy_record().sha256 in record
-    assert f"{1e6 * model.evidence.held_out.rms_m:.4g} um rms" in entries["held-out error"][0]
+    assert f"{1e6 * held.rms_m:.4g} um rms" in entries["held-out error"][0]
     assert entries["temperature"] == ["not recorded"]
     row = [float(v) for v in entries["covariance.A"][0].split()]
-    assert row == list(model.evidence.covariance.matrix[1])
+    assert row == list(stated().covariance.matrix[1])
     assert re.fullmatch(r"[\d.]+ N/V, standard error [\d.e-]+", entries["k_L"][0])
     for keyword in ("record", "held-out error", "voltage", "duration", "k_L"):
         assert entries[keyword][0] in page
@@ -94,9 +101,7 @@ def test_a_model_without_evidence_has_no_such_files() -> None:
 
 def test_what_a_person_says_of_a_record_stays_text() -> None:
     """A record's name may hold what means something in HTML and XML."""
-    model = evident_model().plant()
-    told = model.evidence
-    assert told is not None
+    model, told = evident_model().plant(), stated()
     assert told.reference is not None
     name = "<b>&\"'"
     odd = replace(
@@ -157,11 +162,9 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
     said, outside = messages(fmi, 120.0, 0.6)
     (line,) = said
     assert line.startswith("voltage is 7")
-    seen = evident_model().evidence
-    assert seen is not None
-    high = seen.seen.voltage.high
-    assert f"from {seen.seen.voltage.low:.6g} to {high:.6g}." in line
-    beyond = (120.0 - high) / (high - seen.seen.voltage.low) - 0.01
+    low, high = stated().seen.voltage.low, stated().seen.voltage.high
+    assert f"from {low:.6g} to {high:.6g}." in line
+    beyond = (120.0 - high) / (high - low) - 0.01
     assert np.max(outside) == pytest.approx(beyond, abs=2e-3)
     assert outside[0] == outside[-1] == 0.0
 
@@ -181,9 +184,8 @@ def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
 
 def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
     model = evident_model()
-    assert model.evidence is not None
-    seen = replace(model.evidence.seen, temperature=Interval(290.0, 300.0))
-    told = replace(model.evidence, seen=seen)
+    seen = replace(stated().seen, temperature=Interval(290.0, 300.0))
+    told = replace(stated(), seen=seen)
     assert "seen_temperature_low" not in with_validity(replace(model, evidence=told)).values
     warm = replace(model.with_effect(EFFECTS["temperature"]), evidence=told)
     watched = with_validity(warm)
@@ -292,12 +294,10 @@ def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
 
 
 def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
-    drift = EFFECTS["offset_drift"]
-    model = evident_model()
-    assert model.evidence is not None
-    told = replace(model.evidence, outside=(drift.name,))
+    told = replace(stated(), outside=("offset_drift",))
+    plant = replace(evident_model().plant(), evidence=told)
     with Archive(evident_fmu()) as archive:
-        row = repeated(archive, replace(model.plant(), evidence=told), [noisy_record()])[-1]
+        row = repeated(archive, plant, [noisy_record()])[-1]
     assert isinstance(row, CheckRow)
     assert row.passed
     assert "not compared: the FMU leaves out offset_drift" in row.remark

@@ -108,15 +108,8 @@ def test_balances_in_next_are_those_before_the_instant() -> None:
     ]  # fmt: skip
 
 
-def test_every_mistake_of_a_declaration_is_named() -> None:
-    zero = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.0), "period"),))
-    unsampled = replace(CONTROLLER, sampled=())
-    with pytest.raises(InputError, match="declares only one of"):
-        compose((PLANT, unsampled))
-    with pytest.raises(InputError, match="'T_none' of component 'sampled_pi' is no parameter"):
-        compose((PLANT, replace(CONTROLLER, sample_period="T_none")))
-    with pytest.raises(InputError, match="'T_0' may be 0 by its bounds"):
-        compose((zero, replace(CONTROLLER, sample_period="T_0")))
+def _second(**changes: object) -> Component:
+    """Return a sampled counter with a period of its own, with changes."""
     second = replace(
         ALONE,
         name="second",
@@ -127,19 +120,36 @@ def test_every_mistake_of_a_declaration_is_named() -> None:
         outputs=(),
         equations=lambda s: Equations(next={"more": s.more}),
     )
-    with pytest.raises(InputError, match=r"different periods \(T_2, T_s\)"):
-        compose((PLANT, CONTROLLER, second))
-    same = compose((PLANT, CONTROLLER, replace(second, parameters=(), sample_period="T_s")))
+    return replace(second, **changes)  # type: ignore[arg-type]  # of its fields
+
+
+_ZERO = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.0), "period"),))
+
+
+@pytest.mark.parametrize(
+    ("components", "said"),
+    [
+        ((PLANT, replace(CONTROLLER, sampled=())), "declares only one of"),
+        ((PLANT, replace(CONTROLLER, sample_period="T_none")),
+         "'T_none' of component 'sampled_pi' is no parameter"),
+        ((_ZERO, replace(CONTROLLER, sample_period="T_0")), "'T_0' may be 0 by its bounds"),
+        ((PLANT, CONTROLLER, _second()), r"different periods \(T_2, T_s\)"),
+        ((PLANT, replace(CONTROLLER, equations=lambda s: Equations(out={"voltage": s.command}))),
+         "lacks the next value of the sampled state 'command'"),
+        ((PLANT, replace(CONTROLLER, outputs=(), equations=lambda s: Equations(
+            next={"integral": s.integral, "command": s.command, "gain": 1.0}))),
+         "sampled state 'gain', which it does not declare"),
+        ((PLANT, ALONE), "Two components declare 'position'"),
+    ],
+)  # fmt: skip
+def test_mistakes_of_a_declaration_are_named(components: tuple[Component, ...], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        compose(components)
+
+
+def test_two_components_share_a_period() -> None:
+    same = compose((PLANT, CONTROLLER, _second(parameters=(), sample_period="T_s")))
     assert same.sampled_names == ("integral", "command", "more")
-    lacking = replace(CONTROLLER, equations=lambda s: Equations(out={"voltage": s.command}))
-    with pytest.raises(InputError, match="lacks the next value of the sampled state 'command'"):
-        compose((PLANT, lacking))
-    more = replace(CONTROLLER, outputs=(), equations=lambda s: Equations(
-        next={"integral": s.integral, "command": s.command, "gain": 1.0}))  # fmt: skip
-    with pytest.raises(InputError, match="sampled state 'gain', which it does not declare"):
-        compose((PLANT, more))
-    with pytest.raises(InputError, match="Two components declare 'position'"):
-        compose((PLANT, ALONE))
 
 
 def test_sensitivities_are_refused() -> None:

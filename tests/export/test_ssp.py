@@ -106,23 +106,6 @@ def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
     assert re.findall(r'source="k_L" target="(.*?)"', mapping) == ["compensator.k_L", "stack.k_L"]
 
 
-@slow
-def test_a_changed_parameter_set_reaches_both_parts(tmp_path: Path) -> None:
-    """The value stands once, so a user who edits it changes the stack and its observer."""
-    changed = tmp_path / "changed.ssp"
-    with zipfile.ZipFile(archive_of("closed_loop")) as old, zipfile.ZipFile(changed, "w") as new:
-        for name in old.namelist():
-            content = old.read(name)
-            if name == "resources/shared.ssv":
-                known = r'(name="k_L".*?value=")[^"]*'
-                text = re.sub(known, r"\g<1>9.5", content.decode(), count=1, flags=re.S)
-                content = text.encode()
-            new.writestr(name, content)
-    with SspArchive(changed) as archive:
-        assert archive.parameters["stack"]["k_L"] == 9.5
-        assert archive.parameters["compensator"]["k_L"] == 9.5
-
-
 def test_no_wire_runs_through_a_part_or_on_another_wire() -> None:
     layout = layout_of(wiring_of(closed_loop()))
     pieces: list[tuple[tuple[float, float], tuple[float, float], int]] = []
