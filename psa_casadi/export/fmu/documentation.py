@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from psa_casadi.export.common.markup import force_scale, generation_tool, time_s
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.common.variable_table import Variable, starts_at_voltage, variable_table
+from psa_casadi.export.fmu.evidence import META_DATA, PAGE, RELATED
 from psa_casadi.export.fmu.reference_run import FOLDER, NOTES, SHARE, STEPS_PER_PERIOD, HeldStep
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
@@ -20,6 +21,16 @@ from psa_casadi.units import convert
 ENTRY = "documentation/index.html"
 #: Movement within the time that the model needs to settle, over the nominal size, that is none.
 _AT_REST = 1e-6
+#: What it says of the files of the archive; the first two are always there.
+_FILES = {
+    "sources/README.txt": "how to compile the sources: one line, no other library",
+    LICENSE_ENTRY: "the terms of the model, and the notices of the C code",
+    NOTES: "a run to try an importer on, with the outputs to expect",
+    f"{FOLDER}/parameters.ssv": "the parameter values as a parameter set (SSP 1.0)",
+    PAGE: RELATED[PAGE][2],
+    META_DATA: RELATED[META_DATA][2],
+}
+_ALWAYS = tuple(_FILES)[:2]
 _KINDS = {
     "input": "Inputs",
     "output": "Outputs",
@@ -31,15 +42,14 @@ _KINDS = {
 def documentation(
     model: Model,
     *,
-    reference_run: bool = True,
+    places: Collection[str] = (),
     step: HeldStep | None = None,
-    more: Mapping[str, str] | None = None,
     use: str = "",
 ) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
-    `reference_run` says whether the archive holds one, with its notes; `step` is the communication
-    step that was measured on it. `more` are further files to name: what they are, by their place.
+    `places` are those of the files of the archive that it may name; `step` is the communication
+    step that was measured on the reference run.
     `use` tells how the FMU integrates, where that is not with a solver.
     Raises InputError for a character that HTML cannot carry.
     """
@@ -47,15 +57,6 @@ def documentation(
     rates, outputs = (np.array(v).ravel() for v in s.f(*model.at_start()))
     moved = np.abs(rates) * time_scale(model) / model.state_nominals()
     stated = model.publication.stated.items()
-    files = {
-        "sources/README.txt": "how to compile the sources: one line, no other library",
-        LICENSE_ENTRY: "the terms of the model, and the notices of the C code",
-    }
-    if reference_run:
-        files |= {
-            NOTES: "a run to try an importer on, with the outputs to expect",
-            f"{FOLDER}/parameters.ssv": "the parameter values as a parameter set (SSP 1.0)",
-        }
     starts = {v.name: v.start for v in table}
     starts |= dict(zip(model.output_names, outputs.tolist(), strict=True))
     interface = {
@@ -87,7 +88,7 @@ def documentation(
         indicators=[(v.name, v.description) for v in table if v.kind == "indicator"],
         components=_components(model),
         parameters=_parameters(model, table),
-        files={**files, **(more or {})}.items(),
+        files=[it for it in _FILES.items() if it[0] in places or it[0] in _ALWAYS],
         tool=generation_tool(),
     )
     check_text(text, "The page on the model")

@@ -193,7 +193,7 @@ INPUTS, OUTPUTS = f"{FOLDER}/validation_in.csv", f"{FOLDER}/validation_ref.csv"
 MEASURED, START = f"{FOLDER}/validation_measured.csv", f"{FOLDER}/validation.ssv"
 
 #: MIME type, role and meaning of each file; {run} is the run that is to be repeated.
-_RELATED: dict[str, Related] = {
+RELATED: dict[str, Related] = {
     PAGE: ("text/html", "report", "records, errors, range and uncertainty"),
     META_DATA: ("application/x-srmd-meta-data", "meta-data", "the same for machines"),
     SETS: (SSV, "parameter", "values within their uncertainty: {set}"),
@@ -230,7 +230,7 @@ def related_files(model: Model, places: Collection[str]) -> dict[str, Related]:
     reference = model.evidence.reference if model.evidence else None
     run_ = _said(reference) if reference else ""
     found = {}
-    for known, (kind, role, meaning) in _RELATED.items():
+    for known, (kind, role, meaning) in RELATED.items():
         for place in places:
             if place == known or place.startswith(f"{known}/"):
                 found[place] = kind, role, meaning.format(run=run_, set=_set_name(place))
