@@ -23,7 +23,7 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
-from psa_casadi.export.fmu.sources import STRICT, write_sources
+from psa_casadi.export.fmu.sources import STRICT, exported_texts
 from psa_casadi.export.web import WEB_FLAGS, module_texts
 from psa_casadi.model.compose import compose
 from psa_casadi.simulation.compiler import generate_c
@@ -82,8 +82,8 @@ def write_all(sources: Path) -> list[Work]:
     """
     headers = Path(fmpy.__file__).parent / "c-code"
     every_effect = compose((*BASE, *EFFECTS.values()))
-    write_sources(compose(BASE), sources / "fmi2", fmi=2)
-    write_sources(every_effect, sources / "fmi3", name="psa", fmi=3)
+    for model, fmi in ((compose(BASE), 2), (every_effect, 3)):
+        write(sources / f"fmi{fmi}", exported_texts(model, "psa", fmi)[1])
     library = generate_c(every_effect.structure, sensitivities=True)
     write(sources / "library", library, (*SOURCES, *(p.name for p in SOURCE.glob("*.h"))))
     sizes = "".join(f"#define PSA_N{k} {n}\n" for k, n in zip("XUPY", (2, 1, 3, 1), strict=True))

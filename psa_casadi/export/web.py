@@ -9,6 +9,7 @@ import hashlib
 import logging
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from contextvars import copy_context
 from functools import cache
 from importlib.metadata import version
@@ -77,18 +78,18 @@ def begun_module(model: Model) -> "Future[bytes | None]":
     if not has_zig() or model.sampled_names:
         return nothing
     compiled = _compiled(model.structure)  # the text is CasADi's, which takes one thread
+
+    def module() -> bytes | None:
+        try:
+            return compiled()
+        except (MachineError, OSError) as error:
+            logging.getLogger("psa_casadi").warning("The page stays still: %s", error)
+            return None
+
     pool = ThreadPoolExecutor(max_workers=1)
-    found = pool.submit(copy_context().run, _or_none, compiled)
+    found = pool.submit(copy_context().run, module)
     pool.shutdown(wait=False)
     return found
-
-
-def _or_none(compiled: Callable[[], bytes]) -> bytes | None:
-    try:
-        return compiled()
-    except (MachineError, OSError) as error:
-        logging.getLogger("psa_casadi").warning("The page stays still: %s", error)
-        return None
 
 
 @cache
@@ -114,32 +115,25 @@ def module_texts(structure: Structure) -> Mapping[str, str]:
     """Return the generated files of a module by their names."""
     s = structure
     outputs = [o.name for o in s.outputs]
-    shown = next((n for n in SHOWN if n in outputs), None)
-    exact = None if shown is None else _exact_model(s, shown)
+    shown, split = next((n for n in SHOWN if n in outputs), None), split_of(s)
+    exact = {}
+    if shown is not None and not isinstance(split, str):
+        with suppress(Unprintable):  # then it takes no exact steps
+            exact["exact_model.h"] = generate(split, shown)
     by_input = ca.Function(
         "psa_by_input", c_arguments(s), [ca.densify(ca.jacobian(c_slopes(s), s.u))], {"cse": True}
     )
     return {
         **generate_c(s, sensitivities=False),
-        **({} if exact is None else {"exact_model.h": exact}),
+        **exact,
         "by_input.c": c_code("by_input.c", [by_input]),
-        "page_config.h": _config(s, by_input, exact=exact is not None),
+        "page_config.h": _config(s, by_input, exact=bool(exact)),
     }
-
-
-def _exact_model(structure: Structure, shown: str) -> str | None:
-    """Return the text that lets a model take exact steps, None where it cannot."""
-    split = split_of(structure)
-    try:
-        return None if isinstance(split, str) else generate(split, shown)
-    except Unprintable:
-        return None
 
 
 def _config(structure: Structure, by_input: ca.Function, *, exact: bool) -> str:
     s = structure
-    names = list(s.parameter_names)
-    gains = [names.index(c.gain) for c in s.components if c.gain is not None]
+    gains = [s.parameter_names.index(c.gain) for c in s.components if c.gain is not None]
     ladder = ", ".join(f"{{{share!r}, {coarsest}}}" for share, coarsest in LADDER)
     numbers = {
         "EXACT": int(exact), "LADDER": f"{{{ladder}}}", "AGREE": AGREE, "TIGHTEST": TIGHTEST,

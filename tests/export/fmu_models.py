@@ -2,7 +2,7 @@
 
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -12,8 +12,10 @@ from lxml import etree  # type: ignore[import-untyped]
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
+from psa_casadi.export.fmu.platforms import compile_library, host_platform
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
+from tests.model.sampled_models import controller, loop
 
 _FOLDER = tempfile.TemporaryDirectory()
 
@@ -29,20 +31,22 @@ _MANIPULATOR = {
 def model_named(name: str) -> Model:
     """Return a stack by its name, or one of: manipulator, single_mass, flexure, slow_creep.
 
-    Or "every_effect": the base with all effects, each with a small gain.
+    Or "every_effect": the base with all effects, each with a small gain; or "loop", "controller":
+    sampled ones.
     """
     if name in STACKS:
         return compose(BASE, {k: figure.value for k, figure in STACKS[name].values.items()})
-    if name == "manipulator":
-        return compose(BASE, _MANIPULATOR)
-    if name == "single_mass":
-        return compose(SIMPLIFIED)
-    if name == "flexure":
-        return compose([COMPONENTS["flexure"]], name="flexure")
-    if name == "every_effect":
-        gains = {c.gain: 1e-3 for c in EFFECTS.values() if c.gain}
-        return compose((*BASE, *EFFECTS.values()), gains, name=name)
-    return compose((*BASE, EFFECTS["slow_creep"]), {"creep_gain": 0.05})
+    gains = {c.gain: 1e-3 for c in EFFECTS.values() if c.gain}
+    made: dict[str, Callable[[], Model]] = {
+        "manipulator": lambda: compose(BASE, _MANIPULATOR),
+        "single_mass": lambda: compose(SIMPLIFIED),
+        "flexure": lambda: compose([COMPONENTS["flexure"]], name="flexure"),
+        "every_effect": lambda: compose((*BASE, *EFFECTS.values()), gains, name=name),
+        "slow_creep": lambda: compose((*BASE, EFFECTS["slow_creep"]), {"creep_gain": 0.05}),
+        "loop": loop,
+        "controller": controller,
+    }
+    return made[name]()
 
 
 @cache
@@ -75,3 +79,17 @@ def rewritten(source: Path, target: Path, changes: dict[str, Callable[[bytes], b
             raise ValueError(f"the change of {name} has no effect")
     write_archive(target, entries)
     return target
+
+
+def recompiled(target: Path, fmi: int, edits: Mapping[str, Sequence[tuple[str, str]]]) -> Path:
+    """Change source files of the FMU of P-885.51, compile all, and put the binary in place."""
+    inside = entries("P-885.51", fmi)
+    texts = {n[8:]: c.decode() for n, c in inside.items() if n.startswith("sources/")}
+    for file, changes in edits.items():
+        for old, new in changes:
+            if old not in texts[file]:
+                raise ValueError(f"{file} has no '{old}'")
+            texts[file] = texts[file].replace(old, new, 1)
+    library = compile_library(texts, "psa", host_platform())
+    binary = next(n for n in inside if n.startswith("binaries/"))
+    return rewritten(exported("P-885.51", fmi), target, {binary: lambda _: library})

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -14,6 +13,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Output, State
 
@@ -64,54 +64,27 @@ def triangle_error(model: Model, text: str, span: float) -> dict[str, float]:
     """
     peak = 0.5 * model.values["u_rated"]
     slope = 2.0 * peak / span
-    held = {i.name: i.start for i in model.structure.inputs if i.name != "voltage"}
-    kept = "".join(f", {n}={v!r}" for n, v in held.items())
+    inputs = model.structure.inputs
+    kept = "".join(f", {i.name}={i.start!r}" for i in inputs if i.name != "voltage")
     voltage = f"if time < {span / 2!r} then {slope!r}*time else {slope!r}*({span!r} - time)"
     harness = f"model Harness PiezoStack.Signal psa(voltage={voltage}{kept}); end Harness;"
     got = simulated(text + harness, "Harness", span)
     t = np.linspace(0.0, span, _SAMPLES + 1)
-    u = np.column_stack([peak * (1.0 - np.abs(2.0 * t / span - 1.0))] + [
-        np.full_like(t, v) for v in held.values()
-    ])  # fmt: skip
+    u = input_samples(model, len(t), {"voltage": peak * (1.0 - np.abs(2.0 * t / span - 1.0))})
     steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-11)
     variables: list[State | Output] = [*model.structure.states, *model.structure.outputs]
-    nominals = np.concatenate([model.state_nominals(), model.output_nominals()])
+    nominals = [*model.state_nominals(), *model.output_nominals()]
     errors = {}
-    for it, expected, nominal in zip(
-        variables, np.hstack([steps.x, steps.y]).T, nominals, strict=True
-    ):
+    for it, expected, nominal in zip(variables, [*steps.x.T, *steps.y.T], nominals, strict=True):
         at = np.interp(t, got["time"], got[f"psa.{it.name}"])
         size = nominal if it.unit == "m/s" else np.ptp(expected) or nominal
         errors[it.name] = float(np.abs(at - expected).max() / size)
     return errors
 
 
-@dataclass(frozen=True)
-class Equations:
-    """The equations of a class `Signal`: right-hand side by left-hand side, as texts."""
-
-    sides: Mapping[str, str]
-
-    def resolved(self, side: str) -> str:
-        """Return a text with every variable that has an equation replaced by its right side."""
-
-        def replaced(match: re.Match[str]) -> str:
-            name = match[0].replace(" ", "")
-            return f"({self.resolved(self.sides[name])})" if name in self.sides else match[0]
-
-        return re.sub(r"der\(\w+\)|\b[A-Za-z_]\w*\b", replaced, side)
-
-
 def signal_class(text: str) -> str:
     """Return the lines of the class `Signal` without its annotation."""
     return text.partition("  model Signal ")[2].partition("annotation(")[0]
-
-
-def equations(text: str) -> Equations:
-    """Read the equations of `Signal`."""
-    body = re.sub(r"//[^\n]*", "", signal_class(text).split("\n  equation\n")[1])
-    pairs = (" ".join(e.split()).split(" = ", 1) for e in body.split(";") if e.strip())
-    return Equations({e[0]: e[1] for e in pairs})
 
 
 def pure_ode(model: Model, text: str) -> str:
@@ -120,24 +93,30 @@ def pure_ode(model: Model, text: str) -> str:
     rumoca hands its reading of a class to CasADi only if all equations are of the form
     der(x) = f(x); every other variable is replaced by its right-hand side.
     """
-    given = equations(text)
-    lines = [
-        re.sub(r"^\s*output (.*)$", "", line)
-        for line in signal_class(text)
-        .split("\n  equation\n")[0]
-        .partition("\n  protected\n")[0]
-        .split("\n")[2:]
-    ]
+    declared, body = signal_class(text).split("\n  equation\n")
+    body = re.sub(r"//[^\n]*", "", body)
+    pairs = (" ".join(e.split()).partition(" = ") for e in body.split(";") if e.strip())
+    sides = {left: right for left, _, right in pairs}
+
+    def resolved(side: str) -> str:
+        def replaced(match: re.Match[str]) -> str:
+            name = match[0].replace(" ", "")
+            return f"({resolved(sides[name])})" if name in sides else match[0]
+
+        return re.sub(r"der\(\w+\)|\b[A-Za-z_]\w*\b", replaced, side)
+
+    public = declared.partition("\n  protected\n")[0].split("\n")[2:]
+    lines = [line for line in public if not line.lstrip().startswith("output ")]
     lines += [f"Real integral_{n}(start=0.0, fixed=true);" for n in model.output_names]
     lines += ["equation"]
-    lines += [f"der({n}) = {given.resolved(given.sides[f'der({n})'])};" for n in model.state_names]
-    lines += [f"der(integral_{n}) = {given.resolved(n)};" for n in model.output_names]
+    lines += [f"der({n}) = {resolved(sides[f'der({n})'])};" for n in model.state_names]
+    lines += [f"der(integral_{n}) = {resolved(n)};" for n in model.output_names]
     return "\n".join(["model Pure", *lines, "end Pure;"])
 
 
-def read_back(source: str, name: str) -> rumoca.SolveExport:
+def read_back(source: str) -> rumoca.SolveExport:
     """Return rumoca's reading of a pure ODE: `rhs(t, x, u, p)`, and the names of x, u, p."""
-    return load(source, name).to_casadi()
+    return load(source, "Pure").to_casadi()
 
 
 def right_side_error(model: Model, text: str, points: int = 5) -> float:
@@ -145,36 +124,28 @@ def right_side_error(model: Model, text: str, points: int = 5) -> float:
 
     At the last point the voltage is held: its rate is below `hold_rate`.
     """
-    read = read_back(pure_ode(model, text), "Pure")
-    defaults = dict(zip(read.parameter_names, read.default_parameters, strict=True))
-    parameters = [defaults[n] for n in read.parameter_names]
-    draw = np.random.default_rng(1)
+    read = read_back(pure_ode(model, text))
+    given = dict(zip(read.parameter_names, read.default_parameters, strict=True))
+    values, draw = model.values, np.random.default_rng(1)
+    starts = np.array([i.start for i in model.structure.inputs])
+    sizes = np.array([50.0, 100.0, 10.0])[: len(starts)]
     worst = 0.0
     for k in range(points + 1):
         x = model.state_nominals() * draw.normal(size=len(model.state_names))
-        sizes = np.array([50.0, 100.0, 10.0])[: len(model.input_names)]
-        u = np.array([i.start for i in model.structure.inputs]) + sizes * draw.normal(
-            size=len(sizes)
-        )
+        u = starts + sizes * draw.normal(size=len(starts))
         if k == points:
-            u[0], x[0] = (
-                0.0,
-                0.7 * model.values["hold_rate"] * (model.values["R_s"] * model.values["C_p"]),
-            )
+            u[0], x[0] = 0.0, 0.7 * values["hold_rate"] * (values["R_s"] * values["C_p"])
         time = float(draw.uniform(0.1, 5.0))
-        at = {**dict(zip(model.state_names, x, strict=True)),
-              **{f"integral_{n}": 0.0 for n in model.output_names}}  # fmt: skip
-        inputs = dict(zip(model.input_names, u, strict=True))
-        rates = read.rhs(
-            time,
-            [at[n] for n in read.state_names],
-            [inputs[n] for n in read.input_names],
-            parameters,
-        )
-        got = dict(zip(read.state_names, np.array(rates).ravel(), strict=True))
         expected = model.structure.f(time, x, u, model.parameter_vector())
-        values = np.concatenate([np.array(v).ravel() for v in expected])
-        for name, value in zip(at, values, strict=True):
+        given |= dict(zip(model.state_names, x, strict=True))
+        given |= dict(zip(model.input_names, u, strict=True))
+        given |= {f"integral_{n}": 0.0 for n in model.output_names}
+        names = (read.state_names, read.input_names, read.parameter_names)
+        rates = np.array(read.rhs(time, *([given[n] for n in own] for own in names))).ravel()
+        got = dict(zip(read.state_names, rates, strict=True))
+        left = [*model.state_names, *(f"integral_{n}" for n in model.output_names)]
+        right = np.concatenate([np.array(v).ravel() for v in expected])
+        for name, value in zip(left, right, strict=True):
             difference = abs(got[name] - value) / max(abs(value), 1e-300)
             worst = max(worst, difference) if np.isfinite(difference) else np.inf
     return worst

@@ -6,7 +6,6 @@ Beyond the rated voltage it is as good as it says, or limited and told.
 import ctypes
 import re
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,19 +46,11 @@ OUTPUT = "displacement"
 
 
 @cache
-def base(precision: str = "double", hold: str = "linear", substeps: int | None = 1) -> FixedStep:
-    return fixed_step(
-        stack("P-885.51").plant(),
-        name="stack",
-        step=STEP,
-        precision=precision,
-        hold=hold,
-        substeps=substeps,
-    )
-
-
-def errors(found: FixedStep) -> dict[str, float]:
-    return {e.voltage: e.error for e in found.errors}
+def made(precision: str = "double", step: float = STEP) -> FixedStep:
+    """Return the fixed step of a stack; a short one is a single substep."""
+    substeps = 1 if step == STEP else None
+    model = stack("P-885.51").plant()
+    return fixed_step(model, name="stack", step=step, precision=precision, substeps=substeps)
 
 
 def play(found: FixedStep, voltage: FloatArray) -> FloatArray:
@@ -70,12 +61,16 @@ def play(found: FixedStep, voltage: FloatArray) -> FloatArray:
     return Probe(found.plan, found.texts).play(u)[:, model.output_names.index(OUTPUT)]
 
 
+def errors(found: FixedStep) -> dict[str, float]:
+    return {e.voltage: e.error for e in found.errors}
+
+
 def test_the_base_errs_by_what_its_header_says() -> None:
-    found = errors(base())
+    found = errors(made())
     assert set(found) == set(VOLTAGES)
     assert all(0.0 < e <= 2e-4 for e in found.values())
     assert max(found["sine"], found["ramps and holds"]) <= 1e-6
-    header = base().texts["stack.h"]
+    header = made().texts["stack.h"]
     assert all(f"{name:16} {value:.1e}" in header for name, value in found.items())
 
 
@@ -84,14 +79,14 @@ def test_single_precision_rests_in_a_hold() -> None:
     """Half a second of rest after a ramp, where a rounded rate would go on for ever."""
     ramp = np.linspace(0.0, 87.3, 2000)
     voltage = np.concatenate([ramp, np.full(50_000, ramp[-1])])
-    double, single = (play(base(precision), voltage) for precision in PRECISIONS)
+    double, single = (play(made(precision), voltage) for precision in PRECISIONS)
     assert error(single, double) <= 2e-6
     assert np.ptp(single[-10_000:]) <= 1e-6 * np.ptp(single)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str) -> None:
-    found = base(precision)
+    found = made(precision)
     source, suffix = found.texts["stack.c"], PRECISIONS[precision].suffix
     assert re.findall(r"#include (.*)", found.texts["stack.h"] + source) == [
         '"stack.h"',
@@ -157,16 +152,6 @@ def test_wrong_wishes_end_in_a_sentence(wrong: dict[str, object], said: str) -> 
     model = with_effect("backlash") if "substeps" in wrong else stack("P-885.51")
     with pytest.raises(psa.InputError, match=said):
         fixed_step(model, **given)  # type: ignore[arg-type]  # wrong on purpose
-
-
-def test_the_command_writes_two_files_and_tells_the_error(tmp_path: Path) -> None:
-    arguments = ["export", "c", "--stack", "P-885.51", "--step", "10us", "--name", "stack"]
-    done = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "code")])
-    assert done.exit_code == 0, done.output
-    assert sorted(p.name for p in (tmp_path / "code").iterdir()) == ["stack.c", "stack.h"]
-    assert "step: 1e-05 s, 1 substep, double precision" in done.output
-    assert "left out: sensor" in done.output
-    assert f"{errors(base())['jumps']:.1e}" in done.output
 
 
 @pytest.mark.parametrize(
@@ -239,38 +224,24 @@ int told(const double *voltage, int count, double *x) {
 """
 
 
-def planned(precision: str = "double") -> FixedStep:
-    return fixed_step(stack("P-885.51").plant(), name="stack", step=LONG_STEP, precision=precision)
-
-
-def jumps(voltage: float) -> FloatArray:
-    share = np.linspace(0.0, 1.0, 401)
-    return voltage * np.select([share < 0.1, share < 0.5, share < 0.8], [0.0, 1.0, -1.0], 1.0)
-
-
-def played(found: FixedStep, voltage: FloatArray) -> FloatArray:
-    u = played_inputs(found.plan.model, np.zeros(len(voltage)))
-    u[:, 0] = voltage
-    return Probe(found.plan, found.texts).play(u)[:, 0]
-
-
 def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
     """900 V, 7.5 times the rated voltage, gave half a range of error; the limit is far above it."""
-    found = planned()
+    found, share = made(step=LONG_STEP), np.linspace(0.0, 1.0, 401)
     limit, model = found.plan.limit, found.plan.model
     assert 1.25 * model.values["u_rated"] <= limit < 900.0
-    u = played_inputs(model, np.zeros(401))
-    u[:, 0] = jumps(limit)
-    x0, t = np.zeros(len(model.state_names)), LONG_STEP * np.arange(401, dtype=np.float64)
-    true = run(model, t, u, x0, rtol=1e-10).y[1:, 0]
-    assert error(played(found, u[:, 0]), true) <= max(GOOD, found.worst.error)
-    for share in (1.001, 900.0 / limit, 1e9, 1e305):
-        assert np.array_equal(played(found, share * u[:, 0]), played(found, u[:, 0]))
+    jumps = limit * np.select([share < 0.1, share < 0.5, share < 0.8], [0.0, 1.0, -1.0], 1.0)
+    t, u = LONG_STEP * np.arange(401, dtype=np.float64), np.column_stack([jumps, 0.0 * jumps])
+    true = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
+    within = play(found, jumps)
+    shown = true[1:, model.output_names.index(OUTPUT)]
+    assert error(within, shown) <= max(GOOD, found.worst.error)
+    for beyond in (1.001, 900.0 / limit, 1e9, 1e305):
+        assert np.array_equal(play(found, beyond * jumps), within)
 
 
 @pytest.mark.parametrize("precision", ["double", pytest.param("single", marks=slow)])
 def test_the_step_tells_it_and_no_number_leaves_the_voltage(precision: str) -> None:
-    found = planned(precision)
+    found = made(precision, LONG_STEP)
     library = ctypes.CDLL(str(shared_library({**found.texts, "told.c": TOLD}, ())))
     assert "Returns 1 if the voltage was beyond" in " ".join(found.texts["stack.h"].split())
 

@@ -1,23 +1,34 @@
-"""FMUs of several models against computations that share no code with them."""
+"""FMUs of several models, unusual ones too, against computations that share no code with them."""
 
-import fmpy
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
 import numpy as np
 import pytest
 
+from psa_casadi.any_model.effects.attached import extended
+from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.any_model.predict import Sizes
+from psa_casadi.component import Component, Equations
 from psa_casadi.export.check.agreement import has_reference
-from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.check.check import as_exported, check_fmu
+from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.reference import simulate
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
+from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.ode_model import ode_model
+from psa_casadi.simulation.stepper import run
+from psa_casadi.variables import Input, Parameter, State
 from tests.export.fmu_models import exported, model_named
+from tests.export.modelica_runs import simulated
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
-MODELS = (
-    "PTBS200", "WYDS0808020", STACK, "manipulator", "single_mass", "slow_creep", "flexure",
-    "every_effect",
-)  # fmt: skip
-
-
 #: The two versions are two faces of one core: each kind of model in one of them, one in both. Other
 #: stacks are checked in `test_cli_commands` and played in `test_fmu_accuracy`.
 CHECKED = (
@@ -40,32 +51,101 @@ def test_check_passes(name: str, fmi: int) -> None:
     assert all(r.remark.endswith(f"against the {against}") for r in steps)
 
 
-@pytest.mark.parametrize("interface", slow_but(["CoSimulation"], ["CoSimulation", "ModelExchange"]))
-def test_fmpy_agrees(interface: str) -> None:
-    """fmpy's own co-simulation master, and its CVode for model exchange, on two jumps."""
-    rows = [(0.0, 0.0), (5e-3, 0.0), (5e-3, 100.0), (15e-3, 100.0), (15e-3, 20.0), (30e-3, 20.0)]
-    table = np.array(
-        [(t, v, 0.0) for t, v in rows],
-        dtype=[(n, float) for n in ("time", "voltage", "load_force")],
-    )
-    result = fmpy.simulate_fmu(
-        str(exported(STACK)), stop_time=0.03, fmi_type=interface, relative_tolerance=1e-9,
-        output_interval=1e-3, input=table, output=["displacement"],
-    )  # fmt: skip
-    times, first = np.unique(result["time"], return_index=True)
-    truth = simulate(
-        model_named(STACK).values,
-        lambda t: 0.0 if t < 5e-3 else 100.0 if t < 15e-3 else 20.0,
-        times,
-        breakpoints=(5e-3, 15e-3),
-    ).displacement
-    assert len(times) >= 31
-    assert np.max(np.abs(result["displacement"][first] - truth)) < 1e-6 * np.ptp(truth)
-
-
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", dict(CHECKED))
 def test_nominal_values_of_parameters_are_within_their_bounds(name: str) -> None:
     for v in variable_table(model_named(name)):
         if v.kind == "parameter" and v.bounds and v.bounds[1] > 0.0:
             assert v.nominal is not None
             assert v.bounds[0] <= v.nominal <= v.bounds[1], v
+
+
+_X, _U, _P, _T = (ca.SX.sym(name) for name in "xupt")
+
+
+def _ode(name: str, **ode: ca.SX) -> Model:
+    values = {"p": 2.0} if "p" in ode else {}
+    return ode_model({"x": _X, **ode}, name=name, values=values)
+
+
+@cache
+def _without_outputs() -> Model:
+    tank = Component(
+        name="tank",
+        description="a state that follows an input, shown to nobody",
+        source="a first-order lag",
+        equations=lambda s: Equations(der={"level": s.rate * (s.inflow - s.level)}),
+        parameters=(Parameter("rate", 2.0, "1/s", (0.0, 10.0), "rate of the lag"),),
+        states=(State("level", "m", "level", 1.0),),
+        inputs=(Input("inflow", "m", "what the level follows", 0.0, 1.0),),
+    )
+    return compose([tank], name="tank")
+
+
+def _seen_late() -> Model:
+    """A first-order model whose output is seen through a lag."""
+    model = _ode("late", u=_U, p=_P, ode=_P * (_U - _X), y=_X)
+    ones = dict.fromkeys((*model.state_names, *model.input_names, *model.output_names), 1.0)
+    sizes = Sizes(ones, ones, ones, ones, sample=0.01, duration=1.0)
+    lag = next(e for e in effects_of(model, sizes) if e.name.startswith("lag_of_y"))
+    return extended(model, [lag]).with_values({f"{lag.name}_time": 0.05})
+
+
+MODELS: dict[str, Callable[[], Model]] = {
+    "neither input nor parameter": lambda: _ode("decay", ode=-_X),
+    "no input": lambda: _ode("decay", p=_P, ode=-_P * _X),
+    "at rest, parameter without effect": lambda: _ode("rest", u=_U, p=_P, ode=-_P * _X),
+    "constant rate": lambda: _ode("clock", ode=ca.SX(1.0)),
+    "parameter that acts beyond a threshold": lambda: _ode(
+        "threshold", u=_U, p=_P, ode=_P * ca.fmax(_U - 5.0, 0.0) - _X, zero=_U - 5.0
+    ),
+    "switch by time": lambda: _ode(
+        "late", u=_U, p=_P, t=_T, ode=_P * _U - _X + ca.fmax(_T - 0.5, 0.0), zero=_T - 0.5
+    ),
+    "switch by a state": lambda: _ode(
+        "bump", u=_U, p=_P, ode=_U - _X - _P * ca.fmax(_X - 0.3, 0.0), zero=_X - 0.3
+    ),
+    "no output": _without_outputs,
+}
+QUICK = [("switch by a state", 3), ("no output", 3)]
+#: Every model in one of the versions.
+IN_TURN = [(n, 2 + k % 2) for k, n in enumerate(MODELS) if (n, 3) not in QUICK]
+
+
+@pytest.mark.usefixtures("code_runs_here")
+@pytest.mark.parametrize(("name", "fmi"), slow_but(QUICK[:1], [*QUICK, *IN_TURN]))
+def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) -> None:
+    report = check_fmu(export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
+    assert report.passed, report.failures
+
+
+def test_a_sensors_effect_is_left_out_where_the_fmu_leaves_it_out(tmp_path: Path) -> None:
+    """It has no output of its own: its state and parameters tell."""
+    whole = _seen_late()
+    assert whole.state_names != ("x",)
+    with Archive(export_fmu(whole, tmp_path / "m.fmu")) as archive:
+        chosen = as_exported(archive, whole)
+        assert chosen.state_names == ("x",)
+        assert list(wrong_start_values(archive, chosen)) == []
+        assert list(wrong_dependencies(archive, chosen)) == []
+
+
+def test_a_model_without_outputs_runs_everywhere(tmp_path: Path) -> None:
+    """Its state is the lag's exponential in Python, in an FMU and in Modelica."""
+    model, end = _without_outputs(), 1.0
+    assert isinstance(model.structure.y, ca.SX)
+    assert model.structure.y.shape == (0, 1)
+    exact = 1.0 - np.exp(-2.0 * end)
+    t = np.linspace(0.0, end, 11)
+    steps = run(model, t, np.ones((11, 1)), np.zeros(1), rtol=1e-9)
+    assert steps.x[-1, 0] == pytest.approx(exact, rel=1e-7)
+    assert steps.y.shape == (11, 0)
+    with (
+        Fmu(export_fmu(model, tmp_path / "m.fmu")) as fmu,
+        fmu.start(CO_SIMULATION, tolerance=1e-9) as slave,
+    ):
+        slave.set({"inflow": 1.0})
+        slave.step(0.0, end)
+        assert slave.get(["level"])[0] == pytest.approx(exact, rel=1e-7)
+    harness = "model Harness Tank.Signal tank(inflow = 1.0); end Harness;"
+    got = simulated(modelica_text(model, name="Tank") + harness, "Harness", end)
+    assert got["tank.level"][-1] == pytest.approx(1.0 - np.exp(-2.0 * got["time"][-1]), rel=1e-4)

@@ -3,9 +3,9 @@
 Errors are shares of the output's range, or of its nominal where that is larger (a stack that hardly
 moves is not asked for more digits than its absolute tolerance holds)."""
 
-from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,15 +18,12 @@ from psa_casadi.export.importer.fmu import (
     MODEL_EXCHANGE,
     Fmu,
     FmuError,
-    Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, communicate
 from psa_casadi.reference import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
-from tests.export import sampled_fmus
-from tests.export.fmi3_instances import Instance3, Update
 from tests.export.fmu_models import exported, model_named
 from tests.model.sampled_models import PERIOD, loop
 from tests.studies.benchmarks.fmu import STEP_SHARE, TIGHTEST_STEP
@@ -43,50 +40,36 @@ def _grid(end: float, step: float) -> FloatArray:
     return np.array([round(k * step, 12) for k in range(round(end / step) + 1)])
 
 
-def _ramps(top: float) -> Signals:
-    """Up, down, held and reversed: four kinks, two reversals, one of them within a step."""
-    times = np.array([0.0, 4e-3, 7e-3, 1e-2, 1.05e-2, 2e-2])
-    shape = np.array([0.0, 1.0, 0.3, 0.3, 0.9, 0.1])
-    return _both(times, top * shape)
-
-
-def _sampled(top: float) -> Signals:
-    """Sum of sines as a recorder keeps it: 10 kHz, rounded, a kink at every sample."""
-    times = _grid(2e-2, 1e-4)
-    tones = ((50.0, 0.30, 0.0), (170.0, 0.12, 1.0), (610.0, 0.05, 2.0))
-    wave = sum((a * (np.sin(2 * np.pi * f * times + p) - np.sin(p)) for f, a, p in tones),
-               0.0 * times)  # fmt: skip
-    return _both(times, np.round(top * (0.5 * np.minimum(times / 5e-3, 1.0) + 0.5 * wave), 2))
-
-
-def _whisper(top: float) -> Signals:
-    """A reversing voltage of a ten-thousandth of the rated one."""
-    times = np.array([0.0, 3e-3, 6e-3, 9e-3, 2e-2])
-    return _both(times, 1e-4 * top * np.array([0.0, 1.0, -1.0, 0.5, -0.5]))
-
-
-def _both(times: FloatArray, voltage: FloatArray) -> Signals:
-    return Signals(
-        ("voltage", "load_force"), times, np.column_stack([voltage, 0.0 * voltage])
-    )  # fmt: skip
-
-
-SIGNALS: dict[str, Callable[[float], Signals]] = {
-    "ramps": _ramps,
-    "sampled": _sampled,
-    "whisper": _whisper,
-}
+#: 10 kHz, as a recorder keeps it.
+GRID = _grid(2e-2, 1e-4)
+_TONES = ((50.0, 0.30, 0.0), (170.0, 0.12, 1.0), (610.0, 0.05, 2.0))
+_WAVE = sum((a * (np.sin(2 * np.pi * f * GRID + p) - np.sin(p)) for f, a, p in _TONES), 0.0 * GRID)
+#: Times, and voltages as shares of the rated one.
+SIGNALS: dict[str, tuple[FloatArray, Any]] = {
+    # up, down, held and reversed: four kinks, two reversals, one of them within a step
+    "ramps": (np.array([0.0, 4e-3, 7e-3, 1e-2, 1.05e-2, 2e-2]),
+              np.array([0.0, 1.0, 0.3, 0.3, 0.9, 0.1])),
+    # a sum of sines, rounded, with a kink at every sample
+    "sampled": (GRID, np.round(0.5 * np.minimum(GRID / 5e-3, 1.0) + 0.5 * _WAVE, 4)),
+    # a reversing voltage of a ten-thousandth
+    "whisper": (np.array([0.0, 3e-3, 6e-3, 9e-3, 2e-2]),
+                1e-4 * np.array([0.0, 1.0, -1.0, 0.5, -0.5])),
+}  # fmt: skip
 
 
 def _signals(name: str, kind: str) -> Signals:
-    return SIGNALS[kind](model_named(name).values["u_rated"])
+    times, shares = SIGNALS[kind]
+    voltage = model_named(name).values["u_rated"] * shares
+    return Signals(
+        ("voltage", "load_force"), times, np.column_stack([voltage, 0.0 * voltage])
+    )  # fmt: skip
 
 
 @cache
 def _expected(name: str, kind: str) -> FloatArray:
     """Return the displacement every 0.1 ms by a computation at 1e-10 or tighter."""
     model = model_named(name).plant()
-    found = expected_outputs(model, _grid(2e-2, 1e-4), _signals(name, kind))
+    found = expected_outputs(model, GRID, _signals(name, kind))
     column: FloatArray = found[:, model.output_names.index("displacement")]
     return column
 
@@ -109,20 +92,21 @@ IN_TURN = [
 def test_error_is_within_ten_tolerances(name: str, kind: str, tolerance: float) -> None:
     expected = _expected(name, kind)
     with Fmu(exported(name)) as fmu:
-        found = co_simulate(
-            fmu, _grid(2e-2, 1e-4), _signals(name, kind), ["displacement"], tolerance=tolerance
-        )[:, 0]
-    error = np.max(np.abs(found - expected)) / _scale(name, expected)
+        found = co_simulate(fmu, GRID, _signals(name, kind), ["displacement"], tolerance=tolerance)
+    error = np.max(np.abs(found[:, 0] - expected)) / _scale(name, expected)
     assert error < FACTOR * tolerance
 
 
-def _held(instance: Instance, times: FloatArray, levels: FloatArray) -> FloatArray:
-    """Hold each level from one time to the next; return the displacement at the ends."""
+def _held(
+    fmu: Fmu, points: FloatArray, sizes: FloatArray, levels: FloatArray, tolerance: float | None
+) -> FloatArray:
+    """Hold a level from each point on; return the displacement at the ends of the steps."""
     found = []
-    for (begin, end), level in zip(pairwise(times), levels, strict=True):
-        instance.set({"voltage": float(level)})
-        instance.step(float(begin), float(end - begin))
-        found.append(float(instance.get(["displacement"])[0]))
+    with fmu.start(CO_SIMULATION, tolerance=tolerance, start_time=float(points[0])) as slave:
+        for point, size, level in zip(points, sizes, levels, strict=True):
+            slave.set({"voltage": float(level)})
+            slave.step(float(point), float(size))
+            found.append(slave.get(["displacement"])[0])
     return np.array(found)
 
 
@@ -151,37 +135,11 @@ def _after_jumps(name: str) -> FloatArray:
 def test_jumps_and_steps_from_a_microsecond_to_a_quarter_hour(name: str, tolerance: float) -> None:
     """The voltage jumps at every communication point; the steps span nine decades."""
     expected = _after_jumps(name)
-    times = np.concatenate([[0.0], np.cumsum(_SIZES)])
     levels = model_named(name).values["u_rated"] * _SHARES
-    with Fmu(exported(name)) as fmu, fmu.start(CO_SIMULATION, tolerance=tolerance) as instance:
-        found = _held(instance, times, levels)
+    with Fmu(exported(name)) as fmu:
+        found = _held(fmu, _sums(0.0, _SIZES), _SIZES, levels, tolerance)
     error = np.max(np.abs(found - expected)) / _scale(name, expected)
     assert error < FACTOR * tolerance
-
-
-def test_input_derivatives_raise_the_order() -> None:
-    """The error of a held sine falls with the step; with slopes, with its square."""
-
-    def signal(t: FloatArray) -> FloatArray:
-        return 60.0 - 60.0 * np.cos(2 * np.pi * 50.0 * t)
-
-    fine = _grid(2e-2, 2.5e-5)
-    truth = simulate(model_named("P-885.51").values, lambda t: float(signal(np.array(t))), fine)
-    errors: dict[bool, list[float]] = {False: [], True: []}
-    with Fmu(exported("P-885.51")) as fmu:
-        for rates, found in errors.items():
-            for step in (2e-4, 1e-4, 5e-5):
-                times = _grid(2e-2, step)
-                inputs = Signals(("voltage",), times, signal(times)[:, None])
-                x = co_simulate(fmu, times, inputs, ["displacement"], tolerance=1e-8, rates=rates)[
-                    :, 0
-                ]
-                known = truth.displacement[np.searchsorted(fine, times - 1e-9)]
-                found.append(float(np.max(np.abs(x - known)) / np.ptp(truth.displacement)))
-    held, sloped = errors[False], errors[True]
-    assert all(1.8 < a / b < 2.4 for a, b in pairwise(held))
-    assert all(a / b > 3.4 for a, b in pairwise(sloped))
-    assert sloped[0] < held[0] / 30.0
 
 
 @pytest.mark.parametrize("name", slow_but([ONE], ["PTBS200", ONE, "slow_creep", "flexure"]))
@@ -206,7 +164,7 @@ def test_output_derivatives_are_those_of_the_outputs(name: str) -> None:
 def test_every_solver_step_gets_a_share_of_the_tolerance() -> None:
     """The work that the bench tells is that of the FMU: as many steps as the simulator's."""
     name, tolerance = "P-885.51", 1e-5
-    times, inputs = _grid(2e-2, 1e-4), _signals("P-885.51", "sampled")
+    times, inputs = GRID, _signals(name, "sampled")
     with Fmu(exported(name)) as fmu, fmu.start(CO_SIMULATION, tolerance=tolerance) as instance:
         instance.require("SetDebugLogging", 1, 0, None)
         communicate(instance, times, inputs, ["displacement"])
@@ -230,17 +188,10 @@ STARTS = (0.1, 5.0, 1e3, 1e6)
 REQUESTED = pytest.mark.parametrize("tolerance", [None, 1e-8, 1e-12])
 
 
-def _alternating(
-    fmu: Fmu, points: FloatArray, sizes: FloatArray, tolerance: float | None = None
-) -> FloatArray:
+def _alternating(fmu: Fmu, start: float, sizes: FloatArray, tolerance: float | None) -> FloatArray:
     """Hold 100 V and 0 V in turn from each communication point on; return the displacements."""
-    found = []
-    with fmu.start(CO_SIMULATION, tolerance=tolerance, start_time=float(points[0])) as slave:
-        for k, (point, size) in enumerate(zip(points, sizes, strict=True)):
-            slave.set({"voltage": 100.0 * (1 - k % 2)})
-            slave.step(float(point), float(size))
-            found.append(slave.get(["displacement"])[0])
-    return np.array(found)
+    levels = np.where(np.arange(len(sizes)) % 2, 0.0, 100.0)
+    return _held(fmu, _sums(start, sizes), sizes, levels, tolerance)
 
 
 def _sums(start: float, sizes: FloatArray) -> FloatArray:
@@ -254,10 +205,10 @@ def test_results_do_not_depend_on_the_start(fmi: int, tolerance: float | None) -
     """Bit for bit where the importer adds the sizes up, as the FMU does."""
     sizes = np.full(20, 1e-4)
     with Fmu(exported(STACK, fmi)) as fmu:
-        near = _alternating(fmu, _sums(0.0, sizes), sizes, tolerance)
+        near = _alternating(fmu, 0.0, sizes, tolerance)
         assert np.ptp(near) > 5e-6
         for start in STARTS:
-            assert np.array_equal(_alternating(fmu, _sums(start, sizes), sizes, tolerance), near)
+            assert np.array_equal(_alternating(fmu, start, sizes, tolerance), near)
 
 
 @VERSIONS
@@ -269,35 +220,11 @@ def test_long_steps(fmi: int, tolerance: float | None) -> None:
         for start in (0.0, 1e6):
             for size in (1.0, 10.0, 1e4):
                 sizes = np.full(3, size)
-                rest[start, size] = _alternating(fmu, _sums(start, sizes), sizes, tolerance)
+                rest[start, size] = _alternating(fmu, start, sizes, tolerance)
     found = np.array(list(rest.values()))
     error = np.abs(found - rest[0.0, 1.0]).max() / np.ptp(found)
     assert error < 10.0 * (tolerance or 1e-6)
     assert np.array_equal(rest[0.0, 1e4], rest[1e6, 1e4])
-
-
-def test_a_jump_within_a_long_step() -> None:
-    """An input that is set 1,000 s into a step or later is taken as well as one at its start."""
-    moments: list[tuple[float, bool]] = []
-
-    def jump(slave: Instance3, update: Update) -> None:
-        if not moments and update.time > 1e6 + 1e3:
-            moments.append((update.time, update.set_requested))
-            slave.set({"voltage": 30.0})
-
-    with Fmu(exported(STACK, 3)) as fmu:
-        with Instance3(fmu, watcher=jump).start(tolerance=1e-10, start_time=1e6) as slave:
-            slave.set({"voltage": 100.0})
-            slave.step(1e6, 1e4)
-            varied = slave.get(["displacement"])[0]
-        with fmu.start(CO_SIMULATION, tolerance=1e-10) as other:
-            for k, voltage in enumerate((100.0, 30.0)):
-                other.set({"voltage": voltage})
-                other.step(5e3 * k, 5e3)
-            plain = other.get(["displacement"])[0]
-    assert len(moments) == 1
-    assert moments[0][1]
-    assert varied == pytest.approx(plain, rel=1e-8)
 
 
 def test_a_step_below_the_resolution_of_time_is_refused() -> None:
@@ -312,7 +239,7 @@ def test_a_step_below_the_resolution_of_time_is_refused() -> None:
 def test_sampled_states_far_from_zero(fmi: int) -> None:
     """A million seconds on, each instant is where it is near 0 to the rounding of the time."""
     times = np.arange(24) * (PERIOD / 4.0)
-    with Fmu(sampled_fmus.exported("loop", fmi)) as fmu:
+    with Fmu(exported("loop", fmi)) as fmu:
         runs = []
         for start in (0.0, 1e6 * PERIOD, 1e9 * PERIOD):
             with fmu.start(CO_SIMULATION, tolerance=1e-9, start_time=start) as slave:
@@ -331,7 +258,7 @@ def test_sampled_states_far_from_zero(fmi: int) -> None:
 @VERSIONS
 def test_instants_that_cannot_be_counted_are_refused(fmi: int) -> None:
     """By the start, by a step, by the period, in model exchange, and outside of an FMU."""
-    with Fmu(sampled_fmus.exported("loop", fmi)) as fmu:
+    with Fmu(exported("loop", fmi)) as fmu:
         for start in (1e14 * PERIOD, 1e300):
             with (
                 fmu.open(CO_SIMULATION) as slave,

@@ -1,6 +1,7 @@
 """The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them.
 
-And what an FMU says outside of what the records behind its model have shown.
+What an FMU says outside of what the records behind its model have shown, and `psa check
+--evidence`, which plays run and records again.
 """
 
 import re
@@ -16,17 +17,36 @@ import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.components.outputs import OUTPUT
 from psa_casadi.effects import EFFECTS
-from psa_casadi.export.check.evidence import repeated
+from psa_casadi.export.check.check import check_fmu
+from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.measured import Playback, played_again
+from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.fmu import evidence
 from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
 from psa_casadi.export.fmu.reference_run import FOLDER
+from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
+from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.evidence import evidence_of
+from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.identification.prepare import prepared
+from psa_casadi.model.compose import Model
+from psa_casadi.model.evidence import Evidence
+from psa_casadi.model.model_file import loads
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import whole
 from psa_casadi.variables import Interval
-from tests.export.fmu_models import assert_valid
+from tests.export.fmu_models import assert_valid, exported, rewritten
 from tests.model.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
 from tests.tiers import slow, slow_but
+
+
+def stated() -> Evidence:
+    """Return the evidence of the model."""
+    found = evident_model().evidence
+    assert found is not None
+    return found
 
 
 def test_experiments_name_files_that_are_there() -> None:
@@ -37,11 +57,15 @@ def test_experiments_name_files_that_are_there() -> None:
     assert len(spread) == 1 + 2 * 3 + 2  # the mean, pairs of three parameters, two samples
     for experiment in (whole, *spread):
         assert all(f"{FOLDER}/{e.attrib['source']}" in found for e in experiment)
+    for name in (n for n in found if n.endswith(".ssv")):
+        assert_valid(found[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
+    one = found[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
+    assert re.findall(r'Parameter name="(\w+)"', one) == ["k_L", "A", "tau"]
 
 
 def test_meta_data_and_page_say_the_same() -> None:
     """Names and order as the schema of SSP Traceability 1.0 has them (SRMD.xsd, STC.xsd)."""
-    found, model = files_inside(evident_fmu()), evident_model()
+    found = files_inside(evident_fmu())
     root = ET.fromstring(found[evidence.META_DATA])
     space = "{http://ssp-standard.org/SSPTraceability1/%s}"
     assert root.tag == space % "SimulationResourceMetaData" + "SimulationResourceMetaData"
@@ -53,15 +77,14 @@ def test_meta_data_and_page_say_the_same() -> None:
         for entry in part:
             assert entry.tag == space % "SSPTraceabilityCommon" + "ClassificationEntry"
             entries.setdefault(entry.attrib["keyword"], []).append(entry.text or "")
-    page = found[evidence.PAGE].decode()
-    assert model.evidence is not None
-    assert model.evidence.held_out is not None
+    page, held = found[evidence.PAGE].decode(), stated().held_out
+    assert held is not None
     (record,) = entries["record"]
     assert noisy_record().sha256 in record
-    assert f"{1e6 * model.evidence.held_out.rms_m:.4g} um rms" in entries["held-out error"][0]
+    assert f"{1e6 * held.rms_m:.4g} um rms" in entries["held-out error"][0]
     assert entries["temperature"] == ["not recorded"]
     row = [float(v) for v in entries["covariance.A"][0].split()]
-    assert row == list(model.evidence.covariance.matrix[1])
+    assert row == list(stated().covariance.matrix[1])
     assert re.fullmatch(r"[\d.]+ N/V, standard error [\d.e-]+", entries["k_L"][0])
     for keyword in ("record", "held-out error", "voltage", "duration", "k_L"):
         assert entries[keyword][0] in page
@@ -69,30 +92,16 @@ def test_meta_data_and_page_say_the_same() -> None:
     assert "../documentation/evidence.html" in found["documentation/index.html"].decode()
 
 
-def test_parameter_sets_are_as_their_schema_has_them() -> None:
-    found = files_inside(evident_fmu())
-    sets = [n for n in found if n.endswith(".ssv")]
-    assert len(sets) == 9 + 2
-    for name in sets:
-        assert_valid(found[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
-    names = re.findall(
-        r'Parameter name="(\w+)"', found[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
-    )
-    assert names == ["k_L", "A", "tau"]
-
-
 def test_a_model_without_evidence_has_no_such_files() -> None:
-    assert evidence.evidence_files(psa.stack_model("demo"), 20).entries == {}
+    assert evidence.evidence_files(psa.stack_model("demo"), 20) == {}
     none = evidence.evidence_files(evident_model().plant(), 0)
-    assert not [n for n in none.entries if n.startswith(evidence.SETS)]
-    assert evidence.UNCERTAINTY not in none.related
+    assert not [n for n in none if n.startswith(evidence.SETS)]
+    assert evidence.UNCERTAINTY not in none
 
 
 def test_what_a_person_says_of_a_record_stays_text() -> None:
     """A record's name may hold what means something in HTML and XML."""
-    model = evident_model().plant()
-    told = model.evidence
-    assert told is not None
+    model, told = evident_model().plant(), stated()
     assert told.reference is not None
     name = "<b>&\"'"
     odd = replace(
@@ -153,11 +162,9 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
     said, outside = messages(fmi, 120.0, 0.6)
     (line,) = said
     assert line.startswith("voltage is 7")
-    seen = evident_model().evidence
-    assert seen is not None
-    high = seen.seen.voltage.high
-    assert f"from {seen.seen.voltage.low:.6g} to {high:.6g}." in line
-    beyond = (120.0 - high) / (high - seen.seen.voltage.low) - 0.01
+    low, high = stated().seen.voltage.low, stated().seen.voltage.high
+    assert f"from {low:.6g} to {high:.6g}." in line
+    beyond = (120.0 - high) / (high - low) - 0.01
     assert np.max(outside) == pytest.approx(beyond, abs=2e-3)
     assert outside[0] == outside[-1] == 0.0
 
@@ -177,9 +184,8 @@ def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
 
 def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
     model = evident_model()
-    assert model.evidence is not None
-    seen = replace(model.evidence.seen, temperature=Interval(290.0, 300.0))
-    told = replace(model.evidence, seen=seen)
+    seen = replace(stated().seen, temperature=Interval(290.0, 300.0))
+    told = replace(stated(), seen=seen)
     assert "seen_temperature_low" not in with_validity(replace(model, evidence=told)).values
     warm = replace(model.with_effect(EFFECTS["temperature"]), evidence=told)
     watched = with_validity(warm)
@@ -190,3 +196,124 @@ def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> No
         y = watched.structure.f(0.0, x, u, watched.parameter_vector())[1]
         assert float(y[column]) == pytest.approx(outside, abs=1e-12)
     assert seen_inputs(watched)[watched.input_names.index("temperature")] == (290.0, 300.0, np.inf)
+
+
+def carried(path: Path) -> Model:
+    return loads(files_inside(path)["resources/model.json"].decode())
+
+
+def play(path: Path, *records: Record) -> list[CheckRow]:
+    with Fmu(path) as fmu:
+        again = repeated(fmu, carried(path), records)
+        return [r if isinstance(r, CheckRow) else played_again(fmu, r) for r in again]
+
+
+@pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
+def test_the_run_and_the_held_out_error_hold(fmi: int) -> None:
+    rows = {r.name: r for r in play(evident_fmu(fmi), noisy_record())}
+    assert list(rows) == ["records as stated", "reference run", "held-out error of short"]
+    assert all(r.passed for r in rows.values()), rows
+    assert rows["reference run"].figure < (2e-6 if fmi == 2 else 2e-4)
+    assert rows["held-out error of short"].figure < (1e-4 if fmi == 2 else 2e-3)
+
+
+@pytest.mark.slow
+def test_a_record_that_was_averaged_is_averaged_again() -> None:
+    time = np.asarray(np.arange(8000) * 1e-4, dtype=np.float64)
+    voltage = 50.0 - 50.0 * np.cos(8.0 * time)
+    noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
+    clean = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
+    record = Record(name="fast", time=time, voltage=voltage, displacement=clean + noise)
+    shorter, _ = prepared(record)
+    assert shorter.n < record.n
+    found = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])
+    told = evidence_of(
+        found, determinacy(found, (whole(shorter),)), (whole(shorter),),
+        found.predicted((whole(shorter),)), by="test", sampled=[record],
+    )  # fmt: skip
+    model = replace(found.model.plant(), evidence=replace(told, reference=None))
+    with Archive(evident_fmu()) as archive:
+        again = repeated(archive, model, [record])
+        gone = repeated(archive, model, [record.slice(0, 7000)])
+    (playback,) = (run for run in again if isinstance(run, Playback))
+    assert len(playback.times) == shorter.n
+    x0 = np.array([playback.start[n] for n in model.state_names])
+    inputs = np.column_stack([playback.inputs.values[:, 0], np.zeros(shorter.n)])
+    y = psa.run(model, playback.times, inputs, x0, rtol=1e-9).y
+    error = playback.expected - y[:, model.output_names.index("displacement")]
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(playback.stated, rel=1e-4)
+    refused = gone[-1]
+    assert isinstance(refused, CheckRow)
+    assert not refused.passed
+    assert f"{shorter.n} are stated" in refused.remark
+
+
+def test_another_record_is_not_one_of_those() -> None:
+    other = noisy_record().slice(0, 100)
+    rows = play(evident_fmu(), replace(other, name="other", sha256="f" * 64))
+    strange = next(r for r in rows if r.name == "records as stated")
+    assert not strange.passed
+    assert "other has sha256 ffffffffffff..." in strange.remark
+    assert not any("error of" in r.name for r in rows)
+
+
+def test_an_error_that_is_stated_too_small_is_found(tmp_path: Path) -> None:
+    def smaller(content: bytes) -> bytes:
+        return re.sub(rb'("held_out_m": )[\d.e+-]+', rb"\g<1>1.5e-08", content)
+
+    path = rewritten(evident_fmu(), tmp_path / "m.fmu", {"resources/model.json": smaller})
+    failed = [r for r in play(path, noisy_record()) if not r.passed]
+    assert [r.name for r in failed] == ["held-out error of short"]
+    assert "stated 0.015 um" in failed[0].remark
+
+
+@slow
+def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
+    def moved(content: bytes) -> bytes:
+        lines = content.decode().splitlines()
+        column = lines[0].split(",").index("displacement")
+        values = lines[100].split(",")
+        values[column] = repr(1.01 * float(values[column]))
+        return "\n".join([*lines[:100], ",".join(values), *lines[101:], ""]).encode()
+
+    changes = {
+        evidence.OUTPUTS: moved,
+        evidence.PAGE: lambda c: c.replace(b"held-out", b"hold-out"),
+    }
+    path = rewritten(evident_fmu(), tmp_path / "m.fmu", changes)
+    with Archive(path) as archive:
+        assert list(wrong_evidence(archive, carried(path))) == [
+            f"{evidence.PAGE} is not what the model says"
+        ]
+    with Archive(evident_fmu()) as archive:
+        assert list(wrong_evidence(archive, carried(path))) == []
+    (row,) = play(path)
+    assert row.name == "reference run"
+    assert not row.passed
+    assert row.figure > 1e-3
+
+
+def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
+    told = replace(stated(), outside=("offset_drift",))
+    plant = replace(evident_model().plant(), evidence=told)
+    with Archive(evident_fmu()) as archive:
+        row = repeated(archive, plant, [noisy_record()])[-1]
+    assert isinstance(row, CheckRow)
+    assert row.passed
+    assert "not compared: the FMU leaves out offset_drift" in row.remark
+
+
+@pytest.mark.slow
+def test_the_whole_check_with_evidence() -> None:
+    report = check_fmu(evident_fmu(), evidence=True, records=[noisy_record()])
+    assert report.passed, report.failures
+    names = [r.name for r in report.rows]
+    assert {"evidence inside", "reproducible", "reference run"} < set(names)
+    assert names[-1] == "held-out error of short"
+
+
+@pytest.mark.slow
+def test_an_fmu_without_evidence_does_not_pass_when_it_is_asked_for() -> None:
+    """Where none is asked for, it passes: tests/export/test_fmu.py."""
+    report = check_fmu(exported("P-885.51"), evidence=True)
+    assert [r.name for r in report.failures] == ["evidence"]

@@ -11,8 +11,6 @@ import pytest
 from fmpy.validation import validate_fmu
 
 import psa_casadi as psa
-from psa_casadi.component import Component
-from psa_casadi.components import BASE
 from psa_casadi.export.fixed_step.probe import VOLTAGES
 from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
@@ -20,13 +18,12 @@ from psa_casadi.export.fmu.sources import FIXED_ENTRY, STRICT
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.files import temporary_folder
-from psa_casadi.model.compose import compose
 from psa_casadi.report.words.text import check_sentence
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.export.c_host.build import HEADERS
 from tests.export.fmu_models import rewritten
 from tests.model.stack_models import stack
-from tests.simulation.exact_cases import JUMP, FloatArray, error
+from tests.simulation.exact_cases import error
 from tests.tiers import slow
 
 STEP, SAMPLES = 1e-5, 401
@@ -34,37 +31,36 @@ VERSIONS = (2, pytest.param(3, marks=slow))
 
 
 @cache
-def exported(fmi: int) -> Fmu:
-    """Return an FMU of a stack with a fixed step, its file gone once it is loaded."""
+def archived(fmi: int) -> bytes:
+    """Return the file of an FMU of a stack with a fixed step."""
     with temporary_folder() as folder:
-        return Fmu(psa.export_fmu(stack("P-885.51"), folder / "fixed.fmu", fmi=fmi, step=STEP))
+        path = psa.export_fmu(stack("P-885.51"), folder / "fixed.fmu", fmi=fmi, step=STEP)
+        return path.read_bytes()
 
 
-def signals(*, held: bool = False) -> Signals:
-    share = np.linspace(0.0, 1.0, SAMPLES)
-    times = STEP * np.arange(SAMPLES, dtype=np.float64)
-    return Signals(("voltage",), times, 100.0 * VOLTAGES["tones"][1](share)[:, None], held)
+def written(fmi: int, folder: Path) -> Path:
+    """Return the path of a copy of `archived`."""
+    (folder / "fixed.fmu").write_bytes(archived(fmi))
+    return folder / "fixed.fmu"
 
 
-def played(fmi: int, every: int = 1, *, held: bool = False) -> FloatArray:
-    """Return the displacement at every such sample, (n,), where a communication step ends."""
-    given = signals(held=held)
-    inputs = Signals(given.names, given.times[::every], given.values[::every], held)
-    return co_simulate(exported(fmi), inputs.times, inputs, ("displacement",))[:, 0]
-
-
-def simulated(every: int = 1, hold: str = "linear") -> FloatArray:
-    given = signals()
-    model = stack("P-885.51").plant()
-    t, v = given.times[::every], given.values[::every, 0]
-    run = psa.simulate(model, t, v, as_exported=True, rtol=1e-8, hold=hold)
-    return np.asarray(run.outputs["displacement"])
+@cache
+def exported(fmi: int) -> Fmu:
+    """Return a loaded one; its file is gone."""
+    with temporary_folder() as folder:
+        return Fmu(written(fmi, folder))
 
 
 @pytest.mark.parametrize("every", [pytest.param(1, marks=slow), 5])
 def test_communication_steps_are_one_step_or_several(every: int) -> None:
     """FMI 2 passes on the slope of the inputs."""
-    assert error(played(2, every), simulated(every)) <= 5e-5
+    times = STEP * np.arange(SAMPLES, dtype=np.float64)[::every]
+    voltage = 100.0 * VOLTAGES["tones"][1](np.linspace(0.0, 1.0, SAMPLES))[::every]
+    inputs = Signals(("voltage",), times, voltage[:, None])
+    found = co_simulate(exported(2), times, inputs, ("displacement",))[:, 0]
+    model = stack("P-885.51").plant()
+    true = psa.simulate(model, times, voltage, as_exported=True, rtol=1e-8, hold="linear")
+    assert error(found, true.outputs["displacement"]) <= 5e-5
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
@@ -79,33 +75,6 @@ def test_other_communication_steps_are_refused(fmi: int) -> None:
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
-def test_a_saved_state_goes_on_with_the_same_bits(fmi: int) -> None:
-    def three_steps(slave: object) -> FloatArray:
-        rows = []
-        for k in range(3):
-            slave.set({"voltage": 40.0 + 10.0 * k})  # type: ignore[attr-defined]
-            slave.step((2 + k) * STEP, STEP)  # type: ignore[attr-defined]
-            rows.append(slave.get(["displacement", "current"]))  # type: ignore[attr-defined]
-        return np.array(rows)
-
-    with exported(fmi).start(CO_SIMULATION) as slave:
-        slave.set({"voltage": 70.0})
-        slave.step(0.0, 2 * STEP)
-        snapshot = slave.save()
-        data = slave.serialize(snapshot)
-        first = three_steps(slave)
-        slave.restore(snapshot)
-        slave.drop(snapshot)
-        assert three_steps(slave).tobytes() == first.tobytes()
-        with exported(fmi).open(CO_SIMULATION) as other:
-            copy = other.deserialize(data)
-            other.restore(copy)
-            other.drop(copy)
-            assert three_steps(other).tobytes() == first.tobytes()
-        assert np.ptp(first[:, 0]) > 1e-8
-
-
-@pytest.mark.parametrize("fmi", VERSIONS)
 def test_parameters_cannot_be_set(fmi: int) -> None:
     with exported(fmi).start(CO_SIMULATION) as slave:
         with pytest.raises(FmuError, match="'k_L' is constant"):
@@ -115,7 +84,7 @@ def test_parameters_cannot_be_set(fmi: int) -> None:
 
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_the_description_says_what_it_is(fmi: int, tmp_path: Path) -> None:
-    path = psa.export_fmu(stack("P-885.51"), tmp_path / "fixed.fmu", fmi=fmi, step=STEP)
+    path = written(fmi, tmp_path)
     again = psa.export_fmu(stack("P-885.51"), tmp_path / "again.fmu", fmi=fmi, step=STEP)
     assert path.read_bytes() == again.read_bytes()
     assert list(validate_fmu(str(path))) == []
@@ -143,43 +112,6 @@ def test_the_description_says_what_it_is(fmi: int, tmp_path: Path) -> None:
         psa.check_fmu(path, evidence=True)
 
 
-@pytest.mark.parametrize(
-    ("component", "step", "said"),
-    [(JUMP, STEP, "'jump' does not fit"), (None, -1.0, "above 0")],
-    ids=["effect", "step"],
-)
-def test_what_has_no_fixed_step_is_refused(
-    component: Component | None, step: float, said: str, tmp_path: Path
-) -> None:
-    model = stack("P-885.51")
-    if component is not None:
-        model = compose((*BASE, component), model.values)
-    with pytest.raises(psa.InputError, match=said):
-        psa.export_fmu(model, tmp_path / "fixed.fmu", step=step)
-    assert not (tmp_path / "fixed.fmu").exists()
-
-
-@cache
-def archived(fmi: int) -> bytes:
-    """Return the file of an FMU of a stack with a fixed step."""
-    with temporary_folder() as folder:
-        path = psa.export_fmu(stack("P-885.51"), folder / "fixed.fmu", fmi=fmi, step=STEP)
-        return path.read_bytes()
-
-
-def written(fmi: int, folder: Path) -> Path:
-    """Return the path of a copy of `archived`."""
-    (folder / "fixed.fmu").write_bytes(archived(fmi))
-    return folder / "fixed.fmu"
-
-
-def told(path: Path) -> dict[str, float]:
-    """Return the errors that an FMU states, by voltage."""
-    with zipfile.ZipFile(path) as archive:
-        errors: dict[str, float] = json.loads(archive.read(FIXED_ENTRY))["errors"]
-    return errors
-
-
 @slow
 def test_the_check_finds_the_errors_that_it_states(tmp_path: Path) -> None:
     """On the voltages behind them; what means nothing there is left out, and said."""
@@ -189,7 +121,9 @@ def test_the_check_finds_the_errors_that_it_states(tmp_path: Path) -> None:
     assert report.passed, report.failures
     assert report.compared
     figures = {row.name: row.figure for row in report.rows}
-    for voltage, stated in told(path).items():
+    with zipfile.ZipFile(path) as archive:
+        errors: dict[str, float] = json.loads(archive.read(FIXED_ENTRY))["errors"]
+    for voltage, stated in errors.items():
         assert figures[f"fixed step, {voltage}"] == pytest.approx(stated, rel=0.06, abs=1e-8)
     names = {"life cycle", "snapshots", "line of the input", "start of a run", "settled start"}
     assert names < figures.keys()

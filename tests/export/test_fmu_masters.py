@@ -3,14 +3,9 @@
 fmpy integrates model exchange with inputs that it sets once a step, not at every right-hand side,
 so its CVode is shown voltages that jump and are constant in between.
 
-CasADi's importer has its own file. ecos is a co-simulation engine; its Python package names no
-dependency on the TBB library that it needs, so that is loaded first.
+CasADi's importer is in `test_fmu_derivatives`. ecos is a co-simulation engine.
 """
 
-import ctypes
-import importlib.metadata
-import sys
-from pathlib import Path
 from typing import Any
 
 import fmpy
@@ -21,6 +16,7 @@ from psa_casadi.reference import simulate
 from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.export.ssp_systems import END, RATE, monolithic
+from tests.studies.benchmarks.coupling_masters import load_ecos
 from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
@@ -102,22 +98,6 @@ def test_fmpy_euler(fmi: int) -> None:
     assert 1.6 < errors[0] / errors[1] < 2.4
 
 
-@pytest.fixture(scope="module")
-def ecos() -> Any:
-    """Return the module ecospy with the TBB library loaded; skips where either is missing."""
-    if sys.platform != "linux":
-        pytest.skip("ecospy finds TBB by itself on Linux only when it is loaded before")
-    try:
-        files = importlib.metadata.files("tbb") or []
-    except importlib.metadata.PackageNotFoundError:
-        pytest.skip("the package tbb is missing, which ecospy needs")
-    libraries = [f for f in files if Path(str(f)).name == "libtbb.so.12"]
-    if not libraries:
-        pytest.skip("the package tbb has no libtbb.so.12, which ecospy needs")
-    ctypes.CDLL(str(libraries[0].locate()), mode=ctypes.RTLD_GLOBAL)
-    return pytest.importorskip("ecospy", exc_type=ImportError)
-
-
 def _coupled_by_ecos(ecos: Any, fmi: int, step: float) -> tuple[float, float]:
     """Couple stack and flexure; return their displacements at the end [m].
 
@@ -142,8 +122,9 @@ def _coupled_by_ecos(ecos: Any, fmi: int, step: float) -> tuple[float, float]:
 
 
 @VERSIONS
-def test_ecos_couples_two_fmus(ecos: Any, fmi: int) -> None:
+def test_ecos_couples_two_fmus(fmi: int) -> None:
     """The error against one monolithic simulation falls with the step, to first order."""
+    ecos = load_ecos() or pytest.skip("ecospy, or the TBB library that it needs, is missing")
     expected = monolithic()
     errors = []
     for step in (1e-6, 5e-7, 2.5e-7):

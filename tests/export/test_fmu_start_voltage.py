@@ -14,13 +14,11 @@ from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import settled_at
 from psa_casadi.simulation.start import start_state
-from tests.export.fmi3_instances import Instance3
 from tests.export.fmu_models import exported, model_named
 from tests.tiers import slow
 
 STACK = "P-885.51"
 BOTH = pytest.mark.parametrize("fmi", [2, 3])
-INTERFACES = pytest.mark.parametrize("interface", [CO_SIMULATION, MODEL_EXCHANGE])
 
 
 def settled(model: Model, voltage: float) -> dict[str, float]:
@@ -32,23 +30,6 @@ def apart(fmu: Fmu, instance: Instance, expected: dict[str, float]) -> float:
     """Return the largest difference from values, in nominal ones."""
     size = np.array([fmu.nominals[n] for n in expected])
     return float(np.max(np.abs(instance.get(list(expected)) - list(expected.values())) / size))
-
-
-@BOTH
-@INTERFACES
-@pytest.mark.parametrize("voltage", [60.0, -15.0])
-def test_an_instance_begins_settled_at_the_voltage(
-    fmi: int, interface: int, voltage: float
-) -> None:
-    """In both versions and interfaces, as `psa.settled_at`; at the exported value as ever."""
-    model = model_named(STACK).plant()
-    expected = settled(model, voltage) | {"voltage": voltage, START_VOLTAGE: voltage}
-    with Fmu(exported(STACK, fmi)) as fmu:
-        with fmu.start(interface, values={START_VOLTAGE: voltage}) as instance:
-            assert apart(fmu, instance, expected) < 1e-8
-        with fmu.start(interface, values={START_VOLTAGE: 0.0}) as instance:
-            assert apart(fmu, instance, dict.fromkeys(expected, 0.0)) == 0.0
-        assert max(abs(expected[n]) / fmu.nominals[n] for n in model.state_names) > 0.05
 
 
 def begun(fmu: Fmu, voltage: float) -> Instance:
@@ -85,7 +66,7 @@ def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage:
             assert np.all(np.abs(found[rests]) < 1e-9 * np.abs(jump[rests]))
             (twice,) = instance.directional(["displacement"], [START_VOLTAGE, "k_L"], [2.0, 0.0])
             assert twice == pytest.approx(2.0 * found[names.index("displacement")], rel=1e-12)
-            if isinstance(instance, Instance3):
+            if fmi == 3:
                 for name, slope in zip(np.array(names)[moved], found[moved], strict=True):
                     both = instance.adjoint([name], ["time", START_VOLTAGE], [1.0])
                     assert both[1] == pytest.approx(slope, rel=1e-9)

@@ -106,7 +106,7 @@ def test_expressions_survive_being_written_and_read(first: Build, second: Build,
         if "cannot write" not in str(error):  # a constant such as log(-2) is folded to nan
             raise
         reject()
-    read = read_back(_as_numbers(pure_ode(model, text)), "Pure")
+    read = read_back(_as_numbers(pure_ode(model, text)))
     draw = np.random.default_rng(seed)
     compared = 0
     for x in (draw.uniform(-3.0, 3.0, 3), draw.uniform(0.1, 2.0, 3), np.ones(3)):
@@ -124,7 +124,7 @@ def test_expressions_survive_being_written_and_read(first: Build, second: Build,
 )
 def test_functions_that_modelica_says_in_other_words(function: Any) -> None:
     model = _model(lambda s: function(s.alpha), lambda s: s.beta)
-    read = read_back(pure_ode(model, modelica_text(model)), "Pure")
+    read = read_back(pure_ode(model, modelica_text(model)))
     for value in (0.3, 1.0, 7.5):
         got = np.array(read.rhs(0.0, [value, 1.0, 1.0], [], [])).ravel()[0]
         assert got == pytest.approx(float(function(ca.DM(value))), rel=1e-14)
@@ -167,7 +167,7 @@ def test_texts(build: Any, text: str) -> None:
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
     graph = Graph()
     (node,) = graph.read([build(a, b)])
-    assert Printer(graph, {"a": "a", "b": "b"}).text(node) == text
+    assert Printer(graph, {"a": "a", "b": "b"}).definition(node) == text
 
 
 def test_what_is_used_twice_does_not_make_the_text_grow_exponentially() -> None:

@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
-import fmpy
 import numpy as np
 import pytest
 import rumoca
@@ -19,15 +18,14 @@ from psa_casadi.export.importer.fmu import (
     MODEL_EXCHANGE,
     Fmu,
     FmuError,
-    Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output, Parameter, State
+from tests.export.fmu_models import exported
 from tests.export.modelica_runs import load
-from tests.export.sampled_fmus import exported
 from tests.model.sampled_models import (
     ALONE,
     CONTROLLER,
@@ -110,15 +108,8 @@ def test_balances_in_next_are_those_before_the_instant() -> None:
     ]  # fmt: skip
 
 
-def test_every_mistake_of_a_declaration_is_named() -> None:
-    zero = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.0), "period"),))
-    unsampled = replace(CONTROLLER, sampled=())
-    with pytest.raises(InputError, match="declares only one of"):
-        compose((PLANT, unsampled))
-    with pytest.raises(InputError, match="'T_none' of component 'sampled_pi' is no parameter"):
-        compose((PLANT, replace(CONTROLLER, sample_period="T_none")))
-    with pytest.raises(InputError, match="'T_0' may be 0 by its bounds"):
-        compose((zero, replace(CONTROLLER, sample_period="T_0")))
+def _second(**changes: object) -> Component:
+    """Return a sampled counter with a period of its own, with changes."""
     second = replace(
         ALONE,
         name="second",
@@ -129,19 +120,36 @@ def test_every_mistake_of_a_declaration_is_named() -> None:
         outputs=(),
         equations=lambda s: Equations(next={"more": s.more}),
     )
-    with pytest.raises(InputError, match=r"different periods \(T_2, T_s\)"):
-        compose((PLANT, CONTROLLER, second))
-    same = compose((PLANT, CONTROLLER, replace(second, parameters=(), sample_period="T_s")))
+    return replace(second, **changes)  # type: ignore[arg-type]  # of its fields
+
+
+_ZERO = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.0), "period"),))
+
+
+@pytest.mark.parametrize(
+    ("components", "said"),
+    [
+        ((PLANT, replace(CONTROLLER, sampled=())), "declares only one of"),
+        ((PLANT, replace(CONTROLLER, sample_period="T_none")),
+         "'T_none' of component 'sampled_pi' is no parameter"),
+        ((_ZERO, replace(CONTROLLER, sample_period="T_0")), "'T_0' may be 0 by its bounds"),
+        ((PLANT, CONTROLLER, _second()), r"different periods \(T_2, T_s\)"),
+        ((PLANT, replace(CONTROLLER, equations=lambda s: Equations(out={"voltage": s.command}))),
+         "lacks the next value of the sampled state 'command'"),
+        ((PLANT, replace(CONTROLLER, outputs=(), equations=lambda s: Equations(
+            next={"integral": s.integral, "command": s.command, "gain": 1.0}))),
+         "sampled state 'gain', which it does not declare"),
+        ((PLANT, ALONE), "Two components declare 'position'"),
+    ],
+)  # fmt: skip
+def test_mistakes_of_a_declaration_are_named(components: tuple[Component, ...], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        compose(components)
+
+
+def test_two_components_share_a_period() -> None:
+    same = compose((PLANT, CONTROLLER, _second(parameters=(), sample_period="T_s")))
     assert same.sampled_names == ("integral", "command", "more")
-    lacking = replace(CONTROLLER, equations=lambda s: Equations(out={"voltage": s.command}))
-    with pytest.raises(InputError, match="lacks the next value of the sampled state 'command'"):
-        compose((PLANT, lacking))
-    more = replace(CONTROLLER, outputs=(), equations=lambda s: Equations(
-        next={"integral": s.integral, "command": s.command, "gain": 1.0}))  # fmt: skip
-    with pytest.raises(InputError, match="sampled state 'gain', which it does not declare"):
-        compose((PLANT, more))
-    with pytest.raises(InputError, match="Two components declare 'position'"):
-        compose((PLANT, ALONE))
 
 
 def test_sensitivities_are_refused() -> None:
@@ -182,24 +190,6 @@ def test_derivatives_hold_the_sampled_states(fmi: int) -> None:
         slave.step(0.5 * PERIOD, 0.25 * PERIOD)
         through = slave.directional(["position"], ["position"], [1.0])
         assert through[0] == pytest.approx(np.exp(-0.25 * PERIOD / 4e-3), rel=1e-6)
-
-
-@VERSIONS
-def test_description(fmi: int) -> None:
-    described = fmpy.read_model_description(str(exported("loop", fmi)))
-    found = {v.name: v for v in described.modelVariables}
-    for name in ("integral", "command"):
-        v = found[name]
-        assert (v.causality, v.variability, v.initial) == ("local", "discrete", "exact")
-        assert (v.unit, float(v.start)) == ("V", 0.0)
-    listed = {e.variable.name: {d.name for d in e.dependencies} for e in described.outputs}
-    through = {"integral", "command"}
-    known = {"position", "reference", "k_p"}
-    assert listed == {"shown": {"position"}, "voltage": known}
-    rates = {e.variable.name: {d.name for d in e.dependencies} for e in described.derivatives}
-    assert rates == {"der(position)": {"disturbance", "gain", "lag"} | known}
-    initial = {e.variable.name: {d.name for d in e.dependencies} for e in described.initialUnknowns}
-    assert initial["voltage"] == known | through
 
 
 @pytest.mark.usefixtures("code_runs_here")
@@ -257,50 +247,6 @@ def test_model_exchange(fmi: int, step: float, start: float) -> None:
     with Fmu(exported("loop", fmi)) as fmu:
         found = integrate(fmu, times, reference(SLOPE), OUTPUTS, tolerance=1e-11)
     assert error(found, times, SLOPE) < 1e-9
-
-
-@VERSIONS
-@pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
-def test_fmpy_simulates_both_interfaces(fmi: int, kind: str) -> None:
-    inputs = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], dtype=[
-        ("time", float), ("disturbance", float), ("reference", float)])  # fmt: skip
-    result = fmpy.simulate_fmu(
-        str(exported("loop", fmi)), stop_time=0.03, fmi_type=kind, relative_tolerance=1e-9,
-        output_interval=0.7e-3, step_size=0.7e-3, input=inputs, output=list(OUTPUTS),
-    )  # fmt: skip
-    last = {float(row["time"]): row for row in result}  # after the events of a time
-    times = np.array(sorted(last))
-    found = np.array([[last[float(t)][n] for n in OUTPUTS] for t in times])
-    assert len(times) > 40
-    assert error(found, times, 0.0) < 1e-6
-
-
-@VERSIONS
-def test_rollback_between_instants(fmi: int) -> None:
-    """A state taken between two instants replays the same bits, in another instance too."""
-    with Fmu(exported("loop", fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
-        slave.set({"reference": 1.0})
-        slave.step(0.0, 1.5 * PERIOD)
-        snapshot = slave.save()
-        data = slave.serialize(snapshot)
-        first = _replay(slave)
-        assert len({row[2] for row in first}) > 3  # instants fell into it
-        slave.restore(snapshot)
-        assert _replay(slave) == first
-        slave.drop(snapshot)
-        with fmu.open(CO_SIMULATION) as other:
-            copy = other.deserialize(data)
-            other.restore(copy)
-            other.drop(copy)
-            assert _replay(other) == first
-
-
-def _replay(instance: Instance) -> list[tuple[float, ...]]:
-    rows = []
-    for k in range(8):
-        instance.step((1.5 + 0.7 * k) * PERIOD, 0.7 * PERIOD)
-        rows.append(tuple(instance.get([*OUTPUTS, "command"])))
-    return rows
 
 
 @VERSIONS

@@ -1,16 +1,20 @@
-"""SSP archives: what is inside, and whether it follows the standard."""
+"""SSP archives: what is inside, whether it follows the standard, and a master that steps it."""
 
 import re
 import zipfile
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fmpy.ssp.ssd import read_ssd
 from lxml import etree  # type: ignore[import-untyped]
+from typer.testing import CliRunner, Result
 
+from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
 from psa_casadi.export.ssp.drawing import OUTSIDE, Port
 from psa_casadi.export.ssp.steps import stable_step
@@ -18,8 +22,17 @@ from psa_casadi.export.ssp.structure import shared_parameters
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.system import System
 from tests.export.fmu_models import assert_valid, model_named
-from tests.export.ssp_master import SspArchive
-from tests.export.ssp_systems import STACK, archive_of, closed_loop, pushed_stage
+from tests.export.ssp_master import SspArchive, couple, points
+from tests.export.ssp_systems import (
+    END,
+    RATE,
+    STACK,
+    archive_of,
+    closed_loop,
+    monolithic,
+    pushed_stage,
+)
+from tests.studies.benchmarks.coupling import settles
 from tests.tiers import slow, slow_but
 
 #: Each archive is exported once: with pytest-xdist by one process.
@@ -91,23 +104,6 @@ def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
     assert "beta" not in shared_parameters(mistuned.parts)
     mapping = texts(archive_of("closed_loop"))["resources/shared.ssm"]
     assert re.findall(r'source="k_L" target="(.*?)"', mapping) == ["compensator.k_L", "stack.k_L"]
-
-
-@slow
-def test_a_changed_parameter_set_reaches_both_parts(tmp_path: Path) -> None:
-    """The value stands once, so a user who edits it changes the stack and its observer."""
-    changed = tmp_path / "changed.ssp"
-    with zipfile.ZipFile(archive_of("closed_loop")) as old, zipfile.ZipFile(changed, "w") as new:
-        for name in old.namelist():
-            content = old.read(name)
-            if name == "resources/shared.ssv":
-                known = r'(name="k_L".*?value=")[^"]*'
-                text = re.sub(known, r"\g<1>9.5", content.decode(), count=1, flags=re.S)
-                content = text.encode()
-            new.writestr(name, content)
-    with SspArchive(changed) as archive:
-        assert archive.parameters["stack"]["k_L"] == 9.5
-        assert archive.parameters["compensator"]["k_L"] == 9.5
 
 
 def test_no_wire_runs_through_a_part_or_on_another_wire() -> None:
@@ -197,3 +193,60 @@ def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     )
     assert results is not None
     assert results[1] == wiring.name
+
+
+def psa(*arguments: str) -> Result:
+    return CliRunner().invoke(app, arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentences"),
+    [
+        (("--model", "m.json", "--stack", "demo", "-o", "stage.ssp"), ("both given",)),
+        (
+            ("--stack", "P-1", "-o", "absent/stage.ssp", "--picture", "wiring.gif"),
+            ("P-1", "absent does not exist", "is .svg or .png"),
+        ),
+        (("--stack", "P-885.51", "--platforms", "vax", "-o", "stage.ssp"), ("vax",)),
+    ],
+)
+def test_mistakes_are_told_at_once_and_nothing_is_written(
+    arguments: tuple[str, ...],
+    sentences: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = psa("export", "ssp", *arguments)
+    assert found.exit_code == 2
+    for sentence in sentences:
+        assert sentence in found.output
+    assert not list(tmp_path.iterdir())
+
+
+def ramp() -> Signals:
+    return Signals(("command",), np.array([0.0, 1.0]), np.array([[0.0], [RATE]]))
+
+
+@pytest.mark.parametrize(("rates", "order"), [(False, 1), (True, 2)])
+def test_two_parts_approach_an_independent_solution(rates: bool, order: int) -> None:
+    """LSODA on hand-wired equations; to first order, with input derivatives to second."""
+    exact = np.array(monolithic())
+    errors = []
+    with SspArchive(archive_of("pushed_stage")) as archive:
+        for step in (1e-6, 5e-7):
+            found = couple(
+                archive, points(step, END), ramp(), ["stack.x", "stage_position"], rates=rates,
+                tolerance=1e-9,
+            )  # fmt: skip
+            errors.append(float(np.abs(found[-1] - exact).max()) / exact[0])
+    assert errors[0] / errors[1] > 0.8 * 2**order
+    assert errors[1] < (5e-3 if order == 1 else 2e-6)
+
+
+@pytest.mark.parametrize("rates", [False, True])
+def test_the_predicted_step_is_where_the_coupling_turns_unstable(rates: bool) -> None:
+    limit = stable_step(wiring_of(pushed_stage()), rates=rates)
+    with SspArchive(archive_of("pushed_stage")) as archive:
+        assert settles(archive, 0.95 * limit, {}, slopes=rates)
+        assert not settles(archive, 1.05 * limit, {}, slopes=rates)

@@ -1,16 +1,18 @@
 """What the descriptions of FMI 2.0 and FMI 3.0 have in common, and pages of HTML."""
 
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from xml.etree import ElementTree as ET
 
 import casadi as ca
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.characters import check_text
+from psa_casadi.component import Expression
 from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model
 from psa_casadi.units import Unit
+from psa_casadi.version import __version__
 
 _FORCE_SCALE = {
     "assumed": "The force scale is assumed: only quantities scaled to displacement are identified;"
@@ -38,10 +40,7 @@ def describe(model: Model) -> str:
 
 def generation_tool() -> str:
     """Return name and version of this package."""
-    try:
-        return f"psa_casadi {version('psa-casadi')}"
-    except PackageNotFoundError:
-        return "psa_casadi"
+    return f"psa_casadi {__version__}"
 
 
 def time_scale(model: Model) -> float:
@@ -53,18 +52,20 @@ def time_scale(model: Model) -> float:
     """
     s = model.structure
     sampled = 25.0 * model.values[s.period] if s.period else 0.0
-    return max(_continuous_scale(model), sampled) if s.states else sampled
-
-
-def _continuous_scale(model: Model) -> float:
-    s = model.structure
-    slopes = ca.Function("slopes", s.arguments, [ca.jacobian(s.xdot, s.x)])
-    rest = np.zeros(len(s.states))
-    held = [np.zeros(len(s.sampled))] if s.sampled else []
-    matrix = np.array(slopes(0.0, rest, np.zeros(len(s.inputs)), model.parameter_vector(), *held))
-    rates = np.abs(np.linalg.eigvals(matrix))
+    if not s.states:
+        return sampled
+    rates = np.abs(np.linalg.eigvals(at_rest(model, ca.jacobian(s.xdot, s.x))))
     ordinary = rates[rates > 1e-4 * rates.max(initial=0.0)]
-    return float(4.0 / ordinary.min()) if ordinary.size else 1.0
+    return max(float(4.0 / ordinary.min()) if ordinary.size else 1.0, sampled)
+
+
+def at_rest(model: Model, expression: Expression) -> npt.NDArray[np.float64]:
+    """Return the value of an expression of the model where time, states and inputs are 0."""
+    s = model.structure
+    zeros = [np.zeros(len(part)) for part in (s.states, s.inputs)]
+    held = [np.zeros(len(s.sampled))] if s.sampled else []
+    found = ca.Function("at_rest", s.arguments, [ca.densify(expression)])
+    return np.array(found(0.0, *zeros, model.parameter_vector(), *held))
 
 
 def number(value: float) -> str:

@@ -11,7 +11,7 @@ Source: SSP 1.0, section 6 (system structure parameter values).
 
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from statistics import NormalDist
 from xml.etree import ElementTree as ET
 
@@ -42,38 +42,29 @@ def parameter_set(
     ET.register_namespace("ssc", _COMMON)
     attributes = {"version": "1.0", "name": name or model.name, "generationTool": generation_tool()}
     root = ET.Element(f"{{{_VALUES}}}ParameterSet", attributes)
-    listed = ET.SubElement(root, f"{{{_VALUES}}}Parameters")
-    intervals = model.provenance.intervals
-    chosen = model.values if values is None else values
-    used: set[str] = set()
-    for p in model.structure.parameters:
-        if p.name not in chosen:
-            continue
-        meaning = p.description
-        if p.name in intervals and values is None:
-            found = intervals[p.name]
+    intervals = model.provenance.intervals if values is None else {}
+    chosen, starts = model.values if values is None else values, states or {}
+    rows = []
+    for p in (p for p in model.structure.parameters if p.name in chosen):
+        found, meaning = intervals.get(p.name), p.description
+        if found:
             meaning += f"; 95 % interval {found.low:.6g} to {found.high:.6g} {p.unit}"
-        _real(listed, p.name, meaning, chosen[p.name], p.unit)
-        used.add(p.unit)
-    for q in model.structure.states:
-        if q.name in (states or {}):
-            _real(listed, q.name, f"start of the {q.description}", (states or {})[q.name], q.unit)
-            used.add(q.unit)
-    _units(root, sorted(used))
+        rows.append((p.name, meaning, chosen[p.name], p.unit))
+    rows += [
+        (q.name, f"start of the {q.description}", starts[q.name], q.unit)
+        for q in model.structure.states
+        if q.name in starts
+    ]
+    listed = ET.SubElement(root, f"{{{_VALUES}}}Parameters")
+    for title, meaning, value, unit in rows:
+        head = {"name": title, "description": meaning}
+        element = ET.SubElement(listed, f"{{{_VALUES}}}Parameter", head)
+        ET.SubElement(element, f"{{{_VALUES}}}Real", {"value": number(value), "unit": unit})
+    units = ET.SubElement(root, f"{{{_VALUES}}}Units") if rows else root
+    for unit in sorted({unit for *_, unit in rows}):
+        definition = ET.SubElement(units, f"{{{_COMMON}}}Unit", {"name": unit})
+        ET.SubElement(definition, f"{{{_COMMON}}}BaseUnit", base_unit(parse_unit(unit)))
     return xml_text(root)
-
-
-def _real(listed: ET.Element, name: str, meaning: str, value: float, unit: str) -> None:
-    attributes = {"name": name, "description": meaning}
-    element = ET.SubElement(listed, f"{{{_VALUES}}}Parameter", attributes)
-    ET.SubElement(element, f"{{{_VALUES}}}Real", {"value": number(value), "unit": unit})
-
-
-def _units(root: ET.Element, names: Sequence[str]) -> None:
-    units = ET.SubElement(root, f"{{{_VALUES}}}Units") if names else root
-    for name in names:
-        unit = ET.SubElement(units, f"{{{_COMMON}}}Unit", {"name": name})
-        ET.SubElement(unit, f"{{{_COMMON}}}BaseUnit", base_unit(parse_unit(name)))
 
 
 FloatArray = npt.NDArray[np.float64]
@@ -95,70 +86,48 @@ def posterior_sets(model: Model, samples: int = SAMPLES) -> Sets:
     for, all within the bounds. Empty for a model without a covariance. The same model gives the
     same sets.
     """
-    names = model.evidence.covariance.names if model.evidence else ()
-    if not names:
+    covariance = model.evidence.covariance if model.evidence else None
+    if covariance is None or not covariance.names:
         return {}
+    names = covariance.names
     mean = np.array([model.values[n] for n in names])
     log = np.array([model.parameter(n).log for n in names])
-    factor = _factor(model, mean, log)
+    low, high = np.array([model.parameter(n).bounds for n in names]).T
+    scale = np.where(log, mean, 1.0)
+    factor = _factor(np.array(covariance.matrix) / np.outer(scale, scale))
+
+    def moved(by: FloatArray) -> FloatArray:
+        factors = np.exp(np.clip(np.where(log, by, 0.0), -_LARGEST, _LARGEST))
+        return np.asarray(np.where(log, mean * factors, mean + by), dtype=float)
+
+    def within(values: FloatArray) -> dict[str, float]:
+        """Put values with so many digits on the bounds, what has overflowed to nan on the mean."""
+        digits = [float(f"{v:.{_DIGITS}g}") for v in values.tolist()]
+        kept = np.clip(np.where(np.isnan(digits), mean, digits), low, high)
+        return dict(zip(names, kept.tolist(), strict=True))
+
     found = {"mean": dict(zip(names, mean.tolist(), strict=True))}
     for k, column in enumerate(factor.T, start=1):
-        for side, sign in (("plus", 1.0), ("minus", -1.0)):
-            moved = _moved(mean, log, sign * column)
-            found[f"sigma_{k:02d}_{side}"] = _within(model, names, moved)
-    draws = random.Random(len(names))
+        found[f"sigma_{k:02d}_plus"] = within(moved(column))
+        found[f"sigma_{k:02d}_minus"] = within(moved(-column))
+    normal, draws = NormalDist(), random.Random(len(names))
     for k in range(1, samples + 1):
-        found[f"sample_{k:02d}"] = _sample(model, names, mean, log, factor, draws)
+        for _ in range(_DRAWS):
+            z = [normal.inv_cdf(min(max(draws.random(), 1e-16), 1.0 - 1e-16)) for _ in names]
+            drawn = moved(factor @ np.array(z))
+            if np.all((low <= drawn) & (drawn <= high)):
+                break
+        found[f"sample_{k:02d}"] = within(drawn)
     return found
 
 
-def _factor(model: Model, mean: FloatArray, log: npt.NDArray[np.bool_]) -> FloatArray:
+def _factor(covariance: FloatArray) -> FloatArray:
     """Return L with L L^T = C, C positive semidefinite: a direction without spread is 0."""
-    evidence = model.evidence
-    given = np.array(evidence.covariance.matrix if evidence else (), dtype=float)
-    scale = np.where(log, mean, 1.0)
-    left = given / np.outer(scale, scale)
-    least = 1e-12 * np.diag(left)
+    left = covariance.copy()
+    least = 1e-12 * np.diag(covariance)
     factor = np.zeros_like(left)
-    for k in range(len(mean)):
+    for k in range(len(left)):
         if left[k, k] > least[k]:
             factor[k:, k] = left[k:, k] / math.sqrt(left[k, k])
             left[k:, k:] -= np.outer(factor[k:, k], factor[k:, k])
-    return np.asarray(factor, dtype=float)
-
-
-def _moved(mean: FloatArray, log: npt.NDArray[np.bool_], by: FloatArray) -> FloatArray:
-    factors = np.exp(np.clip(np.where(log, by, 0.0), -_LARGEST, _LARGEST))
-    return np.asarray(np.where(log, mean * factors, mean + by), dtype=float)
-
-
-def _sample(
-    model: Model,
-    names: Sequence[str],
-    mean: FloatArray,
-    log: npt.NDArray[np.bool_],
-    factor: FloatArray,
-    draws: random.Random,
-) -> dict[str, float]:
-    """Return one sample; the draws that leave the bounds do not count."""
-    normal = NormalDist()
-    bounds = np.array([model.parameter(n).bounds for n in names])
-    for _ in range(_DRAWS):
-        z = [normal.inv_cdf(min(max(draws.random(), 1e-16), 1.0 - 1e-16)) for _ in names]
-        moved = _moved(mean, log, factor @ np.array(z))
-        if np.all((bounds[:, 0] <= moved) & (moved <= bounds[:, 1])):
-            break
-    return _within(model, names, moved)
-
-
-def _within(model: Model, names: Sequence[str], values: FloatArray) -> dict[str, float]:
-    """Return values with so many digits, put on the bounds where they leave them.
-
-    What has overflowed to no number at all stays at the mean.
-    """
-    found = {}
-    for name, value in zip(names, values.tolist(), strict=True):
-        low, high = model.parameter(name).bounds
-        digits = model.values[name] if math.isnan(value) else float(f"{value:.{_DIGITS}g}")
-        found[name] = min(max(digits, low), high)
-    return found
+    return factor

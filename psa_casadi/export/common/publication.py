@@ -71,19 +71,14 @@ def copyright_line() -> str:
 def license_text(model: Model, fmi: int) -> str:
     """Return the text of documentation/licenses/license.txt: terms and notices of all parts."""
     lines = [f"   {name}: {text}\n" for name, text in model.publication.stated.items()]
+    header = (files("fmpy") / "c-code" / _HEADERS[fmi]).read_text(encoding="utf-8")
+    notice = header[header.index("Copyright") :].partition("*/")[0].splitlines()  # first comment
     return _LICENSES.format(
         name=model.name,
         model="".join(lines) or "   no terms are stated: ask whoever gave you this FMU\n",
         code=code_license(),
-        headers=_notice((files("fmpy") / "c-code" / _HEADERS[fmi]).read_text(encoding="utf-8")),
+        headers="\n".join(line.strip() for line in notice).rstrip() + "\n",
     )
-
-
-def _notice(header: str) -> str:
-    """Return copyright and licence out of the first comment of a header."""
-    comment = header.replace("\r\n", "\n").partition("/*")[2].partition("*/")[0]
-    lines = [line.strip() for line in comment[comment.index("Copyright") :].splitlines()]
-    return "\n".join(lines).rstrip() + "\n"
 
 
 def refuse_foreign(structure: Structure, what: str) -> None:

@@ -1,13 +1,14 @@
 """The variables of an exported model in the order of their value references."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.scales import velocity_scale
 from psa_casadi.units import rate_unit
-from psa_casadi.variables import nominal_value
+from psa_casadi.variables import Input, Output, State, nominal_value
 
 
 @dataclass(frozen=True)
@@ -59,16 +60,6 @@ def starts_at_voltage(model: Model) -> bool:
     return "voltage" in model.input_names and not model.structure.sampled
 
 
-def _start_voltage(model: Model) -> Variable:
-    """Return the parameter whose value other than that of the export settles the states anew."""
-    voltage = next(i for i in model.structure.inputs if i.name == "voltage")
-    return Variable(
-        START_VOLTAGE, "option", START_INDEX, voltage.unit,
-        "voltage at which it begins settled; at this value with the start values given here",
-        voltage.display_unit, voltage.start, nominal_value(voltage.nominal, model.values),
-    )  # fmt: skip
-
-
 def variable_table(model: Model) -> tuple[Variable, ...]:
     """Return time, states, derivatives, inputs, outputs, parameters, indicators, sampled states.
 
@@ -81,29 +72,24 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
     Raises InputError if two variables share a name or the model has no state.
     """
     s, values = model.structure, model.values
+
+    def declared(kind: str, listed: Sequence[State | Input | Output]) -> Iterator[Variable]:
+        for i, q in enumerate(listed):
+            shown = _SHOWN if kind == "state" and q.nominal is velocity_scale else 1.0
+            start = None if isinstance(q, Output) else q.start
+            size = shown * nominal_value(q.nominal, values)
+            yield Variable(q.name, kind, i, q.unit, q.description, q.display_unit, start, size)
+
     table = [
         Variable("time", "time", 0, "s", "simulation time"),
-        *(
-            Variable(q.name, "state", i, q.unit, q.description, q.display_unit, q.start,
-                     (_SHOWN if q.nominal is velocity_scale else 1.0)
-                     * nominal_value(q.nominal, values))
-            for i, q in enumerate(s.states)
-        ),
+        *declared("state", s.states),
         *(
             Variable(f"der({q.name})", "derivative", i, rate_unit(q.unit),
                      f"rate of {q.description}")
             for i, q in enumerate(s.states)
         ),
-        *(
-            Variable(q.name, "input", i, q.unit, q.description, q.display_unit, q.start,
-                     nominal_value(q.nominal, values))
-            for i, q in enumerate(s.inputs)
-        ),
-        *(
-            Variable(q.name, "output", i, q.unit, q.description, q.display_unit, None,
-                     nominal_value(q.nominal, values))
-            for i, q in enumerate(s.outputs)
-        ),
+        *declared("input", s.inputs),
+        *declared("output", s.outputs),
         *(
             Variable(q.name, "parameter", i, q.unit, q.description, q.display_unit, values[q.name],
                      abs(values[q.name]) or q.typical(values), q.bounds)
@@ -114,14 +100,18 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
                      f"zero where derivatives have a kink: {name.replace('_', ' ')}")
             for i, name in enumerate(s.switches)
         ),
-        *(
-            Variable(q.name, "sampled", i, q.unit, q.description, q.display_unit, q.start,
-                     nominal_value(q.nominal, values))
-            for i, q in enumerate(s.sampled)
-        ),
+        *declared("sampled", s.sampled),
         *([INPUT_LINE] if s.inputs else []),
-        *([_start_voltage(model)] if starts_at_voltage(model) else []),
     ]  # fmt: skip
+    if starts_at_voltage(model):
+        voltage = next(v for v in table if v.kind == "input" and v.name == "voltage")
+        meaning = (
+            "voltage at which it begins settled; at this value with the start values given here"
+        )
+        option = replace(
+            voltage, name=START_VOLTAGE, kind="option", index=START_INDEX, description=meaning
+        )
+        table.append(option)
     _refuse(model, table)
     return tuple(table)
 

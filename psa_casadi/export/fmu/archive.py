@@ -4,6 +4,7 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from psa_casadi.errors import InputError
@@ -14,10 +15,8 @@ from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.evidence import (
-    META_DATA,
-    PAGE,
-    EvidenceFiles,
     evidence_files,
+    related_files,
     with_validity,
 )
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
@@ -121,19 +120,17 @@ def _companions(model: Model, fmi: int, samples: int, fixed: FixedStep | None) -
     A model that cannot be simulated with its own values is exported without a reference run, and so
     is one with a fixed step, which takes neither the run's parameters nor any step of its rows.
     """
-    evidence = EvidenceFiles()
-    try:
+    evidence: dict[str, bytes] = {}
+    entries: dict[str, bytes] = {}
+    step, use = None, ""
+    with suppress(SimulationError):
         evidence = evidence_files(model, samples)
-        entries, step = reference_entries(model, evidence.related), held_step(model)
-    except SimulationError:
-        entries, step = {}, None
+        related = related_files(model, evidence)
+        entries, step = reference_entries(model, related), held_step(model)
+    entries = {**entries, **evidence}
     if fixed is not None:
-        entries = {FIXED_ENTRY: fixed_entry(fixed)}
-        page = documentation(model, reference_run=False, step=step, use=use_of(fixed))
-    else:
-        more = {n: evidence.related[n].meaning for n in (PAGE, META_DATA) if n in evidence.related}
-        page = documentation(model, reference_run=bool(entries), step=step, more=more)
-        entries |= evidence.entries
+        entries, use = {FIXED_ENTRY: fixed_entry(fixed)}, use_of(fixed)
+    page = documentation(model, places=entries, step=step, use=use)
     entries[DOCUMENTATION_ENTRY] = page.encode("utf-8")
     entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])

@@ -13,7 +13,6 @@ from xml.etree import ElementTree as ET
 
 import casadi as ca
 
-from psa_casadi.component import Expression
 from psa_casadi.export.common.markup import (
     base_unit,
     default_span,
@@ -47,8 +46,24 @@ def dependencies(structure: Structure) -> dict[Key, dict[Key, str]]:
     At a sample instant a sampled state follows from these and from the sampled states before it,
     so that what depends on it depends on all of them; keys of kind "sampled" stand for the latter.
     """
-    direct = _direct(structure)
-    result: dict[Key, dict[Key, str]] = {}
+    s = structure
+    variables = {"time": s.time, "state": s.x, "input": s.u, "parameter": s.p, "sampled": s.z}
+    switches = ca.vertcat(ca.SX(0, 1), *s.switches.values())
+    values = {"derivative": s.xdot, "output": s.y, "indicator": switches, "next": s.znext}
+    knowns, unknowns = (
+        [(kind, i) for kind, column in columns.items() for i in range(column.numel())]
+        for columns in (variables, values)
+    )
+    jacobian = ca.jacobian(ca.vertcat(*values.values()), ca.vertcat(*variables.values()))
+    tunable = {p.name for p in s.parameters}
+    direct: dict[Key, dict[Key, str]] = {u: {} for u in unknowns}
+    for row, column, entry in zip(
+        *jacobian.sparsity().get_triplet(), jacobian.nonzeros(), strict=True
+    ):
+        names = {str(symbol) for symbol in ca.symvar(entry)}
+        varied = "tunable" if names <= tunable else "dependent"
+        direct[unknowns[row]][knowns[column]] = varied if names else "constant"
+    result = {}
     for unknown, found in direct.items():
         if unknown[0] != "next":
             sources = [direct["next", index] for kind, index in found if kind == "sampled"]
@@ -76,33 +91,6 @@ def without_sampled(found: dict[Key, str]) -> dict[Key, str]:
     return {key: how for key, how in found.items() if key[0] != "sampled"}
 
 
-def _direct(structure: Structure) -> dict[Key, dict[Key, str]]:
-    """Return the same between instants, and what the sampled states ("next") follow from at one."""
-    s = structure
-    sizes = (("time", 1), ("state", len(s.states)), ("input", len(s.inputs)))
-    groups = (*sizes, ("parameter", len(s.parameters)), ("sampled", len(s.sampled)))
-    knowns: list[Key] = [(kind, i) for kind, size in groups for i in range(size)]
-    unknowns: list[Key] = [("derivative", i) for i in range(len(s.states))]
-    unknowns += [("output", i) for i in range(len(s.outputs))]
-    unknowns += [("indicator", i) for i in range(len(s.switches))]
-    unknowns += [("next", i) for i in range(len(s.sampled))]
-    values = ca.vertcat(s.xdot, s.y, *s.switches.values(), s.znext)
-    jacobian = ca.jacobian(values, ca.vertcat(s.time, s.x, s.u, s.p, s.z))
-    tunable = {p.name for p in s.parameters}
-    result: dict[Key, dict[Key, str]] = {u: {} for u in unknowns}
-    rows, columns = jacobian.sparsity().get_triplet()
-    for row, column, entry in zip(rows, columns, jacobian.nonzeros(), strict=True):
-        result[unknowns[row]][knowns[column]] = _kind(entry, tunable)
-    return result
-
-
-def _kind(entry: Expression, tunable: set[str]) -> str:
-    names = {str(symbol) for symbol in ca.symvar(entry)}
-    if not names:
-        return "constant"
-    return "tunable" if names <= tunable else "dependent"
-
-
 #: Log categories; the last one is shown only when debug logging is on.
 LOG_CATEGORIES = {
     "logStatusWarning": "calls that succeeded, but look wrong",
@@ -110,49 +98,23 @@ LOG_CATEGORIES = {
     "logStatusError": "calls that are not allowed or impossible",
     "logSolver": "cost of each communication step",
 }
-_FLAGS_2 = dict.fromkeys(
-    (
-        "canNotUseMemoryManagementFunctions",
-        "canGetAndSetFMUstate",
-        "canSerializeFMUstate",
-        "providesDirectionalDerivative",
+#: What each version's interfaces are capable of: of both, of co-simulation, and of that without a
+#: fixed step. FMI 2 has no word for multiples of a step.
+_ABLE = {
+    2: (
+        ("canNotUseMemoryManagementFunctions", "canGetAndSetFMUstate", "canSerializeFMUstate",
+         "providesDirectionalDerivative"),
+        ("canHandleVariableCommunicationStepSize", "canInterpolateInputs"),
+        ("canHandleVariableCommunicationStepSize",),
     ),
-    "true",
-)
-_FLAGS_3 = dict.fromkeys(
-    (
-        "canGetAndSetFMUState",
-        "canSerializeFMUState",
-        "providesDirectionalDerivatives",
-        "providesAdjointDerivatives",
-        "providesEvaluateDiscreteStates",
+    3: (
+        ("canGetAndSetFMUState", "canSerializeFMUState", "providesDirectionalDerivatives",
+         "providesAdjointDerivatives", "providesEvaluateDiscreteStates"),
+        ("canHandleVariableCommunicationStepSize", "providesIntermediateUpdate",
+         "canReturnEarlyAfterIntermediateUpdate", "hasEventMode"),
+        ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"),
     ),
-    "true",
-)
-#: What each version's interfaces are capable of.
-_FLAGS = {
-    (2, "ModelExchange"): _FLAGS_2,
-    (2, "CoSimulation"): {
-        **_FLAGS_2,
-        "canHandleVariableCommunicationStepSize": "true",
-        "canInterpolateInputs": "true",
-        "maxOutputDerivativeOrder": "1",
-    },
-    (3, "ModelExchange"): {**_FLAGS_3, "needsCompletedIntegratorStep": "false"},
-    (3, "CoSimulation"): {
-        **_FLAGS_3,
-        "canHandleVariableCommunicationStepSize": "true",
-        "providesIntermediateUpdate": "true",
-        "canReturnEarlyAfterIntermediateUpdate": "true",
-        "hasEventMode": "true",
-        "maxOutputDerivativeOrder": "1",
-    },
-}
-#: What an FMU with a fixed step does not claim. FMI 2 has no word for multiples of a step.
-_NOT_FIXED = {
-    2: ("canHandleVariableCommunicationStepSize",),
-    3: ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"),
-}
+}  # fmt: skip
 _CONTINUOUS = {"variability": "continuous"}
 #: Causality, variability and initial of each kind of variable; the same words in both versions.
 _CAUSALITY = {
@@ -183,13 +145,20 @@ def model_description(
     `fixed` step there is no model exchange, and parameters are constants.
     """
     second, table = fmi == 2, variable_table(model)
+    said = describe(model)
+    if fixed:
+        said += (
+            f" Co-simulation by a fixed step of {fixed.plan.step:g} s, of which a communication"
+            f" step is a multiple; largest error {fixed.worst.error:.1e} of the range"
+            f" ({fixed.worst.voltage})."
+        )
     root = ET.Element(
         "fmiModelDescription",
         {
             "fmiVersion": f"{fmi}.0",
             "modelName": model.name,
             "guid" if second else "instantiationToken": token,
-            "description": describe(model) + (_step_words(fixed) if fixed else ""),
+            "description": said,
             **published(model),
             "generationTool": generation_tool(),
             "variableNamingConvention": "structured",
@@ -197,16 +166,7 @@ def model_description(
     )
     if second:
         root.set("numberOfEventIndicators", str(len(model.structure.switches)))
-    for tag in ("CoSimulation",) if fixed else ("ModelExchange", "CoSimulation"):
-        flags = {"modelIdentifier": identifier, **_FLAGS[fmi, tag]}
-        if fixed:
-            flags = {name: flag for name, flag in flags.items() if name not in _NOT_FIXED[fmi]}
-        if fixed and not second:
-            flags["fixedInternalStepSize"] = number(fixed.plan.step)
-        interface = ET.SubElement(root, tag, flags)
-        files = ET.SubElement(interface, "SourceFiles") if second else interface
-        for name in sorted(sources) if second else ():
-            ET.SubElement(files, "File", {"name": name})
+    _interfaces(root, identifier, sources, fmi, fixed)
     _units(root, table)
     _types(root, table, second=second)
     categories = ET.SubElement(root, "LogCategories")
@@ -226,12 +186,26 @@ def model_description(
     return xml_text(root)
 
 
-def _step_words(fixed: FixedStep) -> str:
-    worst = fixed.worst
-    return (
-        f" Co-simulation by a fixed step of {fixed.plan.step:g} s, of which a communication step is"
-        f" a multiple; largest error {worst.error:.1e} of the range ({worst.voltage})."
-    )
+def _interfaces(
+    root: ET.Element, identifier: str, sources: Sequence[str], fmi: int, fixed: FixedStep | None
+) -> None:
+    """Append ModelExchange and CoSimulation: what they are capable of."""
+    always, stepping, not_fixed = _ABLE[fmi]
+    for tag in ("CoSimulation",) if fixed else ("ModelExchange", "CoSimulation"):
+        able = (*always, *stepping) if tag == "CoSimulation" else always
+        left_out = not_fixed if fixed else ()
+        flags = {"modelIdentifier": identifier}
+        flags |= {name: "true" for name in able if name not in left_out}
+        if tag == "CoSimulation":
+            flags["maxOutputDerivativeOrder"] = "1"
+        elif fmi == 3:
+            flags["needsCompletedIntegratorStep"] = "false"
+        if fixed and fmi == 3:
+            flags["fixedInternalStepSize"] = number(fixed.plan.step)
+        interface = ET.SubElement(root, tag, flags)
+        files = ET.SubElement(interface, "SourceFiles") if fmi == 2 else interface
+        for name in sorted(sources) if fmi == 2 else ():
+            ET.SubElement(files, "File", {"name": name})
 
 
 def _units(root: ET.Element, table: Iterable[Variable]) -> None:

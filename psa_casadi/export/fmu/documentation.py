@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -12,14 +12,25 @@ from psa_casadi.export.common.markup import force_scale, generation_tool, time_s
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.common.variable_table import Variable, starts_at_voltage, variable_table
+from psa_casadi.export.fmu.evidence import META_DATA, PAGE, RELATED
 from psa_casadi.export.fmu.reference_run import FOLDER, NOTES, SHARE, STEPS_PER_PERIOD, HeldStep
 from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import STACKS, Figure
+from psa_casadi.model.stacks import STACKS
 from psa_casadi.units import convert
 
 ENTRY = "documentation/index.html"
 #: Movement within the time that the model needs to settle, over the nominal size, that is none.
 _AT_REST = 1e-6
+#: What it says of the files of the archive; the first two are always there.
+_FILES = {
+    "sources/README.txt": "how to compile the sources: one line, no other library",
+    LICENSE_ENTRY: "the terms of the model, and the notices of the C code",
+    NOTES: "a run to try an importer on, with the outputs to expect",
+    f"{FOLDER}/parameters.ssv": "the parameter values as a parameter set (SSP 1.0)",
+    PAGE: RELATED[PAGE][2],
+    META_DATA: RELATED[META_DATA][2],
+}
+_ALWAYS = tuple(_FILES)[:2]
 _KINDS = {
     "input": "Inputs",
     "output": "Outputs",
@@ -31,15 +42,14 @@ _KINDS = {
 def documentation(
     model: Model,
     *,
-    reference_run: bool = True,
+    places: Collection[str] = (),
     step: HeldStep | None = None,
-    more: Mapping[str, str] | None = None,
     use: str = "",
 ) -> str:
     """Return a page of its own, without any file beside it: equations, sources, tables.
 
-    `reference_run` says whether the archive holds one, with its notes; `step` is the communication
-    step that was measured on it. `more` are further files to name: what they are, by their place.
+    `places` are those of the files of the archive that it may name; `step` is the communication
+    step that was measured on the reference run.
     `use` tells how the FMU integrates, where that is not with a solver.
     Raises InputError for a character that HTML cannot carry.
     """
@@ -47,15 +57,16 @@ def documentation(
     rates, outputs = (np.array(v).ravel() for v in s.f(*model.at_start()))
     moved = np.abs(rates) * time_scale(model) / model.state_nominals()
     stated = model.publication.stated.items()
-    files = {
-        "sources/README.txt": "how to compile the sources: one line, no other library",
-        LICENSE_ENTRY: "the terms of the model, and the notices of the C code",
+    starts = {v.name: v.start for v in table}
+    starts |= dict(zip(model.output_names, outputs.tolist(), strict=True))
+    interface = {
+        title: [
+            (v.name, v.unit, _shown(v.nominal, v, 3), _shown(starts[v.name], v), v.description)
+            for v in table
+            if v.kind == kind
+        ]
+        for kind, title in _KINDS.items()
     }
-    if reference_run:
-        files |= {
-            NOTES: "a run to try an importer on, with the outputs to expect",
-            f"{FOLDER}/parameters.ssv": "the parameter values as a parameter set (SSP 1.0)",
-        }
     text = filled(
         "documentation.html",
         model=model,
@@ -73,11 +84,11 @@ def documentation(
         voltage=next((i.start for i in s.inputs if i.name == "voltage"), None),
         rests=np.max(moved, initial=0.0) < _AT_REST,
         settles=starts_at_voltage(model),
-        interface=_interface(table, dict(zip(model.output_names, outputs.tolist(), strict=True))),
+        interface=interface,
         indicators=[(v.name, v.description) for v in table if v.kind == "indicator"],
         components=_components(model),
         parameters=_parameters(model, table),
-        files={**files, **(more or {})}.items(),
+        files=[it for it in _FILES.items() if it[0] in places or it[0] in _ALWAYS],
         tool=generation_tool(),
     )
     check_text(text, "The page on the model")
@@ -102,47 +113,18 @@ def _shown(value: float | None, variable: Variable, digits: int = 6) -> str:
     return shown if unit == "1" else f"{shown} {unit}"
 
 
-def _interface(
-    table: Sequence[Variable], outputs: Mapping[str, float]
-) -> dict[str, list[tuple[str, ...]]]:
-    """Return what is shown of inputs, outputs and states, by the title of their table."""
-    return {
-        title: [
-            (
-                v.name,
-                v.unit,
-                _shown(v.nominal, v, 3),
-                _shown(outputs.get(v.name, v.start), v),
-                v.description,
-            )
-            for v in table
-            if v.kind == kind
-        ]
-        for kind, title in _KINDS.items()
-    }
-
-
-def _figures(model: Model) -> dict[str, Figure]:
-    """Return the sources of the values that are still those of the named stack."""
-    for stack in STACKS.values():
-        if re.sub(r"\W", "_", stack.name) == model.name:
-            values = model.values
-            return {n: f for n, f in stack.values.items() if values.get(n) == f.value}
-    return {}
-
-
 def _parameters(model: Model, table: Sequence[Variable]) -> dict[str, object]:
-    intervals, figures = model.provenance.intervals, _figures(model)
+    """Return heads and rows; a source is that of a value that is still the named stack's."""
+    named = [k for k in STACKS.values() if re.sub(r"\W", "_", k.name) == model.name]
+    figures = {n: f for k in named for n, f in k.values.items() if model.values.get(n) == f.value}
     rows = []
     for v in (v for v in table if v.kind == "parameter"):
-        found = intervals.get(v.name)
+        found, figure = model.provenance.intervals.get(v.name), figures.get(v.name)
         interval = f"{_shown(found.low, v)} to {_shown(found.high, v)}" if found else ""
         low, high = (_shown(b, v) if math.isfinite(b) else "" for b in v.bounds or ())
-        figure = figures.get(v.name)
         source = ("assumed: " if figure.assumed else "") + figure.source if figure else ""
-        name_and_value = (v.name, _shown(v.start, v), interval)
-        rows.append((*name_and_value, f"{low} to {high}", v.description, source))
+        row = (v.name, _shown(v.start, v), interval, f"{low} to {high}", v.description, source)
+        rows.append(row)
     heads = ("name", "value", "95 % interval", "allowed", "meaning", "source of the value")
     kept = [i for i, _ in enumerate(heads) if i < 2 or any(r[i] for r in rows)]
-    chosen = [[r[i] for i in kept] for r in rows]
-    return {"heads": [heads[i] for i in kept], "rows": chosen}
+    return {"heads": [heads[i] for i in kept], "rows": [[r[i] for i in kept] for r in rows]}

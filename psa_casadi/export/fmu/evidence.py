@@ -5,8 +5,8 @@ Sources: SSP Traceability 1.0 (SRMD and its place in an FMU), FMI-LS-REF 1.0.0-b
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -24,14 +24,20 @@ from psa_casadi.export.fmu.reference_run import (
     FOLDER,
     OWN_TOLERANCE,
     SSV,
-    Experiment,
     Related,
     csv_table,
     experiments,
     rounded,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.model.evidence import Covariance, Evidence, RecordRun, ReferenceRun
+from psa_casadi.model.evidence import (
+    Covariance,
+    ErrorShare,
+    Evidence,
+    RecordRun,
+    ReferenceRun,
+    SeenRange,
+)
 from psa_casadi.simulation.stepper import run
 
 
@@ -63,21 +69,16 @@ def with_validity(model: Model) -> Model:
     return replace(extended, evidence=model.evidence)
 
 
-def seen_inputs(model: Model) -> list[Sequence[float]]:
+def seen_inputs(model: Model) -> list[tuple[float, float, float]]:
     """Return least, largest value and rate of each input in the records, infinite if not known."""
-    rows: list[Sequence[float]] = []
+    rows = []
     seen = model.evidence.seen if model.evidence else None
-    for i in model.structure.inputs:
-        known = {"voltage": seen.voltage, "temperature": seen.temperature} if seen else {}
-        found = known.get(i.name)
+    known = {"voltage": seen.voltage, "temperature": seen.temperature} if seen else {}
+    for name in model.input_names:
+        found = known.get(name)
         low, high = (found.low, found.high) if found else (-math.inf, math.inf)
-        rows.append((low, high, seen.rate if seen and i.name == "voltage" else math.inf))
+        rows.append((low, high, seen.rate if seen and name == "voltage" else math.inf))
     return rows
-
-
-def seen_duration(model: Model) -> float:
-    """Return the duration of the longest record [s], infinite if not known."""
-    return model.evidence.seen.duration if model.evidence else math.inf
 
 
 NOT_HELD_OUT = "no sample was held out; `psa diagnose` holds some out and judges the model on them"
@@ -87,66 +88,56 @@ NOT_HELD_OUT = "no sample was held out; `psa diagnose` holds some out and judges
 Said = tuple[str, str]
 
 
-@dataclass(frozen=True)
-class Chapter:
-    """A part of the evidence: its name for machines, its title, and what is said there."""
+def chapters(model: Model) -> list[tuple[str, str, list[Said]]]:
+    """Return what is known of a model's origin, errors, range and uncertainty.
 
-    name: str
-    title: str
-    said: tuple[Said, ...]
-
-
-def chapters(model: Model) -> tuple[Chapter, ...]:
-    """Return what is known of a model's origin, errors, range and uncertainty."""
+    Each part has a name for machines, a title, and what is said there.
+    """
     evidence = model.evidence
     if evidence is None:
-        return ()
+        return []
     origin = ("found by", f"{evidence.by}, psa_casadi {model.provenance.package_version}")
-    parts: tuple[tuple[str, str, Iterable[Said]], ...] = (
-        ("origin", "Where it comes from", (origin, *_records(evidence.runs))),
-        ("error", "What it errs by", _errors(evidence)),
-        ("budget", "Where the error goes", _budget(evidence)),
-        ("validity", "What the records have shown", _seen(evidence)),
-        ("covariance", "How sure the values are", _sure(model, evidence.covariance)),
-    )
-    found = (Chapter(name, title, tuple(said)) for name, title, said in parts)
-    return tuple(c for c in found if c.said)
+    parts: dict[str, tuple[str, Iterable[Said]]] = {
+        "origin": ("Where it comes from", (origin, *_records(evidence.runs))),
+        "error": ("What it errs by", _errors(evidence)),
+        "budget": ("Where the error goes", _budget(evidence)),
+        "validity": ("What the records have shown", _seen(evidence.seen)),
+        "covariance": ("How sure the values are", _sure(model, evidence.covariance)),
+    }
+    found = [(name, title, list(said)) for name, (title, said) in parts.items()]
+    return [part for part in found if part[2]]
 
 
-def micrometres(metres: float) -> str:
-    """Return a length as people read it."""
+def _um(metres: float) -> str:
     return f"{1e6 * metres:.4g} um"
 
 
 def _records(runs: Iterable[RecordRun]) -> Iterator[Said]:
     for r in runs:
         blocks = f", each the mean of {r.averaged}" if r.averaged > 1 else ""
-        errors = f"fitted to {micrometres(r.fitted_m)} rms"
+        errors = f"fitted to {_um(r.fitted_m)} rms"
         if r.held_out_m is not None:
             count = sum(stop - first for first, stop in r.held_out)
-            errors += f", {micrometres(r.held_out_m)} rms over {count} held-out ones"
+            errors += f", {_um(r.held_out_m)} rms over {count} held-out ones"
         yield ("record", f"{r.record}, sha256 {r.sha256}: {r.samples} samples{blocks}; {errors}")
 
 
 def _errors(evidence: Evidence) -> Iterator[Said]:
-    yield ("fitted error", f"{micrometres(evidence.fitted_m)} rms over the samples of the fit")
-    held = evidence.held_out
-    if held is None:
-        yield ("held-out error", NOT_HELD_OUT)
-    else:
-        low, high = held.interval_m.low, held.interval_m.high
+    yield ("fitted error", f"{_um(evidence.fitted_m)} rms over the samples of the fit")
+    held, said = evidence.held_out, NOT_HELD_OUT
+    if held is not None:
         over = f"{held.records} records" if held.records else "blocks of the records"
-        yield (
-            "held-out error",
-            f"{micrometres(held.rms_m)} rms, 95 % interval {micrometres(low)} to"
-            f" {micrometres(high)} (jackknife over {over}); {held.nrmse_percent:.3g} % of the"
-            f" range; at most {micrometres(held.max_m)}",
+        said = (
+            f"{_um(held.rms_m)} rms, 95 % interval {_um(held.interval_m.low)} to"
+            f" {_um(held.interval_m.high)} (jackknife over {over}); {held.nrmse_percent:.3g} % of"
+            f" the range; at most {_um(held.max_m)}"
         )
+    yield ("held-out error", said)
     if evidence.outside:
+        left = ", ".join(evidence.outside)
         yield (
             "counted with",
-            f"{', '.join(evidence.outside)}: of sensor or environment, which an exported plant"
-            " leaves out",
+            f"{left}: of sensor or environment, which an exported plant leaves out",
         )
 
 
@@ -155,35 +146,28 @@ def _budget(evidence: Evidence) -> Iterator[Said]:
     b = evidence.budget
     if b is None:
         return
-    yield ("base", f"{micrometres(b.base_m)} rms above the noise, without the causes")
-    yield ("noise", f"{micrometres(b.noise_m)} rms")
+    yield ("base", f"{_um(b.base_m)} rms above the noise, without the causes")
+    yield ("noise", f"{_um(b.noise_m)} rms")
     for effect in b.causes:
-        yield ("effect", f"{effect.what}: {_share(effect.share, effect.interval)}")
+        yield ("effect", _share(effect))
     if b.unnamed is not None:
-        share = _share(b.unnamed.share, b.unnamed.interval)
-        yield ("unnamed correction outside", f"{b.unnamed.what}: {share}; the model lacks it")
-    yield (
-        "remains", f"{micrometres(b.remains_m)} rms above the noise, {b.remains_percent:.3g} % of"
-        " the range"
-    )  # fmt: skip
+        yield ("unnamed correction outside", f"{_share(b.unnamed)}; the model lacks it")
+    remains = f"{_um(b.remains_m)} rms above the noise, {b.remains_percent:.3g} % of the range"
+    yield ("remains", remains)
 
 
-def _share(share: float, interval: object) -> str:
-    ends = (share, *(getattr(interval, end) for end in ("low", "high")))
+def _share(it: ErrorShare) -> str:
+    ends = (it.share, it.interval.low, it.interval.high)
     percent, low, high = (100.0 * min(max(v, 0.0), 1.0) for v in ends)  # cut as in every page
-    return f"{percent:.3g} % of the error, 95 % interval {low:.3g} to {high:.3g} %"
+    return f"{it.what}: {percent:.3g} % of the error, 95 % interval {low:.3g} to {high:.3g} %"
 
 
-def _seen(evidence: Evidence) -> Iterator[Said]:
-    seen = evidence.seen
+def _seen(seen: SeenRange) -> Iterator[Said]:
+    warm = seen.temperature
     yield ("voltage", f"{seen.voltage.low:.6g} to {seen.voltage.high:.6g} V")
     yield ("rate of voltage", f"up to {seen.rate:.4g} V/s")
     yield ("duration", f"up to {seen.duration:.4g} s from the start of a run")
-    warm = seen.temperature
-    yield (
-        "temperature",
-        "not recorded" if warm is None else f"{warm.low:.6g} to {warm.high:.6g} K",
-    )
+    yield ("temperature", f"{warm.low:.6g} to {warm.high:.6g} K" if warm else "not recorded")
 
 
 def _sure(model: Model, c: Covariance) -> Iterator[Said]:
@@ -208,39 +192,49 @@ VALIDATION, UNCERTAINTY = f"{FOLDER}/validation.exp", f"{FOLDER}/uncertainty.exp
 INPUTS, OUTPUTS = f"{FOLDER}/validation_in.csv", f"{FOLDER}/validation_ref.csv"
 MEASURED, START = f"{FOLDER}/validation_measured.csv", f"{FOLDER}/validation.ssv"
 
+#: MIME type, role and meaning of each file; {run} is the run that is to be repeated.
+RELATED: dict[str, Related] = {
+    PAGE: ("text/html", "report", "records, errors, range and uncertainty"),
+    META_DATA: ("application/x-srmd-meta-data", "meta-data", "the same for machines"),
+    SETS: (SSV, "parameter", "values within their uncertainty: {set}"),
+    START: (SSV, "parameter", "all parameters, and the states at the start of the run"),
+    INPUTS: (CSV, "other", "inputs of {run}"),
+    OUTPUTS: (CSV, "result", "what the model says of {run}"),
+    MEASURED: (CSV, "result", "what was measured in {run}, without the offset"),
+    VALIDATION: (EXP, "experiment/validation", "{run}"),
+    UNCERTAINTY: (
+        EXP, "experiment/uncertainty-analysis",
+        "the same voltage with each parameter set, from the FMU's own start"),
+}  # fmt: skip
 _SRMD = "http://ssp-standard.org/SSPTraceability1/SimulationResourceMetaData"
 _STC = "http://ssp-standard.org/SSPTraceability1/SSPTraceabilityCommon"
 
 
-@dataclass(frozen=True)
-class EvidenceFiles:
-    """Files by their place in the archive, and what the manifest says of each."""
-
-    entries: Mapping[str, bytes] = field(default_factory=dict)
-    related: Mapping[str, Related] = field(default_factory=dict)
-
-
-def evidence_files(model: Model, samples: int) -> EvidenceFiles:
-    """Return the evidence of a model as files; none for a model without evidence.
+def evidence_files(model: Model, samples: int) -> dict[str, bytes]:
+    """Return the evidence of a model as files by place; none for a model without evidence.
 
     `samples` is the number of random parameter sets; with 0 there are no sets at all. Raises
     SimulationError if the run that is to be repeated cannot be simulated.
     """
-    if model.evidence is None:
-        return EvidenceFiles()
-    sets = set_files(model, samples)
     texts = evidence_texts(model, samples)
-    related = {
-        PAGE: Related("text/html", "report", "records, errors, range and uncertainty"),
-        META_DATA: Related("application/x-srmd-meta-data", "meta-data", "the same for machines"),
-    }
-    for place in sets:
-        meaning = f"values within their uncertainty: {_set_name(place)}"
-        related[place] = Related(SSV, "parameter", meaning)
-    if model.evidence.reference is not None:
-        texts[OUTPUTS] = _outputs(model)
-        related |= _related_run(model.evidence.reference, spread=bool(sets))
-    return EvidenceFiles({n: t.encode("utf-8") for n, t in texts.items()}, related)
+    if START in texts:
+        times, inputs = run_inputs(model)
+        start = np.array(list(run_start(model).values()))
+        found = run(model, times, inputs, start, rtol=OWN_TOLERANCE)
+        texts[OUTPUTS] = csv_table(("time", *model.output_names), times, rounded(found.y))
+    return {place: text.encode("utf-8") for place, text in texts.items()}
+
+
+def related_files(model: Model, places: Collection[str]) -> dict[str, Related]:
+    """Return what the manifest says of files of evidence at these places."""
+    reference = model.evidence.reference if model.evidence else None
+    run_ = _said(reference) if reference else ""
+    found = {}
+    for known, (kind, role, meaning) in RELATED.items():
+        for place in places:
+            if place == known or place.startswith(f"{known}/"):
+                found[place] = kind, role, meaning.format(run=run_, set=_set_name(place))
+    return found
 
 
 def evidence_texts(model: Model, samples: int) -> dict[str, str]:
@@ -249,8 +243,30 @@ def evidence_texts(model: Model, samples: int) -> dict[str, str]:
         return {}
     sets = set_files(model, samples)
     texts = {PAGE: evidence_page(model), META_DATA: meta_data(model), **sets}
-    if model.evidence.reference is not None:
-        texts |= _run_files(model, model.evidence.reference, tuple(sets))
+    reference = model.evidence.reference
+    if reference is None:
+        return texts
+    times, inputs = run_inputs(model)
+    again = model.evidence.run_of(reference.record)
+    valid = [
+        (t, y - (again.offset_m if again else 0.0))
+        for t, y in zip(reference.time, reference.displacement, strict=True)
+        if y is not None
+    ]
+    measured = np.array(valid).reshape(len(valid), 2)
+    stimuli = {"Stimuli": _beside(INPUTS)}
+    files = {"Parameters": _beside(START), **stimuli, "References": _beside(OUTPUTS)}
+    texts |= {
+        START: parameter_set(model, name="validation", states=run_start(model)),
+        INPUTS: csv_table(("time", *model.input_names), times, inputs),
+        MEASURED: csv_table(("time", "displacement"), measured[:, 0], rounded(measured[:, 1:])),
+        VALIDATION: experiments("validation", times, [("record", _said(reference), files)]),
+    }
+    if sets:
+        spread = [
+            (_set_name(p), "a parameter set", {"Parameters": _beside(p), **stimuli}) for p in sets
+        ]
+        texts[UNCERTAINTY] = experiments("uncertainty", times, spread)
     return texts
 
 
@@ -263,11 +279,8 @@ def set_files(model: Model, samples: int) -> dict[str, str]:
 def evidence_page(model: Model) -> str:
     """Return the page on a model's evidence."""
     listed = [
-        {
-            "title": chapter.title,
-            "shown": [s for s in chapter.said if not s[0].startswith("covariance")],
-        }
-        for chapter in chapters(model)
+        {"title": title, "shown": [s for s in said if not s[0].startswith("covariance")]}
+        for _, title, said in chapters(model)
     ]
     text = filled(
         "evidence.html", title=f"{model.name}: evidence", chapters=listed, validation=VALIDATION,
@@ -289,10 +302,10 @@ def meta_data(model: Model) -> str:
         f"{{{_SRMD}}}SimulationResourceMetaData",
         {**attributes, "generationTool": generation_tool()},
     )
-    for chapter in chapters(model):
-        kind = {"type": f"psa_casadi.{chapter.name}"}
+    for name, _, said in chapters(model):
+        kind = {"type": f"psa_casadi.{name}"}
         element = ET.SubElement(root, f"{{{_STC}}}Classification", kind)
-        for keyword, text in chapter.said:
+        for keyword, text in said:
             entry = ET.SubElement(element, f"{{{_STC}}}ClassificationEntry", {"keyword": keyword})
             entry.text = text
     return xml_text(root)
@@ -300,14 +313,15 @@ def meta_data(model: Model) -> str:
 
 def run_start(model: Model) -> dict[str, float]:
     """Return the states in which the run that is to be repeated starts."""
-    found = _run_of(model)
-    start = found.start if found else {}
+    evidence, reference = _reference(model)
+    again = evidence.run_of(reference.record)
+    start = again.start if again else {}
     return {s.name: start.get(s.name, s.start) for s in model.structure.states}
 
 
 def run_inputs(model: Model) -> tuple[FloatArray, FloatArray]:
     """Return times (n,) [s] and inputs (n, nu) of the run that is to be repeated."""
-    reference = _reference(model)
+    _, reference = _reference(model)
     times = np.array(reference.time)
     columns = [
         np.array(reference.inputs.get(i.name, [i.start] * len(times)))
@@ -316,59 +330,15 @@ def run_inputs(model: Model) -> tuple[FloatArray, FloatArray]:
     return times, np.array(columns).T
 
 
-def _reference(model: Model) -> ReferenceRun:
-    if model.evidence is None or model.evidence.reference is None:
+def _reference(model: Model) -> tuple[Evidence, ReferenceRun]:
+    evidence = model.evidence
+    if evidence is None or evidence.reference is None:
         raise InputError(f"The model '{model.name}' has no run to repeat; identify it again.")
-    return model.evidence.reference
-
-
-def _run_of(model: Model) -> RecordRun | None:
-    return model.evidence.run_of(_reference(model).record) if model.evidence else None
-
-
-def _outputs(model: Model) -> str:
-    """Return what the model says of the run that is to be repeated."""
-    times, inputs = run_inputs(model)
-    start = np.array(list(run_start(model).values()))
-    found = run(model, times, inputs, start, rtol=OWN_TOLERANCE)
-    return csv_table(("time", *model.output_names), times, rounded(found.y))
-
-
-def _run_files(model: Model, reference: ReferenceRun, sets: tuple[str, ...]) -> dict[str, str]:
-    """Return the files of the run that is to be repeated, but for its outputs."""
-    times, inputs = run_inputs(model)
-    stimuli = {"Stimuli": _beside(INPUTS)}
-    files = {"Parameters": _beside(START), **stimuli, "References": _beside(OUTPUTS)}
-    spread = [
-        Experiment(_set_name(p), "a parameter set", times, {"Parameters": _beside(p), **stimuli})
-        for p in sets
-    ]
-    whole = Experiment("record", _said(reference), times, files)
-    texts = {
-        START: parameter_set(model, name="validation", states=run_start(model)),
-        INPUTS: csv_table(("time", *model.input_names), times, inputs),
-        MEASURED: _measured(model, reference),
-        VALIDATION: experiments("validation", [whole]),
-    }
-    return {**texts, **({UNCERTAINTY: experiments("uncertainty", spread)} if spread else {})}
+    return evidence, evidence.reference
 
 
 def _said(reference: ReferenceRun) -> str:
     return f"the first {reference.time[-1]:.4g} s of the record {reference.record}"
-
-
-def _related_run(reference: ReferenceRun, *, spread: bool) -> dict[str, Related]:
-    said = _said(reference)
-    meaning = "the same voltage with each parameter set, from the FMU's own start"
-    analysis = {UNCERTAINTY: Related(EXP, "experiment/uncertainty-analysis", meaning)}
-    return {
-        START: Related(SSV, "parameter", "all parameters, and the states at the start of the run"),
-        INPUTS: Related(CSV, "other", f"inputs of {said}"),
-        OUTPUTS: Related(CSV, "result", f"what the model says of {said}"),
-        MEASURED: Related(CSV, "result", f"what was measured in {said}, without the offset"),
-        VALIDATION: Related(EXP, "experiment/validation", said),
-        **(analysis if spread else {}),
-    }
 
 
 def _beside(place: str) -> str:
@@ -378,16 +348,3 @@ def _beside(place: str) -> str:
 
 def _set_name(place: str) -> str:
     return place.rpartition("/")[2].removesuffix(".ssv")
-
-
-def _measured(model: Model, reference: ReferenceRun) -> str:
-    """Return what was measured, less the offset of the sensor; missing samples are left out."""
-    found = _run_of(model)
-    offset = found.offset_m if found else 0.0
-    valid = [
-        (t, y - offset)
-        for t, y in zip(reference.time, reference.displacement, strict=True)
-        if y is not None
-    ]
-    rows = np.array(valid).reshape(len(valid), 2)
-    return csv_table(("time", "displacement"), rows[:, 0], rounded(rows[:, 1:]))

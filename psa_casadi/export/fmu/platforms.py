@@ -1,11 +1,11 @@
 """The platforms an FMU can carry a binary for, and how each is compiled."""
 
 import hashlib
-import importlib.util
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from importlib.resources import files
 from pathlib import Path
 
 from psa_casadi.cache import cached
@@ -155,9 +155,7 @@ def windows_alone() -> list[str]:
 
     They leave its headers out too, so these are named.
     """
-    found = importlib.util.find_spec("ziglang")
-    folder = Path(found.origin).parent if found and found.origin else Path()
-    headers = folder / "lib" / "libc" / "include" / "any-windows-any"
+    headers = files("ziglang") / "lib" / "libc" / "include" / "any-windows-any"
     return ["-nostdlib", "-D_UCRT", "-isystem", str(headers)]
 
 

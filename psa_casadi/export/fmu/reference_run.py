@@ -59,16 +59,21 @@ kinks.
 """
 
 
-@dataclass(frozen=True)
-class Related:
-    """What the manifest says of a file in the archive: MIME type, role and meaning."""
+#: MIME type, role and meaning of a file in the archive, for the manifest.
+Related = tuple[str, str, str]
+#: MIME types of the files.
+CSV, SSV, EXP = "text/csv", "application/x-ssp-parameter-set", "application/x-ma-hs-experiments"
+_RELATED: dict[str, Related] = {
+    f"{FOLDER}/{PARAMETERS}": (SSV, "parameter", "values of all parameters"),
+    f"{FOLDER}/{EXPERIMENTS}": (
+        EXP, "experiment/smoke-test", "a run over straight segments of every input"),
+    f"{FOLDER}/{INPUTS}": (CSV, "other", "inputs of the smoke test"),
+    f"{FOLDER}/{OUTPUTS}": (CSV, "result", "outputs of the smoke test"),
+    NOTES: ("text/plain", "document", "how the smoke test is meant"),
+}  # fmt: skip
 
-    kind: str
-    role: str
-    meaning: str
 
-
-def reference_entries(model: Model, more: Mapping[str, Related] | None = None) -> dict[str, bytes]:
+def reference_entries(model: Model, more: Mapping[str, Related]) -> dict[str, bytes]:
     """Return the files of the reference run by their place in the archive.
 
     The manifest lists the files `more` too, which it does not make. Raises SimulationError if the
@@ -77,17 +82,19 @@ def reference_entries(model: Model, more: Mapping[str, Related] | None = None) -
     times, inputs = reference_inputs(model)
     start = np.array([s.start for s in model.structure.states])
     outputs = rounded(run(model, times, inputs, start, rtol=OWN_TOLERANCE).y)
+    said = f"straight segments of every input of {model.name}"
+    files = {"Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS}
     texts = {
         INPUTS: csv_table(("time", *model.input_names), times, inputs),
         OUTPUTS: csv_table(("time", *model.output_names), times, outputs),
         PARAMETERS: parameter_set(model),
-        EXPERIMENTS: experiments("smoke test", [_experiment(model, times)]),
+        EXPERIMENTS: experiments("smoke test", times, [("segments", said, files)]),
+        "fmi-ls-manifest.xml": _manifest({**_RELATED, **more}),
     }
     notes = _NOTES.format(
         name=model.name, segment=_segment(model), stop=times[-1], step=times[1], inputs=INPUTS,
         outputs=OUTPUTS, parameters=PARAMETERS, own=OWN_TOLERANCE, digits=_DIGITS,
     )  # fmt: skip
-    texts["fmi-ls-manifest.xml"] = _manifest(more or {})
     entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
     return {**entries, NOTES: notes.encode("utf-8")}
 
@@ -133,72 +140,42 @@ def csv_table(names: Sequence[str], times: FloatArray, columns: FloatArray) -> s
     return "\n".join([*rows, ""])
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """One experiment: its name and meaning, its times (n,) [s], and files by what they are.
+def experiments(
+    name: str, times: FloatArray, listed: Iterable[tuple[str, str, Mapping[str, str]]]
+) -> str:
+    """Return a file of experiments over the same times (n,) [s].
 
-    The files are those of "Parameters", "Stimuli" and "References", in this order.
+    Each has a name, a meaning, and files by what they are: "Parameters", "Stimuli" and
+    "References", in this order.
     """
-
-    name: str
-    description: str
-    times: FloatArray
-    files: Mapping[str, str]
-
-
-def _experiment(model: Model, times: FloatArray) -> Experiment:
-    files = {"Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS}
-    said = f"straight segments of every input of {model.name}"
-    return Experiment("segments", said, times, files)
-
-
-def experiments(name: str, listed: Iterable[Experiment]) -> str:
-    """Return a file of experiments."""
     root = ET.Element("Experiments", {"name": name})
-    for e in listed:
+    for title, description, files in listed:
         attributes = {
-            "name": e.name,
-            "description": e.description,
-            "startTime": number(e.times[0]),
-            "stopTime": number(e.times[-1]),
+            "name": title,
+            "description": description,
+            "startTime": number(times[0]),
+            "stopTime": number(times[-1]),
             "tolerance": number(TOLERANCE),
-            "stepSize": number(e.times[1] - e.times[0]),
+            "stepSize": number(times[1] - times[0]),
         }
         experiment = ET.SubElement(root, "Experiment", attributes)
-        for tag, source in e.files.items():
+        for tag, source in files.items():
             ET.SubElement(experiment, tag, {"source": source})
     return xml_text(root)
 
 
-#: MIME types of the files.
-CSV, SSV, EXP = "text/csv", "application/x-ssp-parameter-set", "application/x-ma-hs-experiments"
-
-#: What the manifest says of each file of the run.
-_RELATED = {
-    f"{FOLDER}/{PARAMETERS}": Related(SSV, "parameter", "values of all parameters"),
-    f"{FOLDER}/{EXPERIMENTS}": Related(
-        EXP, "experiment/smoke-test", "a run over straight segments of every input"
-    ),
-    f"{FOLDER}/{INPUTS}": Related(CSV, "other", "inputs of the smoke test"),
-    f"{FOLDER}/{OUTPUTS}": Related(CSV, "result", "outputs of the smoke test"),
-    NOTES: Related("text/plain", "document", "how the smoke test is meant"),
-}
-
-
-def _manifest(more: Mapping[str, Related]) -> str:
+def _manifest(listed: Mapping[str, Related]) -> str:
     """Return fmi-ls-manifest.xml, which lists the files: their kind, role and meaning."""
     ET.register_namespace("fmi-ls", _NAMESPACE)
     said = "Layered Standard providing information on related files included in an FMU."
     name = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-beta.1", "description": said}
     attributes = {f"{{{_NAMESPACE}}}fmi-ls-{key}": value for key, value in name.items()}
     root = ET.Element("fmiReferences", attributes)
-    for place, file in {**_RELATED, **more}.items():
+    for place, (kind, role, meaning) in listed.items():
         inside = place.startswith(f"{FOLDER}/")
         source = place.removeprefix(f"{FOLDER}/") if inside else f"../../{place}"
-        attributes = {
-            "type": file.kind, "source": source, "role": file.role, "description": file.meaning,
-        }  # fmt: skip
-        ET.SubElement(root, "Related", attributes)
+        file = {"type": kind, "source": source, "role": role, "description": meaning}
+        ET.SubElement(root, "Related", file)
     return xml_text(root)
 
 

@@ -19,19 +19,14 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Expression
-from psa_casadi.export.common.markup import xml_text
+from psa_casadi.export.common.markup import at_rest, xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
-from psa_casadi.export.common.variable_table import (
-    Variable,
-    starts_at_voltage,
-    variable_table,
-)
+from psa_casadi.export.common.variable_table import starts_at_voltage, variable_table
 from psa_casadi.export.fixed_step.code import bounded, function_code, limit_words
 from psa_casadi.export.fixed_step.export import FixedStep
 from psa_casadi.export.fixed_step.probe import STEPS, shown_output
 from psa_casadi.export.fmu.description import model_description
-from psa_casadi.export.fmu.evidence import seen_duration, seen_inputs
-from psa_casadi.files import atomic_write
+from psa_casadi.export.fmu.evidence import seen_inputs
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import (
     OPTIMISE,
@@ -79,8 +74,13 @@ Make each model a library of its own: two of them have functions of the same nam
 """
 
 
-def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dict[str, str]:
-    """Return the text of every file in the folder sources, by its name; `fmi` is 2 or 3."""
+def source_files(
+    model: Model, identifier: str, token: str, fmi: int = 2, fixed: FixedStep | None = None
+) -> dict[str, str]:
+    """Return the text of every file in the folder sources, by its name; `fmi` is 2 or 3.
+
+    `fixed` is the step of an FMU with a fixed step.
+    """
     structure = model.structure
     derivatives = _derivatives(structure)
     logic = (*LOGIC, *FACES[fmi])
@@ -89,13 +89,21 @@ def source_files(model: Model, identifier: str, token: str, fmi: int = 2) -> dic
     texts |= {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[fmi]}
     texts |= generate_c(structure, sensitivities=False)
     texts["model_derivatives.c"] = c_code("model_derivatives.c", derivatives)
-    texts["fmi_config.h"] = _config(model, derivatives)
-    texts["fmi_data.c"] = _data(model, variable_table(model), identifier, token)
+    texts[_HEADER] = _config(model, derivatives, fixed)
+    texts["fmi_data.c"] = _data(model, identifier, token)
+    if fixed:
+        texts["fmi_data.c"] += function_code(fixed.plan, "psa_fixed_step")
     names = compiled_files(texts)
     flags = " ".join(OPTIMISE)
     texts["README.txt"] = _README.format(name=identifier, flags=flags, files=" ".join(names))
     texts[SOURCES_NOTICE] = code_license()
-    texts["buildDescription.xml"] = _build_description(identifier, names)
+    root = ET.Element("fmiBuildDescription", {"fmiVersion": "3.0"})  # which FMI 2 ignores
+    configuration = ET.SubElement(root, "BuildConfiguration", {"modelIdentifier": identifier})
+    group = ET.SubElement(configuration, "SourceFileSet", {"language": "C99"})
+    for name in names:
+        ET.SubElement(group, "SourceFile", {"name": name})
+    ET.SubElement(configuration, "Library", {"name": "m"})
+    texts["buildDescription.xml"] = xml_text(root)
     return {n: t.replace("\r\n", "\n") for n, t in texts.items()}
 
 
@@ -115,24 +123,24 @@ def _derivatives(structure: Structure) -> tuple[ca.Function, ca.Function]:
     point = c_arguments(s)
     results: list[Expression] = [c_slopes(s), s.y, ca.vertcat(ca.SX(0, 1), *s.switches.values())]
     both = ca.vertcat(*results), ca.vertcat(*point)
-    seeds = [ca.SX.sym("d" + n, v.numel()) for n, v in zip("txup", point, strict=True)]
-    weights = [ca.SX.sym("w" + n, v.numel()) for n, v in zip("xyz", results, strict=True)]
-    along = _split(ca.jtimes(*both, ca.vertcat(*seeds)), results)
-    back = _split(ca.jtimes(*both, ca.vertcat(*weights), True), point)
+
+    def function(
+        name: str, others: str, like: list[Expression], into: list[Expression]
+    ) -> ca.Function:
+        """Return the product with vectors shaped `like` some columns, cut `into` others."""
+        seeds = [ca.SX.sym(n, v.numel()) for n, v in zip(others.split(), like, strict=True)]
+        product = ca.densify(ca.jtimes(*both, ca.vertcat(*seeds), into is point))
+        ends = itertools.accumulate((part.numel() for part in into), initial=0)
+        parts = ca.cse(ca.vertsplit(product, list(ends)))
+        return ca.Function(name, [*point, *seeds], parts, {"cse": True})
+
     return (
-        ca.Function("psa_directional", [*point, *seeds], ca.cse(along), {"cse": True}),
-        ca.Function("psa_adjoint", [*point, *weights], ca.cse(back), {"cse": True}),
+        function("psa_directional", "dt dx du dp", point, results),
+        function("psa_adjoint", "wx wy wz", results, point),
     )
 
 
-def _split(stacked: ca.SX, like: Sequence[Expression]) -> list[ca.SX]:
-    """Cut a stacked column into dense parts of the lengths of others."""
-    ends = itertools.accumulate((part.numel() for part in like), initial=0)
-    parts: list[ca.SX] = ca.vertsplit(ca.densify(stacked), list(ends))
-    return parts
-
-
-def _config(model: Model, functions: Sequence[ca.Function]) -> str:
+def _config(model: Model, functions: Sequence[ca.Function], fixed: FixedStep | None) -> str:
     sizes = {
         "ARG": max(8, *(f.sz_arg() for f in functions)),
         "RES": max(4, *(f.sz_res() for f in functions)),
@@ -142,6 +150,10 @@ def _config(model: Model, functions: Sequence[ca.Function]) -> str:
     lines = [f"#define PSA_DERIVATIVES_SZ_{name} {size}" for name, size in sizes.items()]
     place = model.input_names.index("voltage") if starts_at_voltage(model) else -1
     lines.append(f"#define PSA_VOLTAGE ({place})")
+    if fixed:
+        lines.append(f"#define PSA_FIXED_STEP {fixed.plan.step!r}")
+    if fixed and bounded(fixed.plan):
+        lines.append(f"#define PSA_FIXED_LIMIT {fixed.plan.limit!r}")
     return "\n".join(["#ifndef PSA_FMI_CONFIG_H", "#define PSA_FMI_CONFIG_H", *lines, "#endif", ""])
 
 
@@ -151,54 +163,37 @@ def _number(value: float) -> str:
     return repr(float(value))
 
 
-def _row(variable: Variable) -> str:
-    low, high = variable.bounds or (-math.inf, math.inf)
-    kind = f"PSA_{variable.kind.upper()}"
-    return f'    {{"{variable.name}", {kind}, {variable.index}, {_number(low)}, {_number(high)}}},'
-
-
-def _vector(name: str, size: str, values: Sequence[float]) -> str:
-    body = ", ".join(_number(v) for v in [*values, 0.0])
-    return f"const double {name}[{size} + 1] = {{{body}}};"
-
-
-def _settling(model: Model) -> list[str]:
-    """Return what a settled start needs to know of states and parameters."""
-    kinds = ["MEMORY_SETTLES" if q.settles else "MEMORY_STAYS" for q in model.structure.states]
-    memory = [
-        f"PSA_{kind if q.memory else 'MEMORY_NONE'}"
-        for kind, q in zip(kinds, model.structure.states, strict=True)
-    ]
-    gains = {c.gain for c in model.effects}
-    flags = [str(int(name in gains)) for name in model.parameter_names]
-    return [
-        f"const int psa_memory[PSA_NX + 1] = {{{', '.join([*memory, '0'])}}};",
-        f"const int psa_gains[PSA_NP + 1] = {{{', '.join([*flags, '0'])}}};",
-    ]
-
-
 def switch_scales(model: Model, nominals: Sequence[float]) -> list[float]:
     """Return sum_j |dz/dx_j| nominal_j of every switch z at rest: its noise at a tolerance of 1."""
     s = model.structure
     slopes = ca.jacobian(ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.x)
-    at_rest = ca.Function("slopes", s.arguments, [ca.densify(slopes)])
-    rest = [np.zeros(len(part)) for part in (s.states, s.inputs)]
-    held = [np.zeros(len(s.sampled))] if s.sampled else []
-    found = np.array(at_rest(0.0, *rest, model.parameter_vector(), *held), dtype=np.float64)
-    rows = np.abs(found.reshape(len(s.switches), len(s.states)))
+    rows = np.abs(at_rest(model, slopes)).reshape(len(s.switches), len(s.states))
     return [float(row @ np.array(nominals)) for row in rows]
 
 
-def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) -> str:
-    """Return fmi_data.c; vectors have one element more than the model, as C has no empty ones."""
+def _data(model: Model, identifier: str, token: str) -> str:
+    """Return fmi_data.c; arrays have one element more than the model, as C has no empty ones."""
+    s, table = model.structure, variable_table(model)
 
-    def starts(kind: str) -> list[float]:
-        return [v.start or 0.0 for v in table if v.kind == kind]
+    def starts(*kinds: str) -> list[float]:
+        return [v.start or 0.0 for kind in kinds for v in table if v.kind == kind]
+
+    def array(kind: str, name: str, size: str, items: Iterable[str], last: str) -> str:
+        body = ", ".join([*items, last])
+        return f"const {kind} psa_{name}[PSA_{size} + 1] = {{{body}}};"
+
+    def vector(name: str, size: str, values: Iterable[float]) -> str:
+        return array("double", name, size, map(_number, values), "0.0")
 
     nominals = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
-    sizes = [abs(q) for q in model.state_nominals()]
-    scales = switch_scales(model, nominals)
-    held = [*starts("parameter"), *starts("sampled")]
+    kinds = ["STAYS" if not q.settles else "SETTLES" for q in s.states]
+    memory = [
+        f"PSA_MEMORY_{kind if q.memory else 'NONE'}"
+        for kind, q in zip(kinds, s.states, strict=True)
+    ]
+    gains = {c.gain for c in model.effects}
+    seen = [f"{{{', '.join(map(_number, row))}}}" for row in seen_inputs(model)]
+    duration = model.evidence.seen.duration if model.evidence else math.inf
     lines = [
         '#include "fmi_data.h"',
         "",
@@ -207,56 +202,30 @@ def _data(model: Model, table: Sequence[Variable], identifier: str, token: str) 
         f'const char psa_token[] = "{token}";',
         f'const char psa_model_identifier[] = "{identifier}";',
         "const psa_variable psa_variables[PSA_VARIABLES] = {",
-        *(_row(v) for v in table),
+    ]
+    for v in table:
+        low, high = map(_number, v.bounds or (-math.inf, math.inf))
+        lines.append(f'    {{"{v.name}", PSA_{v.kind.upper()}, {v.index}, {low}, {high}}},')
+    return "\n".join([
+        *lines,
         "};",
-        _vector("psa_start_states", "PSA_NX", starts("state")),
-        _vector("psa_start_inputs", "PSA_NU", starts("input")),
-        _vector("psa_start_parameters", "PSA_HELD", held),
-        _vector("psa_state_nominals", "PSA_NX", sizes or [1.0]),
-        _vector("psa_told_nominals", "PSA_NX", nominals or [1.0]),
-        *_settling(model),
-        _vector("psa_switch_scales", "PSA_NZ", scales),
-        *_seen(model),
+        vector("start_states", "NX", starts("state")),
+        vector("start_inputs", "NU", starts("input")),
+        vector("start_parameters", "HELD", starts("parameter", "sampled")),
+        vector("state_nominals", "NX", [abs(q) for q in model.state_nominals()] or [1.0]),
+        vector("told_nominals", "NX", nominals or [1.0]),
+        array("int", "memory", "NX", memory, "0"),
+        array("int", "gains", "NP", (str(int(n in gains)) for n in model.parameter_names), "0"),
+        vector("switch_scales", "NZ", switch_scales(model, nominals)),
+        array("psa_range", "seen", "NU", seen, "{0.0, 0.0, 0.0}"),
+        f"const double psa_seen_duration = {_number(duration)};",
         "",
-    ]
-    return "\n".join(lines)
-
-
-def _seen(model: Model) -> list[str]:
-    """Return what the records behind the model have shown, for its log."""
-    rows = [", ".join(_number(v) for v in row) for row in [*seen_inputs(model), (0.0, 0.0, 0.0)]]
-    body = ", ".join(f"{{{row}}}" for row in rows)
-    return [
-        f"const psa_range psa_seen[PSA_NU + 1] = {{{body}}};",
-        f"const double psa_seen_duration = {_number(seen_duration(model))};",
-    ]
-
-
-def _build_description(identifier: str, names: Sequence[str]) -> str:
-    """Return the list of sources in the form of FMI 3's buildDescription.xml."""
-    root = ET.Element("fmiBuildDescription", {"fmiVersion": "3.0"})
-    configuration = ET.SubElement(root, "BuildConfiguration", {"modelIdentifier": identifier})
-    group = ET.SubElement(configuration, "SourceFileSet", {"language": "C99"})
-    for name in names:
-        ET.SubElement(group, "SourceFile", {"name": name})
-    ET.SubElement(configuration, "Library", {"name": "m"})
-    return xml_text(root)
+    ])  # fmt: skip
 
 
 #: Where an FMU carries the step [s], its substeps and the measured errors by voltage.
 FIXED_ENTRY = "resources/fixed_step.json"
-_HEADER, _SOURCE = "fmi_config.h", "fmi_data.c"
-
-
-def fixed_sources(texts: Mapping[str, str], fixed: FixedStep) -> dict[str, str]:
-    """Return the sources of an FMU with the fixed step in them."""
-    define = f"#define PSA_FIXED_STEP {fixed.plan.step!r}\n"
-    if bounded(fixed.plan):
-        define += f"#define PSA_FIXED_LIMIT {fixed.plan.limit!r}\n"
-    define += "#endif\n"
-    head, end, rest = texts[_HEADER].rpartition("#endif\n")
-    code = function_code(fixed.plan, "psa_fixed_step")
-    return {**texts, _HEADER: head + define + rest if end else "", _SOURCE: texts[_SOURCE] + code}
+_HEADER = "fmi_config.h"
 
 
 def fixed_entry(fixed: FixedStep) -> bytes:
@@ -308,8 +277,7 @@ def exported_texts(
     """
 
     def sources(token: str) -> dict[str, str]:
-        texts = source_files(model, identifier, token, fmi)
-        return (fixed_sources(texts, fixed) if fixed else texts) | dict(given or {})
+        return source_files(model, identifier, token, fmi, fixed) | dict(given or {})
 
     bare = sources("")
     names = compiled_files(bare)
@@ -320,19 +288,3 @@ def exported_texts(
     token = "{" + str(uuid.UUID(bytes=digest.digest()[:16])) + "}"
     xml = model_description(model, identifier, token, names, fmi, fixed)
     return token, sources(token), xml
-
-
-def write_sources(
-    model: Model, directory: Path, *, name: str | None = None, fmi: int = 2
-) -> list[Path]:
-    """Write all sources of a model's FMU to a folder and return the paths, sorted.
-
-    The folder is made if it does not exist. The sources compile alone; its README.txt has the line.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    written = []
-    _, texts, _ = exported_texts(model, name or model.name, fmi)
-    for file_name, text in sorted(texts.items()):
-        atomic_write(directory / file_name, text)
-        written.append(directory / file_name)
-    return written

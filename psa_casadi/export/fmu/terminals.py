@@ -3,7 +3,7 @@
 Source: FMI 3.0.2, section 2.4.9 (terminals and icons).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.icon import ICONS, drawing_of, png, svg
@@ -11,11 +11,12 @@ from psa_casadi.export.common.markup import xml_text
 from psa_casadi.model.compose import Model
 
 FOLDER = "terminalsAndIcons"
+#: Colour of the wires of a connection, by its icon.
+_COLOURS = {"mechanical": "91 102 111", "electrical": "0 114 178"}
 
 
-@dataclass(frozen=True)
-class Terminal:
-    """A connection: its name, meaning, icon, colour, side, and its variables.
+class Terminal(NamedTuple):
+    """A connection: its name, meaning, icon, side, and its variables.
 
     `members` are (name of the variable, name in the connection, kind); two terminals connect by
     the names in the connection. A force or a current is a flow ("inflow" into this model,
@@ -25,47 +26,27 @@ class Terminal:
     name: str
     description: str
     icon: str
-    colour: str
     side: float
     members: tuple[tuple[str, str, str], ...]
 
 
-_MECHANICAL, _ELECTRICAL = "91 102 111", "0 114 178"
-
 TERMINALS: tuple[Terminal, ...] = (
     Terminal(
-        "electrical",
-        "voltage in, current out: the amplifier's input and what the stack draws",
-        "electrical",
-        _ELECTRICAL,
-        -100.0,
+        "electrical", "voltage in, current out: the amplifier's input and what the stack draws",
+        "electrical", -100.0,
         (("voltage", "voltage", "signal"), ("current", "current", "inflow")),
     ),
     Terminal(
-        "mechanical",
-        "force of the load in, motion of the output out",
-        "mechanical",
-        _MECHANICAL,
-        100.0,
-        (
-            ("displacement", "position", "signal"),
-            ("velocity", "velocity", "signal"),
-            ("load_force", "force", "inflow"),
-        ),
+        "mechanical", "force of the load in, motion of the output out", "mechanical", 100.0,
+        (("displacement", "position", "signal"), ("velocity", "velocity", "signal"),
+         ("load_force", "force", "inflow")),
     ),
     Terminal(
-        "tip",
-        "motion of the stack's output in, force on the stack out",
-        "mechanical",
-        _MECHANICAL,
-        -100.0,
-        (
-            ("tip_position", "position", "signal"),
-            ("tip_velocity", "velocity", "signal"),
-            ("reaction_force", "force", "outflow"),
-        ),
+        "tip", "motion of the stack's output in, force on the stack out", "mechanical", -100.0,
+        (("tip_position", "position", "signal"), ("tip_velocity", "velocity", "signal"),
+         ("reaction_force", "force", "outflow")),
     ),
-)
+)  # fmt: skip
 
 
 def terminals_of(model: Model) -> tuple[Terminal, ...]:
@@ -82,41 +63,27 @@ def terminals_and_icons(model: Model) -> str:
     ET.SubElement(drawing, "CoordinateSystem", {**corners, "suggestedScalingFactorTo_mm": "0.1"})
     ET.SubElement(drawing, "Icon", corners)
     terminals = terminals_of(model)
-    if terminals:
-        listed = ET.SubElement(root, "Terminals")
-        for terminal in terminals:
-            _terminal(listed, terminal)
+    listed = ET.SubElement(root, "Terminals") if terminals else root
+    for t in terminals:
+        head = {"name": t.name, "matchingRule": "plug", "description": t.description}
+        element = ET.SubElement(listed, "Terminal", head)
+        for variable, member, kind in t.members:
+            names = {"variableName": variable, "memberName": member, "variableKind": kind}
+            ET.SubElement(element, "TerminalMemberVariable", names)
+        wire = {"defaultConnectionColor": _COLOURS[t.icon], "defaultConnectionStrokeSize": "1"}
+        place = {"x1": f"{t.side - 10:g}", "y1": "-10", "x2": f"{t.side + 10:g}", "y2": "10"}
+        drawn = {**wire, **place, "iconBaseName": t.icon}
+        ET.SubElement(element, "TerminalGraphicalRepresentation", drawn)
     return xml_text(root)
-
-
-def _terminal(parent: ET.Element, terminal: Terminal) -> None:
-    element = ET.SubElement(
-        parent,
-        "Terminal",
-        {"name": terminal.name, "matchingRule": "plug", "description": terminal.description},
-    )
-    for variable, member, kind in terminal.members:
-        attributes = {"variableName": variable, "memberName": member, "variableKind": kind}
-        ET.SubElement(element, "TerminalMemberVariable", attributes)
-    ET.SubElement(
-        element,
-        "TerminalGraphicalRepresentation",
-        {
-            "defaultConnectionColor": terminal.colour,
-            "defaultConnectionStrokeSize": "1",
-            "x1": f"{terminal.side - 10:g}",
-            "y1": "-10",
-            "x2": f"{terminal.side + 10:g}",
-            "y2": "10",
-            "iconBaseName": terminal.icon,
-        },
-    )
 
 
 def terminal_entries(model: Model) -> dict[str, bytes]:
     """Return the files of the folder terminalsAndIcons by their place in the archive."""
-    drawings = {"icon": drawing_of(model)} | {t.icon: t.icon for t in terminals_of(model)}
-    shapes = {name: ICONS[drawing] for name, drawing in drawings.items()}
     entries = {f"{FOLDER}/terminalsAndIcons.xml": terminals_and_icons(model).encode("utf-8")}
-    entries |= {f"{FOLDER}/{n}.png": png(s) for n, s in shapes.items()}
-    return entries | {f"{FOLDER}/{n}.svg": svg(s).encode("utf-8") for n, s in shapes.items()}
+    for name, drawing in [
+        ("icon", drawing_of(model)),
+        *((t.icon, t.icon) for t in terminals_of(model)),
+    ]:
+        entries[f"{FOLDER}/{name}.png"] = png(ICONS[drawing])
+        entries[f"{FOLDER}/{name}.svg"] = svg(ICONS[drawing]).encode("utf-8")
+    return entries

@@ -1,19 +1,35 @@
-"""One Modelica class from a model: declarations by component, one equation per balance."""
+"""One Modelica class from a model: declarations by component, one equation per balance.
+
+Named parts stand in the place of long repeated expressions. Sampled states are discrete variables,
+and one when-clause gives their values.
+
+Source: Modelica Language Specification 3.6, sections 3.7.5 (`sample`, `pre`) and 8.3.5 (when).
+"""
 
 import math
 import textwrap
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
+import casadi as ca
+
+from psa_casadi.component import Expression, Symbols
 from psa_casadi.export.common.icon import drawing_of
 from psa_casadi.export.common.templates import filled
-from psa_casadi.export.modelica.equations import (
-    ModelEquations,
-    Variable,
-    model_equations,
-    when_lines,
+from psa_casadi.export.modelica.expression import (
+    Graph,
+    Identifiers,
+    Printer,
+    comment,
+    modifier,
+    number,
+    string,
+    unit_text,
 )
-from psa_casadi.export.modelica.expression import comment, modifier, number, string, unit_text
 from psa_casadi.model.compose import Model
+from psa_casadi.model.structure import Structure
+from psa_casadi.scales import static_stiffness, stroke
+from psa_casadi.shapes import direction, magnitude_power, rate_magnitude, signed_power
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 
 _WIDTH = 100
@@ -29,6 +45,65 @@ CONNECTORS = {
 #: Names of the connectors.
 IDENTIFIERS = ("pin_p", "pin_n", "flange_a", "flange_b")
 
+#: Parts that have a name wherever a model has their symbols: unit, meaning, and how they are made.
+#: Only a stack has a stroke, which stands in the way of static_stiffness: the k of another model
+#: may be anything.
+PARTS: dict[str, tuple[str, str, Callable[[Symbols], Expression]]] = {
+    "voltage_direction": ("1", "smooth sign of the voltage rate", direction),
+    "voltage_speed": ("V/s", "magnitude of the voltage rate", rate_magnitude),
+    "hysteresis_ratio": (
+        "1", "hysteresis force over its reference", lambda s: s.f_H / s.h_ref),
+    "hysteresis_bend": (
+        "1", "magnitude of the ratio to the power n",
+        lambda s: magnitude_power(s.f_H / s.h_ref, s.n)),
+    "hysteresis_signed_bend": (
+        "1", "the same with the sign of the ratio", lambda s: signed_power(s.f_H / s.h_ref, s.n)),
+    "static_stiffness": (
+        "N/m", "static stiffness of the stack", lambda s: (stroke(s), static_stiffness(s))[1]),
+    "stroke": ("m", "linear free stroke at rated voltage", stroke),
+    "elastic_force": (
+        "N", "force of the wafers' spring and damper", lambda s: s.c_P * s.v_y + s.k_P * s.y),
+    "bonding_force": (
+        "N", "force of the bonding layers' spring and damper",
+        lambda s: s.c_B * (s.v_x - s.v_y) + s.k_B * (s.x - s.y)),
+    "contact_force": (
+        "N", "force of the contact on the stage",
+        lambda s: s.k_c * (s.tip_position - s.x_f) + s.c_c * (s.tip_velocity - s.v_f)),
+}  # fmt: skip
+#: A repeated expression of this many operations and symbols, or more, gets a variable.
+_WORTH_A_NAME = 8
+#: These stay in place: a tool takes a variable that is one of them for discrete.
+_NEVER_NAMED = frozenset({"sign", "lt", "le", "eq", "ne", "not", "and", "or", "if"})
+
+
+@dataclass(frozen=True)
+class _Variable:
+    """A variable and its equation; `unit` is None where it is not known.
+
+    `terms` are the terms of a sum, each a text with its sign and the component that adds it.
+    """
+
+    name: str
+    unit: str | None
+    description: str
+    text: str
+    terms: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Equations of a model; `names` are the Modelica names of its symbols.
+
+    `sides` are right-hand sides by the name of their variable: of "derivatives", of "outputs" that
+    are no balances, and of sampled states "after" an instant. `sampled_parts` change with these.
+    """
+
+    names: Mapping[str, str]
+    balances: tuple[_Variable, ...]
+    parts: tuple[_Variable, ...]
+    sampled_parts: tuple[_Variable, ...]
+    sides: Mapping[str, Mapping[str, str]]
+
 
 def class_text(
     model: Model, name: str, description: str, annotation: str, connectors: Collection[str] = ()
@@ -39,16 +114,16 @@ def class_text(
     is fixed. Raises InputError for values that are not finite and for what Modelica cannot write.
     """
     s = model.structure
-    equations = model_equations(model, IDENTIFIERS if connectors else ())
+    equations = _equations(model, Identifiers(IDENTIFIERS if connectors else ()))
     names = equations.names
     given = {n for c in connectors for n in CONNECTORS[c][1]}
-    shown = "Real" if connectors else "output Real"
 
     def declared(its: Iterable[Input | Output], prefix: str) -> list[str]:
         return [_declaration(model, it, names[it.name], prefix) for it in its]
 
     public = {names[o.name] for o in s.outputs}
     hidden = [v for v in (*equations.balances, *equations.parts) if v.name not in public]
+    fixed = ("reciprocal_gain",) if connectors else ()
     return filled(
         "class.mo",
         name=name,
@@ -59,19 +134,21 @@ def class_text(
         drawing=drawing_of(model),
         declarations=[
             *declared((i for i in s.inputs if i.name not in given), "input Real"),
-            *declared(s.outputs, shown),
-            *_components(model, names, fixed=("reciprocal_gain",) if connectors else ()),
+            *declared(s.outputs, "Real" if connectors else "output Real"),
+            *_declarations_of_components(model, names, fixed),
         ],
         hidden=[
             *declared((i for i in s.inputs if i.name in given), "Real"),
-            *(_variable(v) for v in hidden),
+            *(_variable(v, "Real") for v in hidden),
             *(_variable(v, "discrete Real") for v in equations.sampled_parts),
         ],
         equations=_equation_lines(model, equations),
     )
 
 
-def _components(model: Model, names: Mapping[str, str], fixed: Collection[str]) -> list[str]:
+def _declarations_of_components(
+    model: Model, names: Mapping[str, str], fixed: Collection[str]
+) -> list[str]:
     """Return parameters, states and sampled states under a comment that names their component."""
     lines: list[str] = []
     states = {s.name: s for s in model.structure.states}
@@ -82,9 +159,10 @@ def _components(model: Model, names: Mapping[str, str], fixed: Collection[str]) 
         ]
         own += [(states[s.name], "Real") for s in component.states]
         own += [(s, "discrete Real") for s in component.sampled]
-        if own:
-            lines.append("  " + comment(f"{component.name}: {component.description}"))
-            lines += [_declaration(model, it, names[it.name], prefix) for it, prefix in own]
+        lines += _section(
+            f"{component.name}: {component.description}",
+            [_declaration(model, it, names[it.name], prefix) for it, prefix in own],
+        )
     return lines
 
 
@@ -105,7 +183,7 @@ def _declaration(
         if isinstance(it, State):
             stated["fixed"] = "true"
         stated["nominal"] = size_text(nominal_value(it.nominal, model.values), it.name)
-    return f"  {prefix} {name}{modifier(stated.items())}{value} {string(it.description)};"
+    return f"  {prefix} {name}{modifier(stated)}{value} {string(it.description)};"
 
 
 def size_text(size: float, name: str) -> str:
@@ -114,56 +192,57 @@ def size_text(size: float, name: str) -> str:
     return repr(float(f"{abs(size):.3g}"))
 
 
-def _variable(it: Variable, prefix: str = "Real") -> str:
-    attributes = [("unit", string(it.unit) if it.unit else None)]
-    if prefix != "Real":
-        attributes += [("start", "0.0"), ("fixed", "true")]
-    return f"  {prefix} {it.name}{modifier(attributes)} {string(it.description)};"
+def _variable(it: _Variable, prefix: str) -> str:
+    stated = {"unit": string(it.unit) if it.unit else None}
+    if prefix == "discrete Real":
+        stated |= {"start": "0.0", "fixed": "true"}
+    return f"  {prefix} {it.name}{modifier(stated)} {string(it.description)};"
 
 
-def _equation_lines(model: Model, equations: ModelEquations) -> list[str]:
-    lines = []
-    if equations.parts:
-        lines.append("  // what several equations use")
-        lines += _flat(_wrapped(f"{v.name} = {v.text}") for v in equations.parts)
-    if equations.balances:
-        lines.append("  // balances: sums of what the components add")
-        lines += _flat(_balance(v) for v in equations.balances)
-    for component in model.components:
-        if component.states:
-            lines.append("  " + comment(f"{component.name}: {component.source.rstrip('.')}"))
-            own = [s.name for s in component.states]
-            lines += _flat(
-                _wrapped(f"der({equations.names[n]}) = {equations.derivatives[n]}") for n in own
-            )
-    if model.structure.period is not None:
-        parts = [_wrapped(f"{v.name} = {v.text}") for v in equations.sampled_parts]
-        following = equations.following.items()
-        sides = {n: _wrapped(f"{equations.names[n]} = {text}") for n, text in following}
-        lines += when_lines(model, equations.names[model.structure.period], parts, sides)
-    if equations.outputs:
-        lines.append("  // outputs")
-        lines += _flat(
-            _wrapped(f"{equations.names[n]} = {text}") for n, text in equations.outputs.items()
+def _section(title: str, body: Iterable[str]) -> list[str]:
+    """Return lines under a comment; nothing where there are none."""
+    lines = list(body)
+    return ["  " + comment(title), *lines] if lines else []
+
+
+def _equation_lines(model: Model, equations: _Equations) -> list[str]:
+    names, sides = equations.names, equations.sides
+
+    def written(pairs: Iterable[tuple[str, str]]) -> list[str]:
+        return [line for name, text in pairs for line in _wrapped(f"{name} = {text}")]
+
+    balances = [line for v in equations.balances for line in _balance(v)]
+    lines = _section(
+        "what several equations use", written((v.name, v.text) for v in equations.parts)
+    )
+    lines += _section("balances: sums of what the components add", balances)
+    inside = written((v.name, v.text) for v in equations.sampled_parts)
+    for c in model.components:
+        title = f"{c.name}: {c.source.rstrip('.')}"
+        rates = ((f"der({names[s.name]})", sides["derivatives"][s.name]) for s in c.states)
+        lines += _section(title, written(rates))
+        inside += _section(
+            title, written((names[s.name], sides["after"][s.name]) for s in c.sampled)
         )
-    return lines
+    if model.structure.period is not None:
+        lines.append(f"  when sample(0, {names[model.structure.period]}) then")
+        lines += [*(f"  {line}" for line in inside), "  end when;"]
+    return lines + _section("outputs", written((names[n], t) for n, t in sides["outputs"].items()))
 
 
-def _flat(groups: Iterable[Sequence[str]]) -> list[str]:
-    return [line for group in groups for line in group]
-
-
-def _balance(it: Variable) -> list[str]:
+def _balance(it: _Variable) -> list[str]:
     """Return a balance in one line, or with a line and a component's name for each term."""
     owners = ", ".join(dict.fromkeys(owner for _, owner in it.terms if owner))
     line = f"  {it.name} = {it.text}; // {owners}" if owners else f"  {it.name} = {it.text};"
-    if len(line) <= _WIDTH or len(it.terms) < 2:
-        return [line] if len(line) <= _WIDTH else _wrapped(f"{it.name} = {it.text}")
+    if len(line) <= _WIDTH:
+        return [line]
+    if len(it.terms) < 2:
+        return _wrapped(f"{it.name} = {it.text}")
     lines = [f"  {it.name} ="]
     for i, (text, owner) in enumerate(it.terms):
         end = ";" if i == len(it.terms) - 1 else ""
-        parts = _wrapped(text, "    ", end)
-        lines += [*parts[:-1], f"{parts[-1]} // {owner}" if owner else parts[-1]]
+        *parts, last = _wrapped(text, "    ", end)
+        lines += [*parts, f"{last} // {owner}" if owner else last]
     return lines
 
 
@@ -177,3 +256,203 @@ def _wrapped(text: str, indent: str = "  ", end: str = ";") -> list[str]:
         break_long_words=False,
         break_on_hyphens=False,
     )
+
+
+def _equations(model: Model, identifiers: Identifiers) -> _Equations:
+    """Return the equations of a model; raises InputError for what Modelica cannot write."""
+    s, graph = model.structure, Graph()
+    names = variable_names(s, identifiers)
+    used, later = _used(s), _following(s)
+    groups = {
+        "balances": {n: s.balances.get(n, ca.SX(0)) for n in s.balance_table if n in used},
+        "derivatives": {q.name: s.der[q.name] for q in s.states},
+        "outputs": dict(_outputs(s)),
+        "after": later,
+    }
+    roots = graph.read([side for group in groups.values() for side in group.values()])
+    places = iter(roots)
+    numbers = {kind: {n: next(places) for n in group} for kind, group in groups.items()}
+    named = {k: names[n] for n, k in numbers["balances"].items() if graph.nodes[k].arguments}
+    parts = _name_parts(graph, roots, named, identifiers, s, later)
+    names |= {f"der({q.name})": f"der({names[q.name]})" for q in s.states}
+    names |= {_before(q.name): _before(names[q.name]) for q in s.sampled}
+    printer = Printer(graph, names, named)
+    by_kind: dict[bool, list[_Variable]] = {False: [], True: []}
+    for k, (unit, description) in sorted(parts.items()):
+        sampled = any(graph.nodes[i].name.startswith("pre(") for i in graph.below([k]))
+        by_kind[sampled].append(_Variable(named[k], unit, description, printer.definition(k)))
+    return _Equations(
+        names=names,
+        balances=tuple(
+            _Variable(
+                names[n], s.balance_table[n].unit, s.balance_table[n].description,
+                printer.definition(k), _terms(graph, printer, s, n, k),
+            )
+            for n, k in numbers.pop("balances").items()
+        ),
+        parts=tuple(by_kind[False]),
+        sampled_parts=tuple(by_kind[True]),
+        sides={
+            kind: {n: printer.definition(k) for n, k in group.items()}
+            for kind, group in numbers.items()
+        },
+    )  # fmt: skip
+
+
+def variable_names(structure: Structure, identifiers: Identifiers) -> dict[str, str]:
+    """Return the Modelica names of symbols, balances and outputs; `time` is Modelica's own."""
+    s, used = structure, _used(structure)
+    symbols: list[Input | Parameter | State] = [*s.inputs, *s.parameters, *s.states, *s.sampled]
+    wanted = [q.name for q in symbols]
+    wanted += [name for name in s.balance_table if name in used]
+    wanted += [o.name for o in s.outputs if o.name not in wanted]
+    return {"time": "time"} | {name: identifiers.new(name) for name in wanted}
+
+
+def _used(structure: Structure) -> set[str]:
+    """Return the balances that have terms and those that are read."""
+    sides = (structure.balances, structure.der, structure.next, structure.out)
+    every = ca.vertcat(*(e for side in sides for e in side.values()))
+    read = {s.name() for s in ca.symvar(every)}
+    return {n for n in structure.balance_table if n in structure.balances or n in read}
+
+
+def _outputs(structure: Structure) -> Iterator[tuple[str, Expression]]:
+    """Yield the outputs that are not balances; the velocity is the displacement's derivative."""
+    s = structure
+    for output in s.outputs:
+        expression = s.out[output.name]
+        if output.name == "velocity" and "displacement" in s.balances:
+            shown = _written_out(s.balances["displacement"], s, list(s.balances))
+            rates = ca.vertcat(*[ca.SX.sym(f"der({q.name})") for q in s.states])
+            expression = ca.jtimes(shown, s.x, rates) + ca.jacobian(shown, s.time)
+        if not (output.name in s.symbols and is_symbol(expression, output.name)):
+            yield output.name, expression
+
+
+def is_symbol(expression: Expression, name: str) -> bool:
+    """Whether an expression is nothing but the symbol of that name."""
+    scalar = ca.SX(expression)
+    return bool(scalar.is_symbolic()) and scalar.name() == name
+
+
+def _written_out(expression: Expression, structure: Structure, names: Sequence[str]) -> ca.SX:
+    """Return an expression with these balances in the place of their symbols."""
+    found = ca.SX(expression)
+    symbols = [structure.symbols[n] for n in names]
+    while any(ca.depends_on(found, s) for s in symbols):
+        found = ca.substitute([found], symbols, [structure.balances[n] for n in names])[0]
+    return found
+
+
+def _before(name: str) -> str:
+    """Return the name of the symbol that stands for a sampled state before an instant."""
+    return f"pre({name})"
+
+
+def _following(structure: Structure) -> dict[str, Expression]:
+    """Return each sampled state's value after an instant, those before it as symbols `pre(z)`.
+
+    A balance that depends on a sampled state, through others too, is written out, because its
+    variable has the values after the instant.
+    """
+    s = structure
+    moving: list[str] = []
+    more = [""]
+    while more:
+        reached = ca.vertcat(s.z, *(s.symbols[name] for name in moving))
+        others = (item for item in s.balances.items() if item[0] not in moving)
+        more = [name for name, terms in others if ca.depends_on(terms, reached)]
+        moving += more
+    earlier = ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(_before(q.name)) for q in s.sampled))
+    return {
+        q.name: ca.substitute([_written_out(s.next[q.name], s, moving)], [s.z], [earlier])[0]
+        for q in s.sampled
+    }
+
+
+def _name_parts(
+    graph: Graph, roots: Sequence[int], named: dict[int, str], identifiers: Identifiers,
+    structure: Structure, later: Mapping[str, Expression],
+) -> dict[int, tuple[str | None, str]]:  # fmt: skip
+    """Name nodes: the known parts that the equations hold, and what is long and used twice or more.
+
+    Repeated ones are named from the smallest up. Return unit and meaning of each.
+    """
+    chosen: dict[int, tuple[str | None, str]] = {}
+    below = graph.below(roots)
+    known = _known_parts(Symbols(structure.symbols))
+    expressions = [expression for *_, expression in known]
+    for (name, unit, meaning, _), k in zip(known, graph.read(expressions), strict=True):
+        if k in below and k not in named:
+            named[k], chosen[k] = identifiers.new(name), (unit, meaning)
+    owners = _owners(graph, structure, later)
+    present = sorted(below)
+    uses = dict.fromkeys(present, 0)
+    for argument in (a for k in present for a in graph.nodes[k].arguments):
+        uses[argument] += 1
+    sizes: dict[int, int] = {}
+    for k in present:
+        node = graph.nodes[k]
+        sizes[k] = 1 + sum(sizes[a] for a in node.arguments)
+        is_worth_it = sizes[k] >= _WORTH_A_NAME and uses[k] > 1
+        if is_worth_it and k not in named and node.operation not in _NEVER_NAMED:
+            owner = owners.get(k, "shared")
+            named[k], chosen[k] = (
+                identifiers.new(f"{owner}_part"),
+                (None, f"repeated part of {owner}"),
+            )
+        if k in named:
+            sizes[k] = 1
+    return chosen
+
+
+def _known_parts(symbols: Symbols) -> list[tuple[str, str, str, Expression]]:
+    """Return name, unit, meaning and expression of the parts whose symbols the model has."""
+    found = []
+    for name, (unit, meaning, made) in PARTS.items():
+        try:
+            found.append((name, unit, meaning, made(symbols)))
+        except AttributeError:
+            continue
+    return found
+
+
+def _owners(graph: Graph, structure: Structure, later: Mapping[str, Expression]) -> dict[int, str]:
+    """Return the first component whose equations hold a node, for every node."""
+    owners: dict[int, str] = {}
+    for component in structure.components:
+        sides = component.equations(Symbols(structure.symbols))
+        terms = [*sides.der.values(), *sides.add.values(), *sides.out.values()]
+        terms += [later[s.name] for s in component.sampled]
+        for k in graph.below(graph.read(terms)):
+            owners.setdefault(k, component.name)
+    return owners
+
+
+def _terms(
+    graph: Graph, printer: Printer, structure: Structure, balance: str, number: int
+) -> tuple[tuple[str, str], ...]:
+    """Return the terms of a balance with their signs and components, the first one first.
+
+    A sum that CasADi has rearranged stays in one piece, without a component's name.
+    """
+    contributions = [
+        (c.name, added[balance])
+        for c in structure.components
+        if balance in (added := c.equations(Symbols(structure.symbols)).add)
+    ]
+    terms: list[tuple[str, str]] = []
+    for name, term in reversed(contributions[1:]):
+        node = graph.nodes[number]
+        (own,) = graph.read([term])
+        if node.operation == "add" and node.arguments[1] == own:
+            sign = "+ "
+        elif node.operation == "sub" and graph.add("neg", node.arguments[1]) == own:
+            sign = "- "
+        else:
+            return ((printer.definition(number), ""), *terms)
+        terms.insert(0, (sign + printer.summand(node.arguments[1]), name))
+        number = node.arguments[0]
+    name = contributions[0][0] if contributions else ""
+    return ((printer.definition(number), name), *terms)

@@ -30,39 +30,17 @@ class Node:
     value: float = 0.0
 
 
-#: Operations that are printed, by CasADi's code.
+#: CasADi's operations that are printed, all of them under their own names, but for these.
+_OWN_NAMES = (
+    "add sub mul div neg pow sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh sign"
+    " lt le eq ne not and or"
+)
 _OPERATIONS: dict[int, str] = {
-    ca.OP_ADD: "add",
-    ca.OP_SUB: "sub",
-    ca.OP_MUL: "mul",
-    ca.OP_DIV: "div",
-    ca.OP_NEG: "neg",
-    ca.OP_POW: "pow",
+    **{getattr(ca, f"OP_{name.upper()}"): name for name in _OWN_NAMES.split()},
     ca.OP_CONSTPOW: "pow",
-    ca.OP_SQRT: "sqrt",
-    ca.OP_EXP: "exp",
-    ca.OP_LOG: "log",
-    ca.OP_SIN: "sin",
-    ca.OP_COS: "cos",
-    ca.OP_TAN: "tan",
-    ca.OP_ASIN: "asin",
-    ca.OP_ACOS: "acos",
-    ca.OP_ATAN: "atan",
-    ca.OP_ATAN2: "atan2",
-    ca.OP_SINH: "sinh",
-    ca.OP_COSH: "cosh",
-    ca.OP_TANH: "tanh",
     ca.OP_FABS: "abs",
-    ca.OP_SIGN: "sign",
     ca.OP_FMIN: "min",
     ca.OP_FMAX: "max",
-    ca.OP_LT: "lt",
-    ca.OP_LE: "le",
-    ca.OP_EQ: "eq",
-    ca.OP_NE: "ne",
-    ca.OP_NOT: "not",
-    ca.OP_AND: "and",
-    ca.OP_OR: "or",
     ca.OP_IF_ELSE_ZERO: "if",
 }
 
@@ -79,17 +57,13 @@ class Graph:
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
 
-    def add(self, operation: str, *arguments: int) -> int:
-        """Return the number of an operation on nodes."""
-        return self._number(Node(operation, arguments))
-
-    def symbol(self, name: str) -> int:
-        """Return the number of a symbol."""
-        return self._number(Node("symbol", name=name))
-
-    def constant(self, value: float) -> int:
-        """Return the number of a constant."""
-        return self._number(Node("constant", value=value))
+    def add(self, operation: str, *arguments: int, name: str = "", value: float = 0.0) -> int:
+        """Return the number of an operation on nodes, of a "symbol" or of a "constant"."""
+        node = Node(operation, arguments, name, value)
+        if node not in self._numbers:
+            self._numbers[node] = len(self.nodes)
+            self.nodes.append(node)
+        return self._numbers[node]
 
     def read(self, expressions: Sequence[Expression]) -> list[int]:
         """Return the numbers of scalar expressions; a symbol is known by its name.
@@ -98,7 +72,7 @@ class Graph:
         not have.
         """
         dense = [ca.densify(ca.SX(e)) for e in expressions]
-        symbols = ca.symvar(ca.vertcat(*dense))
+        symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *dense))
         names = [s.name() for s in symbols]
         function = ca.Function("f", [ca.vertcat(*symbols)], dense)
         registers: dict[int, int] = {}
@@ -109,9 +83,15 @@ class Graph:
             if code == ca.OP_OUTPUT:
                 results[outputs[0]] = registers[inputs[0]]
             elif code == ca.OP_INPUT:
-                registers[outputs[0]] = self.symbol(names[inputs[1]])
+                registers[outputs[0]] = self.add("symbol", name=names[inputs[1]])
             elif code == ca.OP_CONST:
-                registers[outputs[0]] = self._finite(function.instruction_constant(k))
+                value = function.instruction_constant(k)
+                if not math.isfinite(value):
+                    raise InputError(
+                        f"An equation holds the constant {value:g}, which Modelica cannot write;"
+                        " divide by nothing that is zero and bound by nothing infinite."
+                    )
+                registers[outputs[0]] = self.add("constant", value=value)
             else:
                 registers[outputs[0]] = self._operation(code, [registers[i] for i in inputs])
         return [results[i] for i in range(len(dense))]
@@ -127,20 +107,6 @@ class Graph:
                 waiting.extend(self.nodes[number].arguments)
         return found
 
-    def _number(self, node: Node) -> int:
-        if node not in self._numbers:
-            self._numbers[node] = len(self.nodes)
-            self.nodes.append(node)
-        return self._numbers[node]
-
-    def _finite(self, value: float) -> int:
-        if not math.isfinite(value):
-            raise InputError(
-                f"An equation holds the constant {value:g}, which Modelica cannot write; divide by"
-                " nothing that is zero and bound by nothing infinite."
-            )
-        return self.constant(value)
-
     def _operation(self, code: int, arguments: list[int]) -> int:
         """Return the number of one of CasADi's operations, reduced to those that are printed."""
         if code == ca.OP_ASSIGN:
@@ -155,53 +121,44 @@ class Graph:
         )
 
     def _simplified(self, operation: str, arguments: list[int]) -> int:
-        first = self.nodes[arguments[0]]
-        if operation == "add":
-            return self._sum(*arguments)
-        if operation == "mul":
-            second = self.nodes[arguments[1]]
-            if first.operation == "log" and second.value == _LOG10:
-                return self.add("log10", *first.arguments)
-            if second.operation == "log" and first.value == _LOG10:
-                return self.add("log10", *second.arguments)
-            if first.operation == "neg":
-                return self.add("neg", self.add("mul", first.arguments[0], arguments[1]))
-        return self.add(operation, *arguments)
+        """Write log(x) / log(10) as log10(x), (-a) b as -(a b), and a pair of ifs as one if.
 
-    def _sum(self, left: int, right: int) -> int:
-        """Return left + right, where (if c then a else 0) + (if not c then b else 0) is one if."""
-        a, b = self.nodes[left], self.nodes[right]
-        if a.operation == b.operation == "if":
-            if b.arguments[0] == self.add("not", a.arguments[0]):
-                return self.add("if", *a.arguments, b.arguments[1])
-            if a.arguments[0] == self.add("not", b.arguments[0]):
-                return self.add("if", *b.arguments, a.arguments[1])
-        return self.add("add", left, right)
+        (if c then a else 0) + (if not c then b else 0) is if c then a else b.
+        """
+        if operation not in ("add", "mul"):
+            return self.add(operation, *arguments)
+        nodes = [self.nodes[a] for a in arguments]
+        for first, second in (nodes, nodes[::-1]):
+            if operation == "mul" and first.operation == "log" and second.value == _LOG10:
+                return self.add("log10", *first.arguments)
+            pair = operation == "add" and first.operation == second.operation == "if"
+            if pair and second.arguments[0] == self.add("not", first.arguments[0]):
+                return self.add("if", *first.arguments, second.arguments[1])
+        if operation == "mul" and nodes[0].operation == "neg":
+            return self.add("neg", self.add("mul", nodes[0].arguments[0], arguments[1]))
+        return self.add(operation, *arguments)
 
 
 def _square(graph: Graph, x: int) -> int:
-    return graph.add("pow", x, graph.constant(2.0))
-
-
-def _hypot(graph: Graph, x: int, y: int) -> int:
-    return graph.add("sqrt", graph.add("add", _square(graph, x), _square(graph, y)))
+    return graph.add("pow", x, graph.add("constant", value=2.0))
 
 
 def _asinh(graph: Graph, x: int) -> int:
     """Return sign(x) ln(|x| + sqrt(x^2 + 1)), which cancels nothing for negative x."""
-    root = graph.add("sqrt", graph.add("add", _square(graph, x), graph.constant(1.0)))
+    one = graph.add("constant", value=1.0)
+    root = graph.add("sqrt", graph.add("add", _square(graph, x), one))
     size = graph.add("log", graph.add("add", graph.add("abs", x), root))
     return graph.add("mul", graph.add("sign", x), size)
 
 
 #: Operations of CasADi that Modelica says in other words.
 _REWRITTEN: dict[int, Callable[..., int]] = {
-    ca.OP_TWICE: lambda g, x: g.add("mul", g.constant(2.0), x),
+    ca.OP_TWICE: lambda g, x: g.add("mul", g.add("constant", value=2.0), x),
     ca.OP_SQ: _square,
-    ca.OP_INV: lambda g, x: g.add("div", g.constant(1.0), x),
-    ca.OP_LOG1P: lambda g, x: g.add("log", g.add("add", g.constant(1.0), x)),
-    ca.OP_EXPM1: lambda g, x: g.add("sub", g.add("exp", x), g.constant(1.0)),
-    ca.OP_HYPOT: _hypot,
+    ca.OP_INV: lambda g, x: g.add("div", g.add("constant", value=1.0), x),
+    ca.OP_LOG1P: lambda g, x: g.add("log", g.add("add", g.add("constant", value=1.0), x)),
+    ca.OP_EXPM1: lambda g, x: g.add("sub", g.add("exp", x), g.add("constant", value=1.0)),
+    ca.OP_HYPOT: lambda g, x, y: g.add("sqrt", g.add("add", _square(g, x), _square(g, y))),
     ca.OP_ASINH: _asinh,
 }
 
@@ -278,21 +235,37 @@ def unit_text(unit: str) -> str:
     return re.sub(r"\bcounts\b", "1", unit.removesuffix("/counts"))
 
 
-def modifier(attributes: Iterable[tuple[str, str | None]]) -> str:
+def modifier(attributes: Mapping[str, str | None]) -> str:
     """Return the attributes that have a value in parentheses, or nothing if none has."""
-    given = [f"{name}={value}" for name, value in attributes if value is not None]
+    given = [f"{name}={value}" for name, value in attributes.items() if value is not None]
     return f"({', '.join(given)})" if given else ""
 
 
 # how tightly an operator binds
 _OR, _AND, _NOT, _RELATION, _SUM, _PRODUCT, _POWER, _ATOM = range(8)
 
-_RELATIONS = {"lt": "<", "le": "<="}
-_BOOLEAN = frozenset({"lt", "le", "eq", "ne", "not", "and", "or"})
-_FUNCTION_NAMES = (
-    "sqrt exp log log10 sin cos tan asin acos atan atan2 sinh cosh tanh abs sign min max"
-)
-_FUNCTIONS = frozenset(_FUNCTION_NAMES.split())
+#: Of numbers: the text, how it binds, and how its sides have to.
+_ARITHMETIC = {
+    "neg": ("-{0}", _SUM, [_PRODUCT]),
+    "pow": ("{0}^{1}", _POWER, [_ATOM, _ATOM]),
+    "mul": ("{0}*{1}", _PRODUCT, [_PRODUCT, _POWER]),
+    "div": ("{0}/{1}", _PRODUCT, [_PRODUCT, _POWER]),
+    "add": ("{0} + {1}", _SUM, [_SUM, _PRODUCT]),
+    "sub": ("{0} - {1}", _SUM, [_SUM, _PRODUCT]),
+}
+#: Two numbers compared, and how that binds.
+_RELATIONS = {
+    "lt": ("{0} < {1}", _RELATION),
+    "le": ("{0} <= {1}", _RELATION),
+    "eq": ("{0} <= {1} and {0} >= {1}", _AND),
+    "ne": ("{0} < {1} or {0} > {1}", _OR),
+}
+_CONNECTED = {"and": _AND, "or": _OR}
+_BOOLEAN = frozenset({*_RELATIONS, *_CONNECTED, "not"})
+_FUNCTIONS = frozenset(
+    ["sqrt", "exp", "log", "log10", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh",
+     "cosh", "tanh", "abs", "sign", "min", "max"]
+)  # fmt: skip
 
 Text = tuple[str, int]
 
@@ -311,17 +284,13 @@ class Printer:
         self._named = named or {}
         self._written: dict[int, Text] = {}
 
-    def text(self, node: int) -> str:
-        """Return a node as text, by its name if it has one."""
-        return self._number(node)[0]
-
     def definition(self, node: int) -> str:
         """Return what a node is made of, even if it has a name."""
         return self._expression(node)[0]
 
     def summand(self, node: int) -> str:
         """Return a node as it stands behind a plus or a minus."""
-        return self._within(node, _PRODUCT)
+        return _enclosed(self._number(node), _PRODUCT)
 
     def _number(self, node: int) -> Text:
         if node in self._named:
@@ -330,67 +299,43 @@ class Printer:
             self._written[node] = self._expression(node)
         return self._written[node]
 
-    def _within(self, node: int, at_least: int) -> str:
-        """Return a node in parentheses unless it binds as tightly as wanted."""
-        text, binding = self._number(node)
-        return text if binding >= at_least else f"({text})"
-
     def _expression(self, node: int) -> Text:
         it = self._graph.nodes[node]
         if it.operation == "constant":
-            return _constant(it.value)
+            whole = it.value == int(it.value) and abs(it.value) < 1e6
+            return str(int(it.value)) if whole else repr(it.value), _ATOM if it.value >= 0 else _SUM
         if it.operation == "symbol":
             return self._symbols[it.name], _ATOM
-        if it.operation in _FUNCTIONS:
-            inside = ", ".join(self._number(a)[0] for a in it.arguments)
-            return f"{it.operation}({inside})", _ATOM
         if it.operation in _BOOLEAN:
             return f"(if {self._condition(node)[0]} then 1.0 else 0.0)", _ATOM
         if it.operation == "if":
-            condition, *values = it.arguments
-            chosen, *other = (self._number(v)[0] for v in values)
+            chosen, *other = (self._number(v)[0] for v in it.arguments[1:])
             otherwise = other[0] if other else "0.0"
-            return f"(if {self._condition(condition)[0]} then {chosen} else {otherwise})", _ATOM
-        return self._arithmetic(it.operation, it.arguments)
-
-    def _arithmetic(self, operation: str, arguments: tuple[int, ...]) -> Text:
-        if operation == "neg":
-            return f"-{self._within(arguments[0], _PRODUCT)}", _SUM
-        left, right = arguments
-        if operation == "pow":
-            return f"{self._within(left, _ATOM)}^{self._within(right, _ATOM)}", _POWER
-        if operation == "mul":
-            return f"{self._within(left, _PRODUCT)}*{self._within(right, _POWER)}", _PRODUCT
-        if operation == "div":
-            return f"{self._within(left, _PRODUCT)}/{self._within(right, _POWER)}", _PRODUCT
-        sign = "+" if operation == "add" else "-"
-        return f"{self._within(left, _SUM)} {sign} {self._within(right, _PRODUCT)}", _SUM
+            condition = self._condition(it.arguments[0])[0]
+            return f"(if {condition} then {chosen} else {otherwise})", _ATOM
+        sides = [self._number(a) for a in it.arguments]
+        if it.operation in _FUNCTIONS:
+            return f"{it.operation}({', '.join(text for text, _ in sides)})", _ATOM
+        form, binding, wanted = _ARITHMETIC[it.operation]
+        return form.format(*map(_enclosed, sides, wanted)), binding
 
     def _condition(self, node: int) -> Text:
         """Return a node as a Boolean: a number is true if it is not 0."""
         it = self._graph.nodes[node]
         if node in self._named or it.operation not in _BOOLEAN:
-            text = self._within(node, _SUM)
+            text = _enclosed(self._number(node), _SUM)
             return f"{text} < 0 or {text} > 0", _OR
-        if it.operation == "not":
-            return f"not {self._condition_within(it.arguments[0], _RELATION)}", _NOT
-        if it.operation in ("and", "or"):
-            own = _AND if it.operation == "and" else _OR
-            left, right = (self._condition_within(a, own + 1) for a in it.arguments)
-            return f"{left} {it.operation} {right}", own
-        left, right = (self._within(a, _SUM) for a in it.arguments)
         if it.operation in _RELATIONS:
-            return f"{left} {_RELATIONS[it.operation]} {right}", _RELATION
-        if it.operation == "eq":
-            return f"{left} <= {right} and {left} >= {right}", _AND
-        return f"{left} < {right} or {left} > {right}", _OR
+            form, binding = _RELATIONS[it.operation]
+            return form.format(*(_enclosed(self._number(a), _SUM) for a in it.arguments)), binding
+        if it.operation == "not":
+            return f"not {_enclosed(self._condition(it.arguments[0]), _RELATION)}", _NOT
+        own = _CONNECTED[it.operation]
+        sides = (_enclosed(self._condition(a), own + 1) for a in it.arguments)
+        return f" {it.operation} ".join(sides), own
 
-    def _condition_within(self, node: int, at_least: int) -> str:
-        text, binding = self._condition(node)
-        return text if binding >= at_least else f"({text})"
 
-
-def _constant(value: float) -> Text:
-    whole = value == int(value) and abs(value) < 1e6
-    text = str(int(value)) if whole else number(value, "A constant of an equation")
-    return text, _ATOM if value >= 0 else _SUM
+def _enclosed(written: Text, at_least: int) -> str:
+    """Return a text in parentheses unless it binds as tightly as wanted."""
+    text, binding = written
+    return text if binding >= at_least else f"({text})"

@@ -16,12 +16,18 @@ import numpy as np
 from psa_casadi.characters import check_text
 from psa_casadi.effects.mechanics import RECIPROCAL_COUPLING
 from psa_casadi.errors import Problems
-from psa_casadi.export.common.icon import ICONS, SIDE, Rectangle, drawing_of
+from psa_casadi.export.common.icon import ICONS, SIDE, drawing_of
 from psa_casadi.export.common.markup import describe, generation_tool, time_scale
 from psa_casadi.export.common.publication import refuse_foreign
 from psa_casadi.export.common.templates import filled
-from psa_casadi.export.modelica.class_text import CONNECTORS, IDENTIFIERS, class_text, size_text
-from psa_casadi.export.modelica.equations import is_symbol, variable_names
+from psa_casadi.export.modelica.class_text import (
+    CONNECTORS,
+    IDENTIFIERS,
+    class_text,
+    is_symbol,
+    size_text,
+    variable_names,
+)
 from psa_casadi.export.modelica.expression import (
     Identifiers,
     check_identifier,
@@ -48,6 +54,8 @@ _SAMPLING = (
     "The sampled states change at the multiples of their period from time 0 on, as sample(0, T)"
     " says, and are constant in between."
 )
+_RESTS = "states start at rest."
+_MOVES = "states start at their start values, from where they move even if the inputs do not."
 
 
 def export_modelica(
@@ -80,7 +88,15 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
     signal = documentation(about(exported), equations_table(exported))
     classes = [class_text(exported, "Signal", "the model with plain inputs and outputs", signal)]
     if connectors:
-        classes.append(_acausal(exported, connectors))
+        connected = reciprocal(exported)
+        wiring = _WIRING if "output" in connectors else ""
+        texts = [*about(connected), wiring, _cascade_note(connected)]
+        meaning = "the model with connectors of the Modelica Standard Library 4"
+        acausal = documentation(texts, equations_table(connected))
+        classes.append(class_text(connected, "Acausal", meaning, acausal, connectors))
+    rates = exported.structure.f(*exported.at_start())[0]
+    rests = all(float(rate) == 0.0 for rate in rates.elements())
+    used = _USE + (_RESTS if rests else _MOVES)
     sampled = [_SAMPLING] if exported.sampled_names else []
     version = model.publication.version
     whole = filled(
@@ -92,8 +108,8 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
         sine=_sine(exported),
         wired=_wired(exported) if _can_be_wired(exported) else None,
         drawing=drawing,
-        rectangles=[_rectangle(shape) for shape in ICONS[drawing]],
-        annotation=documentation([*about(exported), _USE + _starts(exported), *sampled]),
+        rectangles=[_rectangle(*shape) for shape in ICONS[drawing]],
+        annotation=documentation([*about(exported), used, *sampled]),
         version=string(version) if version else "",
     )
     check_text(whole, f"The Modelica package {name}")
@@ -116,28 +132,18 @@ def connectors_of(model: Model) -> tuple[str, ...]:
 
 def reciprocal(model: Model) -> Model:
     """Return the model with action and reaction between its two masses, if it has two."""
-    if "cascade_mechanics" not in (c.name for c in model.components):
+    if not _is_cascade(model):
         return model
     return model.with_effect(RECIPROCAL_COUPLING).with_values({"reciprocal_gain": 1.0})
 
 
-def _acausal(model: Model, connectors: tuple[str, ...]) -> str:
-    """Return the class `Acausal`."""
-    connected = reciprocal(model)
-    wiring = _WIRING if "output" in connectors else ""
-    texts = [*about(connected), wiring, _cascade_note(connected)]
-    return class_text(
-        connected,
-        "Acausal",
-        "the model with connectors of the Modelica Standard Library 4",
-        documentation(texts, equations_table(connected)),
-        connectors,
-    )
+def _is_cascade(model: Model) -> bool:
+    return "cascade_mechanics" in (c.name for c in model.components)
 
 
 def _cascade_note(model: Model) -> str:
     """Return what the reaction changes; empty for a single mass."""
-    if "cascade_mechanics" not in (c.name for c in model.components):
+    if not _is_cascade(model):
         return ""
     k_P, k_B = model.values["k_P"], model.values["k_B"]
     share = k_B / (k_P + k_B)
@@ -224,18 +230,14 @@ def _wired(model: Model) -> dict[str, str]:
     }
 
 
-def _rectangle(shape: Rectangle) -> tuple[str, str]:
+def _rectangle(left: int, top: int, width: int, height: int, colour: str) -> tuple[str, str]:
     """Return extent and colour in a Modelica icon's coordinates, -100 to 100 with y upward."""
-    left, right = (_across(x) for x in (shape.left, shape.left + shape.width))
-    top, bottom = (0.0 - _across(y) for y in (shape.top, shape.top + shape.height))
-    red, green, blue = (int(shape.colour[i : i + 2], 16) for i in (1, 3, 5))
-    colour = f"{{{red}, {green}, {blue}}}"
-    return f"{{{{{left:g}, {bottom:g}}}, {{{right:g}, {top:g}}}}}", colour
-
-
-def _across(place: int) -> float:
-    """Return where a place between 0 and SIDE is between -100 and 100."""
-    return round(200 * place / SIDE - 100, 1)
+    x1, x2, y2, y1 = (
+        round(200 * v / SIDE - 100, 1) for v in (left, left + width, top, top + height)
+    )
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    extent = f"{{{{{x1:g}, {0.0 - y1:g}}}, {{{x2:g}, {0.0 - y2:g}}}}}"
+    return extent, f"{{{red}, {green}, {blue}}}"
 
 
 def documentation(paragraphs: Sequence[str], table: str = "") -> str:
@@ -246,29 +248,22 @@ def documentation(paragraphs: Sequence[str], table: str = "") -> str:
 
 def equations_table(model: Model) -> str:
     """Return an HTML table of the components: what they are, their equations, their sources."""
-    heads = "".join(f"<th>{h}</th>" for h in ("component", "what it is", "equation", "source"))
-    rows = [
+    rows = [("component", "what it is", "equation", "source")]
+    rows += [
         (c.name, c.description, c.equation_text, c.source.rstrip(".")) for c in model.components
     ]
-    lines = [
-        f"<tr>{''.join(f'<td>{escape(cell, quote=False)}</td>' for cell in row)}</tr>"
-        for row in rows
-    ]
-    return "\n".join(["<table>", f"<tr>{heads}</tr>", *lines, "</table>", ""])
+    lines = ["<table>"]
+    for k, row in enumerate(rows):
+        tag = "td" if k else "th"
+        cells = (f"<{tag}>{escape(cell, quote=False)}</{tag}>" for cell in row)
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return "\n".join([*lines, "</table>", ""])
 
 
 def about(model: Model) -> list[str]:
     """Return what the model is, who publishes it on what terms, and which program wrote it."""
     said = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
     return [describe(model), said, f"Written by {generation_tool()}."]
-
-
-def _starts(model: Model) -> str:
-    """Say whether the states rest where they start; an input starts at its own value."""
-    rates = model.structure.f(*model.at_start())[0]
-    if all(float(rate) == 0.0 for rate in rates.elements()):
-        return "states start at rest."
-    return "states start at their start values, from where they move even if the inputs do not."
 
 
 def _refuse(model: Model) -> None:
@@ -282,10 +277,9 @@ def _refuse(model: Model) -> None:
             f"Two variables of '{model.name}' are named '{name}', which Modelica does not allow;"
             " rename one."
         )
-    for name in sorted(
-        model.structure.balance_table.keys() & model.structure.out.keys() & {*model.output_names}
-    ):
-        if not is_symbol(model.structure.out[name], name):
+    out, balances = model.structure.out, model.structure.balance_table.keys()
+    for name in sorted(balances & out.keys() & {*model.output_names}):
+        if not is_symbol(out[name], name):
             problems.add(
                 f"The output '{name}' of '{model.name}' differs from the balance of that name;"
                 " rename the output."
