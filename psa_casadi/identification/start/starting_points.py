@@ -3,10 +3,10 @@
 Starting values of the linear part, from the records alone.
 
 1. Excerpts in which a static loop misses something (`excerpts`): steps, broadband, fast loops.
-2. Their poles by vector fitting, for one to five poles (`vector_fitting`).
+2. Their poles by vector fitting, for one to five poles (`vector_fit`).
 3. Poles on drive, lag, wafers and bonding layers in the few ways that make sense; poles that no
    record shows lie below those that it shows.
-4. Every such start refined by least squares with the exact response (`linear_fit`), the best ones
+4. Every such start refined by least squares with the exact response (`fit_linear`), the best ones
    to the end, and k_P/k_B as well where that explains more.
 
 The linear part fitted to excerpts: eqs. (13), (15) behind a drive and a static loop.
