@@ -16,7 +16,7 @@ from psa_casadi.reference import simulate
 from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.export.ssp_systems import END, RATE, monolithic
-from tests.studies.benchmarks.coupling_masters import load_ecos
+from tests.studies.benchmarks.coupling import load_ecos
 from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"

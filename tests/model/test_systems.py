@@ -1,12 +1,16 @@
 """Wired systems: one model, its errors, and the nanopositioner against an independent loop."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from fmpy import simulate_fmu
 
 from psa_casadi.component import Component, Equations
 from psa_casadi.errors import InputError
+from psa_casadi.export.fmu.archive import export_fmu
+from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.nanopositioner import (
     controller_for,
@@ -19,7 +23,9 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.model.system import connect
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Input, Output
+from tests.export.modelica_runs import simulated
 from tests.studies.benchmarks.nonlinearity import simulate_positioner
+from tests.tiers import slow
 
 STACK_AND_STAGE = (
     ("stack.displacement", "flexure.tip_position"),
@@ -140,3 +146,27 @@ def test_a_plant_that_cannot_be_tuned_is_refused() -> None:
     assert [p.split()[0] for p in caught.value.problems] == [
         "The", "The", "sample_time", "sensitivity",
     ]  # fmt: skip
+
+
+@slow
+def test_the_closed_loop_is_the_same_as_fmu_and_in_modelica(tmp_path: Path) -> None:
+    """A step of 5 um: the stage in fmpy and in rumoca against `run`."""
+    system = nanopositioner()
+    model = system.model()
+    span, T = 2e-3, 5e-5
+    t = np.linspace(0.0, span, 41)
+    steps = run(model, t, np.full((41, 1), 5e-6), np.zeros(len(model.state_names)), rtol=1e-9)
+    wanted = steps.y[:, model.output_names.index("stage_position")]
+    assert wanted[-1] > 4e-6
+    path = export_fmu(model, tmp_path / "loop.fmu")
+    found = simulate_fmu(
+        str(path), stop_time=span, output_interval=T, relative_tolerance=1e-9,
+        start_values={"reference": 5e-6}, output=["stage_position"], fmi_type="CoSimulation",
+    )  # fmt: skip
+    at = np.interp(t, found["time"], found["stage_position"])
+    np.testing.assert_allclose(at, wanted, atol=1e-6 * 5e-6)
+    text = modelica_text(model, name="Loop")
+    harness = "model Harness Loop.Signal positioner(reference=5e-6); end Harness;"
+    got = simulated(text + harness, "Harness", span)
+    at = np.interp(t, got["time"], got["positioner.stage_position"])
+    np.testing.assert_allclose(at, wanted, atol=1e-5 * 5e-6)
