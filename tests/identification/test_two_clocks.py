@@ -12,8 +12,8 @@ from psa_casadi.notes import texts
 from psa_casadi.records import Record, read_record
 from psa_casadi.units import FloatArray
 from tests.studies.plants.base import Run, simulate_base
-from tests.studies.plants.stack import draw_stack
 from tests.studies.plants.sensor import held
+from tests.studies.plants.stack import draw_stack
 
 #: Sampling time [s], samples, renewals in one of them, and loops in the record.
 STEP, SAMPLES, RENEWALS, LOOPS = 5e-3, 3000, 4, 40
