@@ -618,8 +618,17 @@ def in_forces(
             kept[name] = float(np.clip(value, low, high))
         if not within:
             instead = kept.get(name, usual.values[name])
-            figures = {"value": value, "unit": parameter.unit, "low": low, "high": high}
-            refused.append(note("out_of_range", name=name, instead=instead, **figures))
+            refused.append(
+                note(
+                    "out_of_range",
+                    name=name,
+                    value=value,
+                    unit=parameter.unit,
+                    low=low,
+                    high=high,
+                    instead=instead,
+                )
+            )
     found = tuple(name for name in start.parameter_names if name in kept)
     return usual.with_values(kept), found, [*notes, *refused]
 
