@@ -130,6 +130,8 @@ def coordinates_of(
         low=np.array([p.bounds[0] for p in parameters]),
         high=np.array([p.bounds[1] for p in parameters]),
         start_scale=tuple(np.array(sizes) for _ in runs),
+        first_voltage=tuple(0.0 for _ in runs),
+        compliance=0.0,
         offset_scale=1.0,
         prior=np.concatenate(
             [np.where(log, LOG_PRIOR, LINEAR_PRIOR), *([*own, 1.0] for _ in runs)]

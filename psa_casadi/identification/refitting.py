@@ -303,7 +303,9 @@ def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
     """Whether a further parameter would have a standard error below half a logarithmic unit."""
     known, count = best.unknowns, len(best.unknowns.names)
     none: list[dict[str, float]] = [{} for _ in experiments]
-    fresh = unknowns_of(best.model, [*known.names, name], none, known.offset_scale)
+    fresh = unknowns_of(
+        best.model, [*known.names, name], none, known.first_voltage, known.offset_scale
+    )
     prior = np.concatenate([fresh.prior[: count + 1], known.prior[count:]])
     unknowns = replace(fresh, started=known.started, start_scale=known.start_scale, prior=prior)
     theta = np.concatenate([np.zeros(count + 1), best.theta[count:]])

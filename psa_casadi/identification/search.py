@@ -119,8 +119,8 @@ def search(
 ) -> Search:
     """Fit the core parameters from several starts, then whatever else the data can tell.
 
-    The starts are ordinary shapes of loop with the first of the `linear` candidates (lags and
-    resonances), and the other candidates with the first shape. Each gets a quick fit; the
+    The starts are the records' loops and ordinary shapes with the first of the `linear` candidates
+    (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
     best and the second best are followed to the end, if that one is close or, with `thorough`, not
     far, to tell whether starts agree; with `thorough` more of them while all miss the records. A
     keyboard interrupt ends the search at the best fit so far, if there is one. Raises PsaError when
@@ -178,7 +178,7 @@ def _search(
         keep(best)
         best = without_blur(best, experiments)
         keep(best)
-    if (thorough or told) and not best.interrupted:
+    if thorough and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)
         not_unique |= set(open_ones)
     names = best.unknowns.names

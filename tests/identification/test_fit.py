@@ -58,7 +58,7 @@ def test_coordinates_invert_values_and_slopes_are_their_derivatives(
     effects: tuple[str, ...], seed: int
 ) -> None:
     model = model_with(*effects)
-    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], 1e-6)
+    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], [2.0, 3.0], 1e-6)
     count = len(unknowns.names)
     at_reference = unknowns.values(np.zeros(unknowns.size))
     for name in unknowns.names:
@@ -82,7 +82,7 @@ def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, 
     """Two runs differ by up to 4e-7 of the range beside the step, for they step differently."""
     model = model_with(*effects)
     experiments = [whole(record_of(model, seed, 120)) for seed in (1, 2)]
-    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], 1e-6)
+    unknowns = unknowns_of(model, free_parameters(model), [{}, {}], [2.0, 3.0], 1e-6)
     theta, step = moved(unknowns, 4), 1e-2
 
     def predicted(point: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -221,7 +221,7 @@ def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
 
 def rival_of_model(name: str, model: Model, free: Sequence[str]) -> Rival:
     """Return a model of which only the order of magnitude of its free parameters is known."""
-    unknowns = unknowns_of(model, free, [], _OFFSET)
+    unknowns = unknowns_of(model, free, [], [], _OFFSET)
     theta = unknowns.coordinates(model.values)
     return Rival(name, model, unknowns, theta, np.diag(1.0 / unknowns.prior[: len(theta)] ** 2))
 

@@ -53,6 +53,102 @@ _LEAST = 1e-6
 _EVALUATIONS, _TOLERANCE = 30, 1e-5
 
 
+def beginnings(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiments: Sequence[Experiment],
+    level: float,
+    way: Way,
+) -> FloatArray:
+    """Return theta with start and offset of the records that are held out whole; others stay.
+
+    `model` has the values of theta; `level` [m] is that of white noise which tells as little as
+    what the model misses. Raises PsaError where a record cannot be simulated.
+    """
+    found = theta.copy()
+    own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
+    for k, experiment in enumerate(experiments):
+        if not experiment.held_out_whole or not experiment.known.any():
+            continue
+        first, last = unknowns.first(k), unknowns.first(k + 1)
+        found[first:last] = 0.0
+        told = _told(unknowns, theta, experiments, k)
+        shared = {c: told[c] for c in told if unknowns.started[k][c - first] not in own}
+        found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
+        sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
+        for c in sizes.keys() & told.keys():
+            size = float(np.sqrt(np.mean(np.square(told[c]))))
+            sizes[c] = min(sizes[c], max(size, _LEAST))
+        found[list(sizes)] = _sought(model, unknowns, found, experiment, k, level, sizes, way)
+    return found
+
+
+def _told(
+    unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
+) -> dict[int, list[float]]:
+    """Return what the fitted records that begin as record k does tell of its start's coordinates.
+
+    One value for each of these records, by the coordinate's place.
+    """
+    first = unknowns.first(k)
+    size = max(float(np.ptp(e.record.voltage)) for e in experiments)
+    begins = [float(e.record.voltage[0]) for e in experiments]
+    alike = [
+        j
+        for j, other in enumerate(experiments)
+        if not other.held_out_whole and abs(begins[j] - begins[k]) <= _SAME * size
+    ]
+    found = {
+        first + place: [
+            float(theta[unknowns.first(j) + unknowns.started[j].index(name)])
+            for j in alike
+            if name in unknowns.started[j]
+        ]
+        for place, name in enumerate(unknowns.started[k])
+    }
+    return {c: values for c, values in found.items() if values}
+
+
+def _sought(
+    model: Model,
+    unknowns: Unknowns,
+    theta: FloatArray,
+    experiment: Experiment,
+    k: int,
+    level: float,
+    sizes: Mapping[int, float],
+    way: Way,
+) -> FloatArray:
+    """Return the coordinates of record k with which its first tenth fits best, of such sizes."""
+    known, columns = np.flatnonzero(experiment.known), list(sizes)
+    stop = int(known[-1]) + 1
+    y, prior = measured(experiment.record)[known], 1.0 / np.array(list(sizes.values()))
+
+    def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        there = theta.copy()
+        there[columns] = own
+        try:
+            run = trace_record(
+                model, experiment.record, unknowns.start(there, k), (), stop=stop, way=way
+            )
+        except PsaError:
+            return None
+        by_start, by_offset = unknowns.place_slopes(there, k)
+        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / level
+        missed = (run.output[known] + unknowns.offset(there, k) - y) / level
+        return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
+
+    free = np.full(len(columns), np.inf)
+    found = minimise(  # the last coordinate is the offset, exactly linear
+        evaluate, np.zeros(len(columns)), (-free, free), tolerance=_TOLERANCE,
+        evaluations=_EVALUATIONS, linear=(len(columns) - 1,),
+    )  # fmt: skip
+    if found is None:
+        raise PsaError("A held-out record cannot be simulated from where the others begin.")
+    return found.theta
+
+
 #: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
 #: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
 #: then the stepper is taken.
@@ -266,92 +362,22 @@ class Fit:
         )  # fmt: skip
 
     def placed(self, experiments: Sequence[Experiment]) -> FloatArray:
-        """Return theta with where records begin that are held out whole, which no fit has seen.
+        """Return theta with where held-out records begin (`beginnings`), which no fit has seen."""
+        return beginnings(
+            self.model, self.unknowns, self.theta, experiments, self._doubt(), self.way
+        )
 
-        What the model misses counts as white noise that tells as little: samples that are alike
-        count as one, so its level is rms sqrt((1 + r)/(1 - r)) with r the correlation of
-        neighbours. Raises PsaError where a record cannot be simulated.
+    def _doubt(self) -> float:
+        """Return the level [m] of white noise that tells as little as what the model misses.
+
+        Samples that are alike count as one: rms sqrt((1 + r)/(1 - r)), r the correlation of
+        neighbours.
         """
         left = self.residuals
         power = float(left @ left)
         r = float(left[1:] @ left[:-1]) / power if power > 0.0 else 0.0
         r = min(max(r, 0.0), _MOST_ALIKE)
-        level = max(self.rms * float(np.sqrt((1.0 + r) / (1.0 - r))), 1e-15)
-        found, u = self.theta.copy(), self.unknowns
-        own = {s.name for c in self.model.components if c.belongs_to != "plant" for s in c.states}
-        for k, experiment in enumerate(experiments):
-            if not experiment.held_out_whole or not experiment.known.any():
-                continue
-            first, last = u.first(k), u.first(k + 1)
-            found[first:last] = 0.0
-            told = self._told(experiments, k)
-            shared = {c: told[c] for c in told if u.started[k][c - first] not in own}
-            found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
-            sizes = {c: float(u.prior[c]) for c in range(first, last) if c not in shared}
-            for c in sizes.keys() & told.keys():
-                size = float(np.sqrt(np.mean(np.square(told[c]))))
-                sizes[c] = min(sizes[c], max(size, _LEAST))
-            found[list(sizes)] = self._sought(experiment, k, found, level, sizes)
-        return found
-
-    def _told(self, experiments: Sequence[Experiment], k: int) -> dict[int, list[float]]:
-        """Return what the fitted records that begin as record k does tell of its start.
-
-        One value for each of these records, by the coordinate's place.
-        """
-        u, begins = self.unknowns, [float(e.record.voltage[0]) for e in experiments]
-        size = max(float(np.ptp(e.record.voltage)) for e in experiments)
-        alike = [
-            j
-            for j, other in enumerate(experiments)
-            if not other.held_out_whole and abs(begins[j] - begins[k]) <= _SAME * size
-        ]
-        found = {
-            u.first(k) + place: [
-                float(self.theta[u.first(j) + u.started[j].index(name)])
-                for j in alike
-                if name in u.started[j]
-            ]
-            for place, name in enumerate(u.started[k])
-        }
-        return {c: values for c, values in found.items() if values}
-
-    def _sought(
-        self,
-        experiment: Experiment,
-        k: int,
-        theta: FloatArray,
-        level: float,
-        sizes: Mapping[int, float],
-    ) -> FloatArray:
-        """Return the coordinates of record k, of such sizes, with which its first tenth fits."""
-        known, columns, u = np.flatnonzero(experiment.known), list(sizes), self.unknowns
-        stop = int(known[-1]) + 1
-        y, prior = measured(experiment.record)[known], 1.0 / np.array(list(sizes.values()))
-
-        def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-            there = theta.copy()
-            there[columns] = own
-            try:
-                run = trace_record(
-                    self.model, experiment.record, u.start(there, k), (), stop=stop, way=self.way
-                )
-            except PsaError:
-                return None
-            slopes = run.sensitivity @ u.start_slopes(there, k)
-            slopes[:, u.first(k + 1) - 1] = u.offset_scale
-            slopes = slopes[known][:, columns] / level
-            missed = (run.output[known] + u.offset(there, k) - y) / level
-            return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
-
-        free = np.full(len(columns), np.inf)
-        found = minimise(  # the last coordinate is the offset, exactly linear
-            evaluate, np.zeros(len(columns)), (-free, free), tolerance=_TOLERANCE,
-            evaluations=_EVALUATIONS, linear=(len(columns) - 1,),
-        )  # fmt: skip
-        if found is None:
-            raise PsaError("A held-out record cannot be simulated from where the others begin.")
-        return found.theta
+        return max(self.rms * float(np.sqrt((1.0 + r) / (1.0 - r))), 1e-15)
 
 
 @contextmanager
@@ -394,15 +420,7 @@ def fit(
         raise InputError(["No sample with a displacement is left to fit; give more data."])
     placed = model.with_values(start or {})
     unknowns = unknowns_around(model, free, experiments, sigma, placed=placed)
-    values = {**model.values, **(start or {})}
-    theta = np.zeros(unknowns.size)
-    theta[: len(unknowns.names)] = unknowns.coordinates(values)
-    slope = values["G"] * values["k_L"] * static_compliance(values)
-    for r, e in enumerate(experiments):
-        if e.used.any():
-            y, v = measured(e.record)[e.used], e.record.voltage[e.used]
-            offset = float(np.mean(y) - slope * np.mean(v))
-            unknowns.place(theta, r, start_states[r] if start_states else {}, offset)
+    theta = _starting_point(model, experiments, unknowns, start or {}, start_states)
     minimum, way, told = accurate_minimum(
         model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
         rtol=rtol, goal=goal, radius=radius, patient=patient,
@@ -435,5 +453,26 @@ def unknowns_around(
     """Return the coordinates of a fit around a model's values, `placed` where it begins."""
     scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
     motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
-    unknowns = unknowns_of(model, free, motions, 30.0 * max(scale, 1e-12))
+    first = [float(e.record.voltage[0]) for e in experiments]
+    unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
     return unknowns.without([k for k, e in enumerate(experiments) if not e.used.any()])
+
+
+def _starting_point(
+    model: Model,
+    experiments: Sequence[Experiment],
+    unknowns: Unknowns,
+    start: Mapping[str, float],
+    start_states: Sequence[Mapping[str, float]] | None,
+) -> FloatArray:
+    values = {**model.values, **start}
+    theta = np.zeros(unknowns.size)
+    theta[: len(unknowns.names)] = unknowns.coordinates(values)
+    for r, experiment in enumerate(experiments):
+        if not experiment.used.any():
+            continue
+        given = start_states[r] if start_states else {}
+        y, v = measured(experiment.record)[experiment.used], experiment.record.voltage
+        slope = values["G"] * values["k_L"] * static_compliance(values)
+        unknowns.place(theta, r, given, float(np.mean(y) - slope * np.mean(v[experiment.used])))
+    return theta

@@ -175,9 +175,10 @@ def traced_by_theta(
     start = unknowns.start(theta, index)
     found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
     count = len(unknowns.names)
-    by_theta = found.sensitivity[:, count:] @ unknowns.start_slopes(theta, index)
-    by_theta[:, :count] += found.sensitivity[:, :count] @ slopes
-    return found.output, by_theta, found.way
+    start_slopes = unknowns.place_slopes(theta, index)[0]
+    by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
+    by_theta[:count, :count] = slopes
+    return found.output, found.sensitivity @ by_theta, found.way
 
 
 def predict(
@@ -209,7 +210,7 @@ def predict(
             x, jacobian, way_taken = traced_by_theta(
                 model, record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
             )
-            jacobian[:, unknowns.first(index + 1) - 1] = unknowns.offset_scale
+            jacobian += unknowns.place_slopes(theta, index)[1]
         return Prediction(x + unknowns.offset(theta, index), jacobian, way_taken)
 
     return side_by_side(one, range(len(experiments)))

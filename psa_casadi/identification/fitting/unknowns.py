@@ -40,8 +40,9 @@ class Unknowns:
     with weak bends fixes s and the two products, and hardly A itself; so its valley is straight
     here, and A without bound (Rayleigh's quadratic loop) lies at a finite distance.
     `started` names, per record, the states whose start is searched, as deviations from where the
-    record's first voltage and rate put them. Where the loop has its own coordinates, that of a
-    record's memory is q_0 = f_H(0) / A: what follows keeps its form when A moves.
+    record's first voltage and rate put them. Where the loop has its own coordinates, those of a
+    record's memory and offset are q_0 = f_H(0) / A and the offset plus C A (q_0 - v_0), with the
+    first voltage v_0 and the static compliance C [m/N]: what follows keeps its place when A moves.
     `prior` holds the standard deviation of every coordinate's weak prior (infinite for offsets),
     centred at 0.
     """
@@ -54,6 +55,8 @@ class Unknowns:
     low: FloatArray
     high: FloatArray
     start_scale: tuple[FloatArray, ...]
+    first_voltage: tuple[float, ...]
+    compliance: float
     offset_scale: float
     prior: FloatArray
     loop: tuple[int, ...] | None = None
@@ -152,36 +155,11 @@ class Unknowns:
     def start(self, theta: FloatArray, record: int) -> dict[str, float]:
         """Return the deviations of one record's initial state, in the states' units."""
         first, names = self.first(record), self.started[record]
-        deviations = theta[first : first + len(names)] * self._start_sizes(theta, record)
-        return dict(zip(names, deviations.tolist(), strict=True))
-
-    def start_slopes(self, theta: FloatArray, record: int) -> FloatArray:
-        """Return d start / d theta, shape (started, size)."""
-        first, count = self.first(record), len(self.started[record])
-        slopes, sizes = np.zeros((count, self.size)), self._start_sizes(theta, record)
-        slopes[:, first : first + count] = np.diag(sizes)
-        if self.loop is not None and _CARRIED in self.started[record]:
-            row, a, a_ref = self.started[record].index(_CARRIED), *self._amplitudes(theta)
-            slopes[row, self.loop[1]] = -theta[first + row] * sizes[row] * a / a_ref
-        return slopes
-
-    def _start_sizes(self, theta: FloatArray, record: int) -> FloatArray:
-        """Return the size of a unit of every start's coordinate, in the states' units."""
-        sizes, names = self.start_scale[record], self.started[record]
-        if self.loop is None or _CARRIED not in names:
-            return sizes
-        a, a_ref = self._amplitudes(theta)
-        return np.where([n == _CARRIED for n in names], sizes * a / a_ref, sizes)
-
-    def _amplitudes(self, theta: FloatArray) -> tuple[float, float]:
-        """Return the loop's A at theta, without all other values, and its reference."""
-        k = self.loop[1] if self.loop is not None else 0
-        a_ref = float(self.reference[k])
-        return float(np.clip(a_ref / (1.0 + theta[k]), self.low[k], self.high[k])), a_ref
-
-    def offset(self, theta: FloatArray, record: int) -> float:
-        """Return the sensor's offset in one record [m]."""
-        return float(theta[self.first(record + 1) - 1]) * self.offset_scale
+        deviations = theta[first : first + len(names)] * self.start_scale[record]
+        found = dict(zip(names, deviations.tolist(), strict=True))
+        if self._carries(record):
+            found[_CARRIED] *= self._amplitude(theta) / self._a_ref
+        return found
 
     def place(
         self, theta: FloatArray, record: int, states: Mapping[str, float], offset: float
@@ -191,9 +169,51 @@ class Unknowns:
         The parameters' coordinates must stand in theta.
         """
         first, last = self.first(record), self.first(record + 1) - 1
-        found = np.array([states.get(n, 0.0) for n in self.started[record]])
-        theta[first:last] = found / self._start_sizes(theta, record)
+        found = {n: states.get(n, 0.0) for n in self.started[record]}
+        if self._carries(record):
+            a = self._amplitude(theta)
+            offset += self.compliance * (found[_CARRIED] - a * self.first_voltage[record])
+            found[_CARRIED] *= self._a_ref / a
+        theta[first:last] = np.array(list(found.values())) / self.start_scale[record]
         theta[last] = offset / self.offset_scale
+
+    def place_slopes(self, theta: FloatArray, record: int) -> tuple[FloatArray, FloatArray]:
+        """Return d start / d theta, shape (started, size), and d offset / d theta (size,)."""
+        first, last = self.first(record), self.first(record + 1) - 1
+        start, offset = np.zeros((last - first, self.size)), np.zeros(self.size)
+        start[:, first:last] = np.diag(self.start_scale[record])
+        offset[last] = self.offset_scale
+        if self.loop is not None and self._carries(record):
+            row, count = self.started[record].index(_CARRIED), len(self.names)
+            a, by_a = self._amplitude(theta), np.zeros(count)
+            by_a[self.loop[1]] = -a * a / self._a_ref
+            q = self.start(theta, record)[_CARRIED] / a
+            start[row, first + row] *= a / self._a_ref
+            start[row, :count] = q * by_a
+            offset[first + row] = -self.compliance * start[row, first + row]
+            offset[:count] = -self.compliance * (q - self.first_voltage[record]) * by_a
+        return start, offset
+
+    def _carries(self, record: int) -> bool:
+        return self.loop is not None and _CARRIED in self.started[record]
+
+    def _amplitude(self, theta: FloatArray) -> float:
+        """Return the loop's A at theta, without all other values."""
+        k = self.loop[1] if self.loop is not None else 0
+        a = self.reference[k] / (1.0 + theta[k])
+        return float(min(max(a, self.low[k]), self.high[k]))
+
+    @property
+    def _a_ref(self) -> float:
+        return float(self.reference[self.loop[1]]) if self.loop is not None else 1.0
+
+    def offset(self, theta: FloatArray, record: int) -> float:
+        """Return the sensor's offset in one record [m]."""
+        offset = float(theta[self.first(record + 1) - 1]) * self.offset_scale
+        if self._carries(record):
+            bent = self._amplitude(theta) * self.first_voltage[record]
+            offset -= self.compliance * (self.start(theta, record)[_CARRIED] - bent)
+        return offset
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return lower and upper bounds of theta."""
@@ -218,12 +238,14 @@ def unknowns_of(
     model: Model,
     free: Sequence[str],
     motions: Sequence[Mapping[str, float]],
+    first_voltage: Sequence[float],
     offset_scale: float,
 ) -> Unknowns:
     """Set up the coordinates around a model's values.
 
     `motions` names for every record the states beside the memories whose start is searched, each
-    with the size of an ordinary deviation, in the state's unit.
+    with the size of an ordinary deviation, in the state's unit; `first_voltage` [V] is where each
+    record starts.
     """
     parameters = [model.parameter(n) for n in free]
     values: Mapping[str, float] = model.values
@@ -247,6 +269,8 @@ def unknowns_of(
         low=np.array([p.bounds[0] for p in parameters]),
         high=np.array([p.bounds[1] for p in parameters]),
         start_scale=tuple(np.array([*sizes.values(), *motion.values()]) for motion in motions),
+        first_voltage=tuple(first_voltage),
+        compliance=static_compliance(values),
         offset_scale=offset_scale,
         prior=np.concatenate([prior, *each]),
         loop=loop,
@@ -274,6 +298,32 @@ def memory_priors(model: Model) -> tuple[float, ...]:
 def memory_prior(state: State) -> float:
     """Return the standard deviation of the weak prior of a state's start, in usual sizes."""
     return SETTLING_PRIOR if state.memory and state.settles else MEMORY_PRIOR
+
+
+class Searched(Protocol):
+    """The coordinates of a fit: parameters by name, then what every record has of its own.
+
+    `prior` (size,) are the standard deviations of their weak priors, infinite where there is none.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
+    @property
+    def started(self) -> tuple[tuple[str, ...], ...]:
+        """Names of what every record has of its own."""
+
+    @property
+    def prior(self) -> FloatArray:
+        """Standard deviations of the weak priors (size,)."""
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+
+    def first(self, record: int) -> int:
+        """Return the index of the first coordinate of one record."""
 
 
 class FittedColumn(Protocol):
@@ -320,7 +370,7 @@ class Fitted(Protocol):
         """Derivatives of the prediction by theta (n, size)."""
 
     @property
-    def unknowns(self) -> Unknowns:
+    def unknowns(self) -> Searched:
         """The coordinates of the fit."""
 
     @property

@@ -198,11 +198,13 @@ _CAPACITANCE = 1.6e-6
 #: Typical ratio of the peak hysteresis force to the linear force.
 _HYSTERESIS_SHARE = 0.1
 
-#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The first saturates early, far
-#: within the range; from the second a fit of such a loop ends with a steep A and no bend.
+#: Shapes of loop to start from: A, beta, gamma over k_L, and n. The second saturates early, far
+#: within the range; from the others a fit of such a loop ends with a steep A and no bend.
 LOOP_SHAPES: tuple[Mapping[str, float], ...] = (
-    {"A": -0.35, "beta": 0.6, "gamma": 0.02, "n": 1.4},
     {"A": -0.3, "beta": 0.3, "gamma": 0.1, "n": 1.3},
+    {"A": -0.35, "beta": 0.6, "gamma": 0.02, "n": 1.4},
+    {"A": -0.15, "beta": 0.05, "gamma": 0.05, "n": 1.1},
+    {"A": -0.3, "beta": 0.1, "gamma": 0.1, "n": 1.05},
 )
 
 
@@ -233,8 +235,8 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "C_p": _CAPACITANCE if told is None else told.value,
         "k_P": k_p,
         "k_B": k_b,
-        **{name: share * k_l for name, share in LOOP_SHAPES[1].items() if name != "n"},
-        "n": LOOP_SHAPES[1]["n"],
+        **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
+        "n": LOOP_SHAPES[0]["n"],
     }
     try:
         return compose(BASE, {**values, **_within(_lags(values, sample_time))})
@@ -268,12 +270,12 @@ def chosen_start(
     return model.with_values(scaled), True
 
 
-def loop_starts(model: Model) -> list[tuple[str, dict[str, float]]]:
-    """Return starting values for the hysteresis by name, scaled to the model's k_L."""
+def loop_starts(model: Model) -> list[dict[str, float]]:
+    """Return starting values for the hysteresis, scaled to the model's k_L."""
     k_l = model.values["k_L"]
     return [
-        (f"loop shape {k}", {n: v if n == "n" else v * k_l for n, v in shape.items()})
-        for k, shape in enumerate(LOOP_SHAPES, 1)
+        {name: value if name == "n" else value * k_l for name, value in shape.items()}
+        for shape in LOOP_SHAPES
     ]
 
 

@@ -41,6 +41,7 @@ from psa_casadi.identification.start.linear_response import (
     respond,
     vector_fit,
 )
+from psa_casadi.identification.start.loop_start import loop_start
 from psa_casadi.identification.start.ordinary import has_loop, loop_starts
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
@@ -626,12 +627,18 @@ _MASSES = ("m_P", "m_B")
 def starting_points(
     model: Model, linear: Sequence[LinearCandidate], records: Sequence[Record]
 ) -> list[tuple[str, dict[str, float]]]:
-    """Return the starts by name: shapes that loops usually have, then dynamics that records show.
+    """Return the starts by name; static gain and loop keep their size where k_P moves.
 
-    The model's own loop where its hysteresis is none of Bouc-Wen's. Static gain and loop keep their
-    size where k_P moves.
+    The loop that the records show comes first, then shapes that loops usually have: fewer of them
+    where the records show a loop, and where they show dynamics to try. The model's own loop where
+    its hysteresis is none of Bouc-Wen's.
     """
-    shapes = [("the model's own loop", {})] if not has_loop(model) else loop_starts(model)
+    shapes: list[tuple[str, dict[str, float]]] = [("the model's own loop", {})]
+    if has_loop(model):
+        shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
+        shown = loop_start(model, records)
+        if shown is not None:
+            shapes = [("the records' loops", shown), *shapes[: 1 if linear else 2]]
     if not linear:
         return shapes
     bounds = {p.name: p.bounds for p in model.structure.parameters}
