@@ -234,7 +234,7 @@ def _estimate(value: float, low: float, high: float) -> str:
 
 
 OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
-    "own_diagnosis": lambda d: labelled(own_lines(d), 100),
+    "own_diagnosis": lambda d: f"{d.verdict}\n{labelled(own_lines(d), 100)}",
     "own_identification": _identification,
     "moved": lambda name, estimate, without, unit, causes: (
         f"{name} = {with_unit(_estimate(*estimate), unit)}, without the cause{'s' * (causes > 1)}"
