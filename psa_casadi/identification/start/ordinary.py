@@ -34,7 +34,6 @@ from psa_casadi.model.compose import Model, compose
 from psa_casadi.notes import note, texts
 from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval
 
 #: Forms of the hysteresis by name; `best` is the one that the records prefer.
@@ -152,11 +151,6 @@ def _by_charge(records: Sequence[Record]) -> Capacitance | None:
         return None
     # what is left is a loop, not noise: its width does not average out
     return Capacitance(value, float(np.sqrt(rest / power)), explained, "charge")
-
-
-def _unevenness(time: FloatArray) -> float:
-    steps = np.diff(time)
-    return float(np.ptp(steps) / np.mean(steps))
 
 
 def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float]:
