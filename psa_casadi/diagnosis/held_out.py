@@ -25,7 +25,7 @@ import scipy
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import predicted_further
-from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.fitting.prediction import Prediction, measured
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -110,19 +110,25 @@ def held_out_rms(experiments: Sequence[Experiment], predicted: Sequence[FloatArr
     return rms(np.concatenate(held_out_residuals(experiments, predicted)))
 
 
-def held_out_further(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
-    """Return the root mean square errors of the further columns over all held-out samples.
+def held_out_further(
+    fit: Fit, experiments: Sequence[Experiment], predictions: Sequence[Prediction]
+) -> tuple[float, ...]:
+    """Return the root mean square errors of the further channels over all held-out samples.
 
-    In their SI units; those of the fitted samples where none is held out. Raises PsaError.
+    In their units; those of the fitted samples where none is held out. The predictions are those of
+    whole records.
     """
     found = []
-    theta = fit.placed(experiments)
     for f in fit.further:
-        shown = predicted_further(fit.model, experiments, fit.unknowns, theta, f, way=fit.way)
-        pairs = [(experiments[k], x) for k, x in shown.items()]
-        held = np.concatenate([(getattr(e.record, f.column) - x)[e.held_out] for e, x in pairs])
+        rows = predicted_further(experiments, predictions, f).items()
+        held = np.concatenate([_held_out(experiments[k], f.number, shown) for k, shown in rows])
         found.append(rms(held) if held.size else f.rms)
     return tuple(found)
+
+
+def _held_out(e: Experiment, channel: int, shown: FloatArray) -> FloatArray:
+    at = e.at(channel, e.held_out)
+    return np.asarray((e.measured(channel) - shown)[at] / e.share(channel))
 
 
 def held_out_gain(

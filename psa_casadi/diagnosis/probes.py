@@ -29,8 +29,7 @@ from psa_casadi.component import (
 )
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.further import COLUMNS, Further, measured_in, with_column
-from psa_casadi.identification.fitting.prediction import OUTPUT, measured, trace_record
+from psa_casadi.identification.fitting.prediction import measured, outputs_of, trace_record
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import tells_tone
@@ -282,26 +281,21 @@ def _changes(
     rtol = fit.way.rtol if step else _RTOL
     rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
 
-    def changed(k: int, output: str) -> FloatArray:
-        """Return an output after the step, or its changes along the derivatives (samples, m)."""
+    def changed(k: int) -> FloatArray:
+        """Return outputs after the step, or their changes along the derivatives (n, outputs, m)."""
         e = experiments[k]
         if e.held_out_whole:
-            return np.zeros((0, len(moved)))
+            return np.zeros((0, len(outputs), len(moved)))
         found = trace_record(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
-            stop=e.stop, way=Way(rtol, rtol), by_start=False, output=output,
+            stop=e.stop, way=Way(rtol, rtol), by_start=False, outputs=outputs,
         )  # fmt: skip
-        own = found.output[:, None] if step else found.sensitivity * sizes
+        own = found.y[:, :, None] if step else found.sensitivity * sizes
         return own[e.used[: e.stop]]
 
-    def in_column(f: Further, k: int) -> FloatArray:
-        e = experiments[k]
-        total = (-measured_in(e, f.column) if step else np.zeros(int(e.used.sum())))[:, None]
-        for factor, output in zip(f.factors, COLUMNS[f.column].outputs, strict=True):
-            total = total + factor * changed(k, output)
-        return total
-
-    parts, further = [changed(k, OUTPUT) for k in range(len(experiments))], []
+    outputs = outputs_of(experiments[0].channels)
+    every = [changed(k) for k in range(len(experiments))]
+    parts, further = [own[:, 0] for own in every], []
     if step:
         for k, (e, residual) in enumerate(
             zip(experiments, fit.residuals_of(experiments), strict=True)
@@ -309,8 +303,14 @@ def _changes(
             shown = measured(e.record)[: e.stop][e.used[: e.stop]]
             parts[k] = parts[k] + (fit.offset(k) - (shown - residual))[:, None]
     for f in fit.further:
-        records = with_column(experiments, f.column)
-        left = f.left_of(np.concatenate([in_column(f, k) for k in records]))
+        columns = []
+        for k in f.records:
+            e = experiments[k]
+            total = -e.measured(f.number)[e.used][:, None] if step else 0.0
+            for factor, name in zip(f.factors, f.channel.outputs, strict=True):
+                total = total + factor * every[k][:, outputs.index(name)]
+            columns.append(total)
+        left = f.left_of(np.concatenate(columns))
         further.append(left + f.residuals[:, None] if step else left)
     return np.concatenate(parts), tuple(further)
 

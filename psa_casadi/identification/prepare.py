@@ -1,12 +1,13 @@
 """What is done to records before they are fitted: masks, one clock, averages, further columns."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.further import COLUMNS, with_column
+from psa_casadi.identification.fitting.further import COLUMNS, SENSORS, with_column
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.identification.start.ordinary import capacitance_of
@@ -16,7 +17,7 @@ from psa_casadi.notes import Note, note
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import MOST, Experiment, Level
+from psa_casadi.records.split import MOST, Experiment
 from psa_casadi.records.suspects import cleaned, masked, suspects
 
 
@@ -84,9 +85,10 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
         given = [r for r in records if getattr(r, column) is not None]
         if not given:
             continue
-        wider = model
-        if shown.sensor is not None and shown.sensor.name not in (c.name for c in model.components):
-            wider = _with_sensor(model, column)
+        wider, sensor = model, SENSORS.get(column)
+        if sensor is not None and sensor.name not in (c.name for c in model.components):
+            with suppress(InputError):  # where that finds nothing to show
+                wider = model.with_components((*model.components, sensor))
         missing = [o for o in shown.outputs if o not in wider.output_names]
         if missing:
             problems.append(
@@ -114,19 +116,9 @@ def with_levels(
         if values:
             noise = max(fast_noise(v) for v in values)
             spread = max(float(np.std(v)) for v in values)
-            levels.append(Level(column, max(noise, _FIRST_LEVEL * spread)))
-    return tuple(replace(e, further=tuple(levels)) for e in experiments)
-
-
-def _with_sensor(model: Model, column: str) -> Model:
-    """Return the model with the sensor of a column; as it is where that finds nothing to show."""
-    sensor = COLUMNS[column].sensor
-    if sensor is None:
-        return model
-    try:
-        return model.with_components((*model.components, sensor))
-    except InputError:
-        return model
+            level = max(noise, _FIRST_LEVEL * spread)
+            levels.append(replace(COLUMNS[column], level=level))
+    return tuple(e.beside(levels) for e in experiments)
 
 
 def _says_nothing(column: str, records: Sequence[Record]) -> str:

@@ -26,7 +26,7 @@ from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, Level
+from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
 from psa_casadi.units import FloatArray
 
@@ -150,11 +150,11 @@ def relevelled(best: Fit, experiments: Sequence[Experiment]) -> tuple[Fit, tuple
     for _ in range(_LEVEL_ROUNDS if best.further else 0):
         if best.interrupted:
             break
-        levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in best.further)
+        levels = [f.relevelled() for f in best.further]
         pairs = zip(best.further, levels, strict=True)
-        if all(abs(float(np.log(f.level / q.value))) < _SAME_LEVEL for f, q in pairs):
+        if all(abs(float(np.log(f.level / q.level))) < _SAME_LEVEL for f, q in pairs):
             break
-        now = tuple(replace(e, further=levels) for e in now)
+        now = tuple(e.beside(levels) for e in now)
         best = refit_or_keep(best, now, best.unknowns.names, best.sigma)
     return best, now
 

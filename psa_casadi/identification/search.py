@@ -323,7 +323,7 @@ def without_column(experiments: Sequence[Experiment], column: str) -> tuple[Expe
         replace(
             e,
             record=replace(e.record, **gone),
-            further=tuple(q for q in e.further if q.column != column),
+            channels=tuple(q for q in e.channels if q.column != column),
         )
         for e in experiments
     )
@@ -350,7 +350,7 @@ def loads_as_curves(
         sign = np.sign(np.cov(load[seen], y[seen])[0, 1]) or 1.0
         shown = np.where(seen, load * sign * e.record.range_m / span, np.nan)
         record = replace(e.record, displacement=shown, load_force=None)
-        as_displacement.append(replace(e, record=record, further=()))
+        as_displacement.append(replace(e, record=record).beside(()))
     ways = [
         fit_base(start, own, progress=progress).predicted(own)
         for own in (unloaded, tuple(as_displacement))

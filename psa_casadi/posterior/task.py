@@ -16,6 +16,7 @@ from psa_casadi.identification.fitting.fit import (
 )
 from psa_casadi.identification.fitting.further import further_of
 from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum
+from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import noise_levels
@@ -25,7 +26,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note
 from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, Level, whole, without_gaps
+from psa_casadi.records.split import Experiment, whole, without_gaps
 from psa_casadi.simulation.simulate import Way
 from psa_casadi.units import FloatArray
 
@@ -208,9 +209,9 @@ def task_of(
         ends = np.cumsum([e.used.sum() for e in experiments])
         own = np.split(found.residual[: len(weights)] * weights, ends[:-1])
         sigma = [max(float(np.sqrt(np.mean(r**2))), 1e-15) for r in own]
-        beside = further_of(centre, experiments, unknowns, theta, way=way)
-        levels = tuple(Level(f.column, max(f.rms, f.straight)) for f in beside)
-        experiments = tuple(replace(e, further=levels) for e in experiments)
+        shown = predict(centre, experiments, unknowns, theta, way=way, further=True)
+        levels = [f.relevelled() for f in further_of(experiments, shown)]
+        experiments = tuple(e.beside(levels) for e in experiments)
     return _task(
         centre, experiments, unknowns, found, way, sigma,
         (*said, *(s for _, own in ready for s in own), *columns.left_out),

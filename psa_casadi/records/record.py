@@ -237,6 +237,16 @@ class Record(Plotted):
         )
 
     @property
+    def hold(self) -> Literal["linear", "zero"]:
+        """What inputs do between samples: they are linear."""
+        return "linear"
+
+    def column(self, name: str) -> FloatArray | None:
+        """Return the samples (n,) of a column by its name, None where it was not recorded."""
+        values: FloatArray | None = getattr(self, name, None) if name in COLUMNS else None
+        return values
+
+    @property
     def recorded(self) -> dict[str, FloatArray]:
         """The columns that were recorded beside the time, by name, shape (n,) each."""
         there = {c: getattr(self, c) for c in ("voltage", *_OPTIONAL)}

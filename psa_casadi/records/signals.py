@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -81,6 +82,20 @@ class Signals:
     def n(self) -> int:
         """Number of samples."""
         return self.time.size
+
+    @property
+    def mask(self) -> npt.NDArray[np.bool_]:
+        """True for every sample, shape (n,); missing readings of an output are nan."""
+        return np.ones(self.n, dtype=np.bool_)
+
+    @cached_property
+    def sample_time(self) -> float:
+        """Median distance between samples [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    def column(self, name: str) -> FloatArray | None:
+        """Return the samples (n,) of a column by its name, None where it was not recorded."""
+        return self.columns.get(name)
 
     @property
     def duration(self) -> float:

@@ -1,7 +1,7 @@
 """Parts of records: training and held-out samples, gaps, kinds of stretches, and excerpts."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import NamedTuple
 
@@ -153,26 +153,56 @@ _SHOWN = 0.05
 
 
 @dataclass(frozen=True)
-class Level:
-    """The noise level that weights a further column of the records in a fit, in its SI unit."""
+class Channel:
+    """A column of the records that is fitted, and what of a model it shows.
+
+    `outputs` are those of the model, in the column's `unit`. With an `offset`, every record has its
+    own; with `factors`, every output has one, the same in all records, and the first factor is that
+    of `scale`, a parameter of the sensor, where there is one. `level` is the noise level that
+    weights it; the model is taken to be right to the share `straight` of what is shown (of its rms
+    about the offsets; of the range where there are no factors): a smaller error says nothing of a
+    device.
+    """
 
     column: str
-    value: float
+    unit: str
+    outputs: tuple[str, ...]
+    straight: float = 1e-3
+    scale: str | None = None
+    offset: bool = True
+    factors: bool = True
+    level: float = 0.0
+
+
+#: The first channel of a stack.
+DISPLACEMENT = Channel("displacement", "m", ("measured_displacement",), straight=0.0, factors=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """A record with the samples that count for a fit (`used`) and those held out for judging it.
 
-    A record that is held out whole has no used ones: see `judging`. `further` are the columns
-    beside the displacement that are fitted as well; the same in all experiments of a fit, whether a
-    record has them or not.
+    A record that is held out whole has no used ones: see `judging`. `channels` are the columns that
+    are fitted, the first one foremost; the same in all experiments of a fit, whether a record has
+    them or not. `noise` is that of every channel over what is usual in all experiments, 1 where
+    nothing else is known. `known_start` says that the state at its start is the declared one.
     """
 
     record: Record
     used: BoolArray
     held_out: BoolArray
-    further: tuple[Level, ...] = ()
+    channels: tuple[Channel, ...] = (DISPLACEMENT,)
+    noise: tuple[float, ...] | None = None
+    known_start: bool = False
+
+    @property
+    def further(self) -> tuple[Channel, ...]:
+        """The channels beside the first."""
+        return self.channels[1:]
+
+    def beside(self, further: Iterable[Channel]) -> "Experiment":
+        """Return the experiment with other channels beside the first."""
+        return replace(self, channels=(self.channels[0], *further))
 
     @property
     def held_out_whole(self) -> bool:
@@ -189,6 +219,22 @@ class Experiment:
     def stop(self) -> int:
         """One past the last used sample: a fit need not simulate further; 0 without any."""
         return int(np.max(np.flatnonzero(self.used), initial=-1)) + 1
+
+    def share(self, channel: int) -> float:
+        """Return the noise of a channel over what is usual in all experiments."""
+        return 1.0 if self.noise is None else self.noise[channel]
+
+    def measured(self, channel: int) -> FloatArray:
+        """Return a channel's readings (n,) in its unit, nan where there is none."""
+        values = self.record.column(self.channels[channel].column)
+        return np.full(self.record.n, np.nan) if values is None else values
+
+    def at(self, channel: int, samples: BoolArray | None = None) -> BoolArray:
+        """Return which of the samples, by default the used ones, have a reading of a channel."""
+        found: BoolArray = (self.used if samples is None else samples) & np.isfinite(
+            self.measured(channel)
+        )
+        return found
 
 
 def whole(record: Record) -> Experiment:

@@ -58,9 +58,9 @@ class Way:
 
 @dataclass(frozen=True)
 class Traced:
-    """One output (n,), its derivatives (n, k), and the way that was taken."""
+    """Outputs (n, m), their derivatives (n, m, k), and the way that was taken."""
 
-    output: FloatArray
+    y: FloatArray
     sensitivity: FloatArray
     way: str
 
@@ -77,32 +77,36 @@ def trace(
     x0: FloatArray,
     *,
     way: Way,
-    output: str,
+    outputs: Sequence[str],
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
+    hold: str = "linear",
     steps_limit: int = 0,
     steps_most: int = 0,
 ) -> Traced:
-    """Return one output of a run and its derivatives by `unknowns` (see `run`).
-
-    `steps_limit` bounds the stepper's work between two samples, `steps_most` that of the run.
-    Raises SimulationError where both ways fail.
-    """
-    if not way.stepped:
-        try:
-            found = run_exact(
-                model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
-                unknowns=unknowns, s0=s0, output=output,
+    """SHIM"""
+    ys, ss, ways = [], [], ""
+    for output in outputs:
+        y = None
+        if not way.stepped:
+            try:
+                found = run_exact(
+                    model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
+                    unknowns=unknowns, s0=s0, output=output, hold=hold,
+                )  # fmt: skip
+                y, sl, ways = found.shown, found.sensitivity, EXACT
+            except NotExact:
+                pass
+        if y is None:
+            steps = run(
+                model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, steps_most=steps_most,
+                unknowns=unknowns, s0=s0, output=output, hold=hold,
             )  # fmt: skip
-            return Traced(found.shown, found.sensitivity, EXACT)
-        except NotExact:
-            pass
-    steps = run(
-        model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, steps_most=steps_most,
-        unknowns=unknowns, s0=s0, output=output,
-    )  # fmt: skip
-    slopes = np.zeros((len(t), 0)) if steps.sensitivity is None else steps.sensitivity
-    return Traced(steps.y[:, model.output_names.index(output)], slopes, STEPPER)
+            sl = np.zeros((len(t), 0)) if steps.sensitivity is None else steps.sensitivity
+            y, ways = steps.y[:, model.output_names.index(output)], STEPPER
+        ys.append(y)
+        ss.append(sl)
+    return Traced(np.stack(ys, 1), np.stack(ss, 1), ways)
 
 
 def accurate(
@@ -230,7 +234,7 @@ def input_samples(model: Model, n: int, given: Mapping[str, FloatArray]) -> Floa
 
 def record_inputs(model: Model, record: Record, n: int) -> FloatArray:
     """Return the first n samples (n, nu) of a model's inputs that a record has columns for."""
-    columns = {name: getattr(record, name, None) for name in model.input_names}
+    columns = {name: record.column(name) for name in model.input_names}
     return input_samples(model, n, {k: v for k, v in columns.items() if v is not None})
 
 

@@ -20,7 +20,7 @@ from psa_casadi.units import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
 
-_NEWTON_STEPS = 30
+_NEWTON_STEPS, _FILTER_STEPS = 30, 8
 #: Sets that one call of a function takes.
 _CHUNK = 1024
 
@@ -64,6 +64,96 @@ def start_on(
         return Start(x, np.zeros((len(x), len(model.parameter_names))), none)
     rates = [initial_slope(t, u[:, i]) for i in range(u.shape[1])]
     return start_state(model, list(u[0]), rates, memory, float(t[0]))
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Initial state (nx,), its derivatives by parameters (nx, np) and by deviations (nx, m)."""
+
+    x: FloatArray
+    by_parameter: FloatArray
+    by_start: FloatArray
+
+
+def begun(
+    model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, float]
+) -> Begun:
+    """Return the start for samples u (n, nu) at times t (n,) [s], and deviations of some states.
+
+    A stack begins where the first inputs and their rates put it (`start_on`); any other model at
+    its declared starts, but for the filters of effects, which begin where they would rest.
+    """
+    names = model.state_names
+    if not is_stack(model):
+        found = _declared(model, u[0], deviations)
+        return Begun(found.x, found.by_parameter, found.by_start[:, [*map(names.index, deviations)]])
+    memories = memory_names(model.structure)
+    start = start_on(model, t, u, {n: deviations.get(n, 0.0) for n in memories})
+    x, moved = start.x.copy(), np.zeros((len(names), len(deviations)))
+    for column, (name, deviation) in enumerate(deviations.items()):
+        if name in memories:
+            moved[:, column] = start.by_memory[:, memories.index(name)]
+        else:
+            x[names.index(name)] += deviation
+            moved[names.index(name), column] = 1.0
+    return Begun(x, start.by_parameter, moved)
+
+
+def is_stack(model: Model) -> bool:
+    """Whether a model has a stack's voltage and displacement, and formulas of its own for both."""
+    shows = any(n in model.output_names for n in ("measured_displacement", "displacement"))
+    return "voltage" in model.input_names and shows and not model.structure.foreign
+
+
+def resting_states(structure: Structure) -> tuple[str, ...]:
+    """Return the states of effects that start where they would rest."""
+    effects = [c for c in structure.components if c.gain is not None]
+    return tuple(s.name for c in effects for s in c.states if not s.memory)
+
+
+def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float]) -> Begun:
+    """Return the start at the declared values and deviations, with derivatives by all states.
+
+    x_0 = declared start + deviation; filters of effects start where they would rest:
+    g(x_s, x_0, u_0, p) = 0 with g their rates.
+    """
+    s = model.structure
+    x = np.array([q.start + deviations.get(q.name, 0.0) for q in s.states])
+    p, nx = model.parameter_vector(), len(s.states)
+    by_p, by_x = np.zeros((nx, len(p))), np.eye(nx)
+    names = resting_states(s)
+    resting = [k for k, q in enumerate(s.states) if q.name in names]
+    if not resting:
+        return Begun(x, by_p, by_x)
+    rest = _rest(s)
+    for _ in range(_FILTER_STEPS):
+        rates, slopes, _ = (np.array(a) for a in rest(0.0, x, inputs, p))
+        move = np.linalg.lstsq(slopes[:, resting], -rates[:, 0], rcond=None)[0]
+        x[resting] += move
+        if np.max(np.abs(move) / np.maximum(np.abs(x[resting]), 1e-9)) < 1e-12:
+            break
+    _, slopes, by_parameter = (np.array(a) for a in rest(0.0, x, inputs, p))
+    if not np.isfinite(x).all():
+        raise PsaError("The effects' states have no rest at the start; change the values.")
+    others = [k for k in range(nx) if k not in resting]
+    own = np.linalg.pinv(slopes[:, resting])
+    by_p[resting] = -own @ by_parameter
+    by_x[np.ix_(resting, others)] = -own @ slopes[:, others]
+    by_x[np.ix_(resting, resting)] = 0.0
+    return Begun(x, by_p, by_x)
+
+
+@cache
+def _rest(structure: Structure) -> ca.Function:
+    """Casadi function (t, x, u, p) -> rates of the resting states, their slopes by x and by p."""
+    names = resting_states(structure)
+    rows = [k for k, s in enumerate(structure.states) if s.name in names]
+    rates = structure.xdot[rows]
+    return ca.Function(
+        "rest",
+        [structure.time, structure.x, structure.u, structure.p],
+        [rates, *(ca.densify(structure.jacobian(rates, by)) for by in (structure.x, structure.p))],
+    )
 
 
 def start_state(

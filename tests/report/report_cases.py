@@ -90,7 +90,7 @@ def _fit(model: Model, records: int) -> Fit:
     unknowns = unknowns_of(model, ("k_L", "tau"), [{}] * records, [0.0] * records, 1e-6)
     empty, levels = np.zeros((0, unknowns.size)), (NOISE,) * records
     return Fit(model, unknowns, np.zeros(unknowns.size), np.zeros(0), empty, levels, 0.0, True,
-               False, 1, Way(1e-6, 1e-6), (Simulated(EXACT, 0.0),))  # fmt: skip
+               False, 1, Way(1e-6, 1e-6), (Simulated(EXACT, (0.0,)),))  # fmt: skip
 
 
 def diagnosis(

@@ -111,13 +111,14 @@ def hypothesis(
     if fit is None:
         return None
     try:
-        predicted = tuple(fit.predicted(experiments))
-        beside = held_out_further(fit, experiments)
+        whole = fit.predictions(experiments, differentiated=False, further=True)
     except PsaError:
         return None
+    beside = held_out_further(fit, experiments, whole)
+    predicted = tuple(p.displacement for p in whole)
     held = held_out_rms(experiments, predicted)
-    whole = rms(np.concatenate(whole_residuals(experiments, predicted)))
-    return Hypothesis(tuple(causes), fit, predicted, held, whole, final, beside)
+    every = rms(np.concatenate(whole_residuals(experiments, predicted)))
+    return Hypothesis(tuple(causes), fit, predicted, held, every, final, beside)
 
 
 def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:

@@ -15,11 +15,18 @@ the fitted records begin which begin alike (their root mean square is its prior)
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.fitting.further import Further, further_of, scaled
+from psa_casadi.identification.fitting.further import (
+    Further,
+    further_of,
+    predicted_further,
+    scaled,
+    span_of,
+)
 from psa_casadi.identification.fitting.levenberg_marquardt import (
     FIRST_RADIUS,
     LEAST_RADIUS,
@@ -35,13 +42,22 @@ from psa_casadi.identification.fitting.prediction import (
     simulated,
     trace_record,
 )
-from psa_casadi.identification.fitting.unknowns import Unknowns, static_compliance, unknowns_of
+from psa_casadi.identification.fitting.unknowns import (
+    LINEAR_PRIOR,
+    Unknowns,
+    coordinates_of,
+    memory_prior,
+    static_compliance,
+    unknowns_of,
+)
 from psa_casadi.interruption import current_work
 from psa_casadi.model.compose import Model
-from psa_casadi.records.split import Experiment, fitted
+from psa_casadi.records.split import DISPLACEMENT, Channel, Experiment, fitted
 from psa_casadi.simulation.simulate import Way
+from psa_casadi.simulation.start import is_stack, resting_states
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
+from psa_casadi.variables import nominal_value
 
 #: Relative tolerance of a step in fits.
 FIT_RTOL = 1e-6
@@ -58,13 +74,14 @@ def beginnings(
     unknowns: Unknowns,
     theta: FloatArray,
     experiments: Sequence[Experiment],
-    level: float,
+    levels: Sequence[float],
     way: Way,
 ) -> FloatArray:
     """Return theta with start and offset of the records that are held out whole; others stay.
 
-    `model` has the values of theta; `level` [m] is that of white noise which tells as little as
-    what the model misses. Raises PsaError where a record cannot be simulated.
+    `model` has the values of theta; `levels` are those of white noise which tells as little as what
+    the model misses, of the channels without factors. Raises PsaError where a record cannot be
+    simulated.
     """
     found = theta.copy()
     own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
@@ -73,14 +90,14 @@ def beginnings(
             continue
         first, last = unknowns.first(k), unknowns.first(k + 1)
         found[first:last] = 0.0
-        told = _told(unknowns, theta, experiments, k)
+        told = _told(unknowns, theta, experiments, k) if is_stack(model) else {}
         shared = {c: told[c] for c in told if unknowns.started[k][c - first] not in own}
         found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
         sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
         for c in sizes.keys() & told.keys():
             size = float(np.sqrt(np.mean(np.square(told[c]))))
             sizes[c] = min(sizes[c], max(size, _LEAST))
-        found[list(sizes)] = _sought(model, unknowns, found, experiment, k, level, sizes, way)
+        found[list(sizes)] = _sought(model, unknowns, found, experiment, k, levels, sizes, way)
     return found
 
 
@@ -116,28 +133,36 @@ def _sought(
     theta: FloatArray,
     experiment: Experiment,
     k: int,
-    level: float,
+    levels: Sequence[float],
     sizes: Mapping[int, float],
     way: Way,
 ) -> FloatArray:
     """Return the coordinates of record k with which its first tenth fits best, of such sizes."""
-    known, columns = np.flatnonzero(experiment.known), list(sizes)
-    stop = int(known[-1]) + 1
-    y, prior = measured(experiment.record)[known], 1.0 / np.array(list(sizes.values()))
+    columns, prior = list(sizes), 1.0 / np.array(list(sizes.values()))
+    stop = int(np.flatnonzero(experiment.known)[-1]) + 1
+    plain = [j for j, c in enumerate(experiment.channels) if not c.factors]
+    outputs = [experiment.channels[j].outputs[0] for j in plain]
+    at = [experiment.at(j, experiment.known) for j in plain]
+    weights = [levels[i] * experiment.share(j) for i, j in enumerate(plain)]
 
     def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         there = theta.copy()
         there[columns] = own
         try:
             run = trace_record(
-                model, experiment.record, unknowns.start(there, k), (), stop=stop, way=way
-            )
+                model, experiment.record, unknowns.start(there, k), (),
+                stop=stop, way=way, outputs=outputs,
+            )  # fmt: skip
         except PsaError:
             return None
         by_start, by_offset = unknowns.place_slopes(there, k)
-        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / level
-        missed = (run.output[known] + unknowns.offset(there, k) - y) / level
-        return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
+        missed, slopes = [], []
+        for i, (j, known, weight) in enumerate(zip(plain, at, weights, strict=True)):
+            offset, moves = (unknowns.offset(there, k), by_offset) if j == 0 else (0.0, 0.0)
+            shown = run.y[known[:stop], i] + offset
+            missed.append((shown - experiment.measured(j)[known]) / weight)
+            slopes.append((run.sensitivity[known[:stop], i] @ by_start + moves)[:, columns] / weight)
+        return np.concatenate([*missed, own * prior]), np.vstack([*slopes, np.diag(prior)])
 
     free = np.full(len(columns), np.inf)
     found = minimise(  # the last coordinate is the offset, exactly linear
@@ -176,9 +201,15 @@ def accurate_minimum(
 
     See `minimise` for how far it is sought.
     """
-    pairs = [(measured(e.record)[e.used], s) for e, s in zip(experiments, sigma, strict=True)]
+    pairs = [(_readings(e, 0), s) for e, s in zip(experiments, sigma, strict=True)]
     allowed = [
-        max(_OF_NOISE * s, _OF_RANGE * float(np.ptp(y)) if y.size else 0.0) for y, s in pairs
+        [
+            max(_OF_NOISE * level * e.share(j), _OF_RANGE * float(np.ptp(y)) if y.size else 0.0)
+            for j, c in enumerate(e.channels)
+            if not c.factors
+            for y, level in [(_readings(e, j), c.level if j else s)]
+        ]
+        for e, s in zip(experiments, sigma, strict=True)
     ]
     if not any(e.further for e in experiments):  # a loop that diverges misses more than all
         goal = min(goal, sum(y.size * float(np.ptp(y) / s) ** 2 for y, s in pairs if y.size))
@@ -219,15 +250,21 @@ def accurate_minimum(
         if minimum.cost > goal:  # of no use, however accurate
             return replace(minimum, evaluations=spent), way, []
         told = simulated(model, experiments, unknowns, theta, way=way)
-        if not any(t.error > a for t, a in zip(told, allowed, strict=True)):
+        pairs_of = zip(told, allowed, strict=True)
+        if not any(e > a for t, own in pairs_of for e, a in zip(t.errors, own, strict=False)):
             break
     return replace(minimum, evaluations=spent), way, told
+
+
+def _readings(e: Experiment, channel: int) -> FloatArray:
+    """Return the fitted readings of a channel (n,)."""
+    return e.measured(channel)[e.at(channel)]
 
 
 class Objective:
     """The weighted residuals (predicted - measured, then priors) with their Jacobian, at a theta.
 
-    Those of the displacement, then those of the further columns. None where the model diverges. It
+    Those of the first channel, then those of the further ones. None where the model diverges. It
     can be pickled with the posterior that it is part of.
     """
 
@@ -236,19 +273,20 @@ class Objective:
         sigma: Sequence[float], way: Way,
     ) -> None:  # fmt: skip
         self._of, self._way = (model, tuple(experiments), unknowns), way
-        self._target = np.concatenate([measured(e.record)[e.used] for e in experiments])
-        weights, span = weights_of(experiments, sigma), float(np.ptp(self._target))
+        self._target = np.concatenate([_readings(e, 0) for e in experiments])
+        shares = shares_of(experiments)
+        weights, span = weights_of(experiments, sigma) * shares, float(np.ptp(self._target))
         self._reach = float(np.max(span / weights)) if span > 0.0 else np.inf
-        self._used = [e.used[: e.stop] for e in experiments]
+        self._used = [e.at(0)[: e.stop] for e in experiments]
         self._prior, self._share = 1.0 / unknowns.prior, 1.0 / weights
 
     def __call__(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return residuals (m,) and Jacobian (m, size)."""
         try:
-            parts = predict(*self._of, theta, way=self._way)
-            beside = further_of(*self._of, theta, way=self._way)
+            parts = predict(*self._of, theta, way=self._way, further=True)
         except PsaError:
             return None
+        beside = further_of(self._of[1], parts)
         used, samples = self._used, len(self._target)
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
         more = [b.jacobian / b.level for b in beside]
@@ -270,8 +308,17 @@ class Objective:
 
 
 def weights_of(experiments: Sequence[Experiment], sigma: Sequence[float]) -> FloatArray:
-    """Return the level [m] that weights each used sample (n,)."""
-    return np.repeat(np.asarray(sigma, dtype=np.float64), [int(e.used.sum()) for e in experiments])
+    """Return the level that weights each used sample of the first channel (n,)."""
+    return np.repeat(np.asarray(sigma, dtype=np.float64), _counts(experiments))
+
+
+def shares_of(experiments: Sequence[Experiment]) -> FloatArray:
+    """Return the share of the noise of each used sample of the first channel (n,)."""
+    return np.repeat(np.array([e.share(0) for e in experiments]), _counts(experiments))
+
+
+def _counts(experiments: Sequence[Experiment]) -> list[int]:
+    return [int(e.at(0).sum()) for e in experiments]
 
 
 #: Correlation of neighbouring residuals that counts at most: a hundred samples are then one.
@@ -288,8 +335,9 @@ class Fit:
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
     each record was run and how accurately; it is empty after an interrupt, and above the goal.
-    `radius` is that of the next step, `further` are the fits of the columns beside the
-    displacement.
+    `radius` is that of the next step. The residuals are those of the first `channel`, `lengths`
+    (records,) of each record and `spread` the range of its readings; `further` are the fits of the
+    channels beside it. Of any model read displacement as its first channel, m as that one's unit.
     """
 
     model: Model
@@ -306,6 +354,9 @@ class Fit:
     simulated: tuple[Simulated, ...]
     radius: float = FIRST_RADIUS
     further: tuple[Further, ...] = ()
+    channel: Channel = DISPLACEMENT
+    lengths: tuple[int, ...] = ()
+    spread: float = 0.0
 
     def __repr__(self) -> str:
         """Return what was fitted and what it leaves, in one line."""
@@ -314,7 +365,7 @@ class Fit:
 
     def of_record(self, experiments: Sequence[Experiment], record: int) -> slice:
         """Where the used samples of one record stand in `residuals` and `jacobian`."""
-        counts = [int(e.used.sum()) for e in experiments[: record + 1]]
+        counts = _counts(experiments[: record + 1])
         return slice(sum(counts[:-1]), sum(counts))
 
     def residuals_of(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
@@ -353,31 +404,72 @@ class Fit:
         return [p.displacement for p in self.predictions(experiments, differentiated=False)]
 
     def predictions(
-        self, experiments: Sequence[Experiment], *, differentiated: bool = True
+        self,
+        experiments: Sequence[Experiment],
+        *,
+        differentiated: bool = True,
+        further: bool = False,
     ) -> list[Prediction]:
-        """Predict whole records with their derivatives by theta, if `differentiated`."""
+        """Predict whole records with their derivatives by theta, if `differentiated`.
+
+        The outputs of `further` channels come too if they are asked for.
+        """
         return predict(
             self.model, experiments, self.unknowns, self.placed(experiments),
-            way=self.way, everything=True, differentiated=differentiated,
+            way=self.way, everything=True, differentiated=differentiated, further=further,
         )  # fmt: skip
+
+    def outputs(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+        """Predict all outputs of the model over whole records (n, ny), with sensors' offsets."""
+        names, theta = self.model.output_names, self.placed(experiments)
+        whole = [replace(e, channels=(*e.channels, *map(_plain, names))) for e in experiments]
+        parts = predict(
+            self.model, whole, self.unknowns, theta,
+            way=self.way, everything=True, differentiated=False, further=True,
+        )  # fmt: skip
+        found = [np.column_stack([p.further[n][0] for n in names]) for p in parts]
+        for channel in self.channels:
+            k = names.index(channel.channel.outputs[0])
+            if channel.number == 0:
+                for y, p in zip(found, parts, strict=True):
+                    y[:, k] = p.displacement
+            elif not channel.channel.factors:
+                for r, y in predicted_further(experiments, parts, channel).items():
+                    found[r][:, k] = y
+        return found
 
     def placed(self, experiments: Sequence[Experiment]) -> FloatArray:
         """Return theta with where held-out records begin (`beginnings`), which no fit has seen."""
-        return beginnings(
-            self.model, self.unknowns, self.theta, experiments, self._doubt(), self.way
-        )
+        plain = [c for c in self.channels if not c.channel.factors]
+        levels = [_doubt(c.residuals, c.rms) for c in plain]
+        return beginnings(self.model, self.unknowns, self.theta, experiments, levels, self.way)
 
-    def _doubt(self) -> float:
-        """Return the level [m] of white noise that tells as little as what the model misses.
+    @cached_property
+    def channels(self) -> tuple[Further, ...]:
+        """The fits of all channels, the first one foremost."""
+        told = tuple(k for k, n in enumerate(self.lengths) if n)
+        first = Further(
+            channel=self.channel, number=0, level=self.sigma[told[0]], spread=self.spread,
+            residuals=self.residuals, jacobian=self.jacobian,
+            basis=np.zeros((len(self.residuals), 0)), factors=np.ones(1),
+            lengths=tuple(self.lengths[k] for k in told), records=told,
+        )  # fmt: skip
+        return (first, *self.further)
 
-        Samples that are alike count as one: rms sqrt((1 + r)/(1 - r)), r the correlation of
-        neighbours.
-        """
-        left = self.residuals
-        power = float(left @ left)
-        r = float(left[1:] @ left[:-1]) / power if power > 0.0 else 0.0
-        r = min(max(r, 0.0), _MOST_ALIKE)
-        return max(self.rms * float(np.sqrt((1.0 + r) / (1.0 - r))), 1e-15)
+
+def _plain(name: str) -> Channel:
+    return Channel(name, "", (name,), offset=False, factors=False)
+
+
+def _doubt(left: FloatArray, rms: float) -> float:
+    """Return the level of white noise that tells as little as what the model misses.
+
+    Samples that are alike count as one: rms sqrt((1 + r)/(1 - r)), r the correlation of neighbours.
+    """
+    power = float(left @ left)
+    r = float(left[1:] @ left[:-1]) / power if power > 0.0 else 0.0
+    r = min(max(r, 0.0), _MOST_ALIKE)
+    return max(rms * float(np.sqrt((1.0 + r) / (1.0 - r))), 1e-15)
 
 
 @contextmanager
@@ -416,7 +508,10 @@ def fit(
     does not stop in a curved valley (`minimise`). Raises InputError when no sample can be used,
     SimulationError when the start cannot be simulated or its numbers overflow.
     """
-    if not any(e.used.any() for e in experiments):
+    if is_stack(model):
+        for e in experiments:
+            measured(e.record)
+    if not any(e.at(k).any() for e in experiments for k, _ in enumerate(e.channels)):
         raise InputError(["No sample with a displacement is left to fit; give more data."])
     placed = model.with_values(start or {})
     unknowns = unknowns_around(model, free, experiments, sigma, placed=placed)
@@ -426,7 +521,10 @@ def fit(
         rtol=rtol, goal=goal, radius=radius, patient=patient,
     )  # fmt: skip
     weights = weights_of(experiments, sigma)
-    further = further_of(model, experiments, unknowns, minimum.theta, way=way)
+    further: tuple[Further, ...] = ()
+    if experiments[0].further:
+        parts = predict(model, experiments, unknowns, minimum.theta, way=way, further=True)
+        further = further_of(experiments, parts)
     found, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
         model=found,
@@ -443,6 +541,9 @@ def fit(
         simulated=tuple(told),
         radius=minimum.radius,
         further=further,
+        channel=experiments[0].channels[0],
+        lengths=tuple(_counts(experiments)),
+        spread=span_of(experiments, 0),
     )
 
 
@@ -450,7 +551,32 @@ def unknowns_around(
     model: Model, free: Sequence[str], experiments: Sequence[Experiment], sigma: Sequence[float],
     *, placed: Model,
 ) -> Unknowns:  # fmt: skip
-    """Return the coordinates of a fit around a model's values, `placed` where it begins."""
+    """Return the coordinates of a fit around a model's values, `placed` where it begins.
+
+    Of any model but a stack per experiment the initial states as deviations from the declared
+    starts (unless these are known) over their usual sizes, with weak priors: `LINEAR_PRIOR` of
+    these sizes, `memory_prior` for memories of effects.
+    """
+    if not is_stack(model):
+        memories = {q.name for c in model.effects for q in c.states if q.memory}
+        resting, s = {*resting_states(model.structure)}, model.structure
+
+        def starts(e: Experiment) -> dict[str, tuple[float, float]]:
+            names = memories if e.known_start else {q.name for q in s.states} - resting
+            return {
+                q.name: (
+                    nominal_value(q.nominal, model.values),
+                    memory_prior(q) if q.name in memories else LINEAR_PRIOR,
+                )
+                for q in s.states
+                if q.name in names
+            }
+
+        offset = experiments[0].channels[0].offset
+        return coordinates_of(
+            model, free, [starts(e) for e in experiments],
+            (span_of(experiments, 0) if offset else 0.0) or 1.0, np.inf if offset else 1.0,
+        ).without([k for k, e in enumerate(experiments) if not e.at(0).any()])  # fmt: skip
     scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
     motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
     first = [float(e.record.voltage[0]) for e in experiments]
@@ -465,14 +591,16 @@ def _starting_point(
     start: Mapping[str, float],
     start_states: Sequence[Mapping[str, float]] | None,
 ) -> FloatArray:
-    values = {**model.values, **start}
+    values, stack = {**model.values, **start}, is_stack(model)
     theta = np.zeros(unknowns.size)
     theta[: len(unknowns.names)] = unknowns.coordinates(values)
     for r, experiment in enumerate(experiments):
         if not experiment.used.any():
             continue
-        given = start_states[r] if start_states else {}
-        y, v = measured(experiment.record)[experiment.used], experiment.record.voltage
-        slope = values["G"] * values["k_L"] * static_compliance(values)
-        unknowns.place(theta, r, given, float(np.mean(y) - slope * np.mean(v[experiment.used])))
+        offset, given = 0.0, start_states[r] if start_states else {}
+        if stack:
+            y, v = measured(experiment.record)[experiment.used], experiment.record.voltage
+            slope = values["G"] * values["k_L"] * static_compliance(values)
+            offset = float(np.mean(y) - slope * np.mean(v[experiment.used]))
+        unknowns.place(theta, r, given, offset)
     return theta

@@ -12,56 +12,44 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
-from psa_casadi.identification.fitting.prediction import trace_record, traced_by_theta
-from psa_casadi.identification.fitting.unknowns import Unknowns
+from psa_casadi.identification.fitting.prediction import Prediction
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
-from psa_casadi.records.split import Experiment, Level
-from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.simulate import Way
+from psa_casadi.records.split import Channel, Experiment
 from psa_casadi.units import FloatArray
 
-
-@dataclass(frozen=True)
-class Shown:
-    """What a column of a record shows.
-
-    `outputs` of the model, each with a factor; the first factor is that of `scale`, a parameter of
-    the `sensor` that a model gets for the column, where it has one. `unit` is the SI unit. The
-    model is taken to be right to the share `straight` of what is shown (rms): a smaller error says
-    nothing of a stack.
-    """
-
-    unit: str
-    outputs: tuple[str, ...]
-    straight: float = 1e-3
-    sensor: Component | None = None
-    scale: str | None = None
-
-
-#: The columns that are fitted, by name. The charge on a stack is that of its capacitance and, by
-#: reciprocity, a share of the displacement; the current is its rate, which lags faster than the
-#: sampling move most.
-COLUMNS: Mapping[str, Shown] = {
-    "monitor_voltage": Shown("V", ("monitor_voltage",), sensor=MONITOR, scale="monitor_scale"),
-    "charge": Shown("C", ("charge", "displacement"), straight=1e-2),
-    "current": Shown("A", ("current", "velocity"), straight=5e-2),
-    "displacement_2": Shown("m", ("displacement_2",), sensor=SECOND_SENSOR, scale="sensor_2_scale"),
-    "strain": Shown("1", ("strain",), sensor=STRAIN_GAUGE, scale="strain_scale"),
+#: The columns of a stack that are fitted beside its displacement, by name. The charge on a stack is
+#: that of its capacitance and, by reciprocity, a share of the displacement; the current is its
+#: rate, which lags faster than the sampling move most.
+COLUMNS: Mapping[str, Channel] = {
+    c.column: c
+    for c in (
+        Channel("monitor_voltage", "V", ("monitor_voltage",), scale="monitor_scale"),
+        Channel("charge", "C", ("charge", "displacement"), straight=1e-2),
+        Channel("current", "A", ("current", "velocity"), straight=5e-2),
+        Channel("displacement_2", "m", ("displacement_2",), scale="sensor_2_scale"),
+        Channel("strain", "1", ("strain",), scale="strain_scale"),
+    )
 }
+#: The sensor that a model gets for a column.
+SENSORS: Mapping[str, Component] = {
+    "monitor_voltage": MONITOR, "displacement_2": SECOND_SENSOR, "strain": STRAIN_GAUGE
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Further:
-    """The fit of one further column, in its SI unit; samples of all records that have it, stacked.
+    """The fit of one channel, in its unit; samples of all records that have it, stacked.
 
     `residuals` (n,) are measured minus predicted; `jacobian` (n, size) d prediction / d theta, both
-    without what offsets and factors can follow: `basis` (n, k) is orthonormal. `factors` belong to
-    the outputs, `level` weighted the column, `spread` is its rms about the offsets, `lengths` are
-    the samples of each record.
+    over the records' shares of the noise, and without what offsets and factors can follow: `basis`
+    (n, k) is orthonormal. `factors` belong to the outputs, `level` weighted the channel, `spread`
+    is its size (`Channel`), `lengths` are the samples of each of the `records`, of which `number`
+    is the place among the channels.
     """
 
-    column: str
+    channel: Channel
+    number: int
     level: float
     spread: float
     residuals: FloatArray
@@ -69,6 +57,17 @@ class Further:
     basis: FloatArray
     factors: FloatArray
     lengths: tuple[int, ...]
+    records: tuple[int, ...]
+
+    @property
+    def column(self) -> str:
+        """Name of the column."""
+        return self.channel.column
+
+    @property
+    def parts(self) -> list[FloatArray]:
+        """The residuals of each of the `records`."""
+        return np.split(self.residuals, np.cumsum(self.lengths)[:-1])
 
     def left_of(self, change: FloatArray) -> FloatArray:
         """Return what offsets and factors leave of a change of the prediction (n,)."""
@@ -77,13 +76,17 @@ class Further:
 
     @property
     def straight(self) -> float:
-        """Rms error below which nothing is known of the column, in its unit."""
-        return COLUMNS[self.column].straight * self.spread
+        """Rms error below which nothing is known of the channel, in its unit."""
+        return self.channel.straight * self.spread
+
+    def relevelled(self) -> Channel:
+        """Return the channel with what the fit leaves as its noise level."""
+        return replace(self.channel, level=max(self.rms, self.straight))
 
     @property
     def notes(self) -> tuple[Note, ...]:
         """What is left of the column, and what is odd about it."""
-        unit, share = COLUMNS[self.column].unit, 100.0 * self.rms / max(self.spread, 1e-300)
+        unit, share = self.channel.unit, 100.0 * self.rms / max(self.spread, 1e-300)
         named = "" if unit == "1" else f" {unit}"
         left = note("column", column=self.column, rms=self.rms, unit=named, share=share)
         return left, *self.turned
@@ -91,7 +94,7 @@ class Further:
     @property
     def turned(self) -> tuple[Note, ...]:
         """Say so where a column falls while what it shows rises."""
-        falls = COLUMNS[self.column].scale is None and self.factors[0] < 0.0
+        falls = self.channel.scale is None and self.factors[0] < 0.0
         return (note("turned_column", column=self.column),) if falls else ()
 
     @property
@@ -101,67 +104,67 @@ class Further:
 
 
 def further_of(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    theta: FloatArray,
-    *,
-    way: Way,
+    experiments: Sequence[Experiment], predictions: Sequence[Prediction]
 ) -> tuple[Further, ...]:
-    """Return the fit of every further column at theta, at the used samples. Raises PsaError."""
-    slopes = unknowns.slopes(theta)
+    """Return the fit of every further channel from what a model shows in the records' used samples.
 
-    def one(task: tuple[int, str]) -> tuple[FloatArray, FloatArray]:
-        index, output = task
-        e = experiments[index]
-        shown, by_theta, _ = traced_by_theta(
-            model, e.record, unknowns, theta, index,
-            stop=e.stop, way=way, slopes=slopes, output=output,
-        )  # fmt: skip
-        used = e.used[: e.stop]
-        return shown[used], by_theta[used]
-
-    found = []
-    for level in experiments[0].further if experiments else ():
-        records = with_column(experiments, level.column)
-        tasks = [(k, output) for output in COLUMNS[level.column].outputs for k in records]
-        runs, count = side_by_side(one, tasks), len(records)
-        per_output = [runs[k : k + count] for k in range(0, len(runs), count)]
-        given = [measured_in(experiments[k], level.column) for k in records]
-        found.append(_projected(level, given, per_output))
-    return tuple(found)
-
-
-def _projected(
-    level: Level,
-    given: Sequence[FloatArray],
-    shown: Sequence[Sequence[tuple[FloatArray, FloatArray]]],
-) -> Further:
-    """Return the fit of a column `given` per record by what outputs have `shown` of each record.
-
-    Offsets and factors are projected out.
+    The predictions hold the further channels' outputs.
     """
-    lengths = tuple(len(y) for y in given)
-    centred = _centred(np.column_stack([np.concatenate([x for x, _ in o]) for o in shown]), lengths)
-    target = _centred(np.concatenate(given), lengths)
-    size = np.maximum(np.linalg.norm(centred, axis=0), 1e-300)
-    factors = np.linalg.lstsq(centred / size, target, rcond=1e-10)[0] / size
-    ones = np.zeros((len(target), len(lengths)))
-    for k, last in enumerate(np.cumsum(lengths)):
-        ones[last - lengths[k] : last, k] = 1.0 / np.sqrt(lengths[k])
-    u, s, _ = np.linalg.svd(centred / size, full_matrices=False)
-    basis = np.hstack([ones, u[:, s > 1e-10 * max(float(s[0]), 1e-300)]])
-    moved = sum(f * np.vstack([j for _, j in own]) for f, own in zip(factors, shown, strict=True))
-    return Further(
-        column=level.column,
-        level=level.value,
-        spread=float(np.sqrt(np.mean(target**2))),
-        residuals=target - basis @ (basis.T @ target),
-        jacobian=moved - basis @ (basis.T @ moved),
-        basis=basis,
-        factors=factors,
-        lengths=lengths,
+    channels = experiments[0].further if experiments else ()
+    return tuple(_fitted(k, experiments, predictions) for k, _ in enumerate(channels, 1))
+
+
+def _fitted(
+    number: int, experiments: Sequence[Experiment], predictions: Sequence[Prediction]
+) -> Further:
+    """Return the fit of one channel; offsets and factors are projected out where it is free."""
+    channel = experiments[0].channels[number]
+    at = {k: e.at(number) for k, e in enumerate(experiments)}
+    records = tuple(k for k, own in at.items() if own.any())
+    shares = [experiments[k].share(number) for k in records]
+    lengths = tuple(int(np.count_nonzero(at[k])) for k in records)
+    target = np.concatenate(
+        [experiments[k].measured(number)[at[k]] / s for k, s in zip(records, shares, strict=True)]
     )
+
+    def shown(name: str, part: int) -> FloatArray:
+        rows = zip(records, shares, strict=True)
+        return np.concatenate(
+            [
+                predictions[k].further[name][part][at[k][: experiments[k].stop]] / s
+                for k, s in rows
+            ]
+        )
+
+    values = np.column_stack([shown(name, 0) for name in channel.outputs])
+    slopes = [shown(name, 1) for name in channel.outputs]
+    factors, basis = np.ones(1), np.zeros((len(target), 0))
+    if channel.offset:
+        values, target = _centred(values, lengths), _centred(target, lengths)
+        basis = np.zeros((len(target), len(lengths)))
+        for k, last in enumerate(np.cumsum(lengths)):
+            basis[last - lengths[k] : last, k] = 1.0 / np.sqrt(lengths[k])
+    if channel.factors:
+        size = np.maximum(np.linalg.norm(values, axis=0), 1e-300)
+        factors = np.linalg.lstsq(values / size, target, rcond=1e-10)[0] / size
+        u, s, _ = np.linalg.svd(values / size, full_matrices=False)
+        basis = np.hstack([basis, u[:, s > 1e-10 * max(float(s[0]), 1e-300)]])
+        left = target - basis @ (basis.T @ target)
+        spread = float(np.sqrt(np.mean(target**2)))
+    else:
+        left, spread = target - values[:, 0], span_of(experiments, number)
+    moved = sum(f * own for f, own in zip(factors, slopes, strict=True))
+    moved = moved - basis @ (basis.T @ moved)
+    return Further(
+        channel=channel, number=number, level=channel.level, spread=spread, residuals=left,
+        jacobian=moved, basis=basis, factors=factors, lengths=lengths, records=records,
+    )  # fmt: skip
+
+
+def span_of(experiments: Sequence[Experiment], number: int) -> float:
+    """Return the range of a channel's readings over the fitted samples of all records."""
+    parts = [e.measured(number)[e.at(number)] for e in experiments]
+    return float(np.ptp(np.concatenate(parts))) if any(p.size for p in parts) else 0.0
 
 
 def with_column(experiments: Sequence[Experiment], column: str) -> list[int]:
@@ -169,21 +172,15 @@ def with_column(experiments: Sequence[Experiment], column: str) -> list[int]:
     return [
         k
         for k, e in enumerate(experiments)
-        if getattr(e.record, column) is not None and e.used.any()
+        if e.record.column(column) is not None and e.used.any()
     ]
-
-
-def measured_in(experiment: Experiment, column: str) -> FloatArray:
-    """Return the used samples of a column (n,)."""
-    values: FloatArray = getattr(experiment.record, column)[experiment.used]
-    return values
 
 
 def scaled(model: Model, found: Sequence[Further]) -> tuple[Model, tuple[Further, ...]]:
     """Return a model whose sensors have the scales that were found, and the factors beside it."""
     values, beside = {}, []
     for each in found:
-        name, factors = COLUMNS[each.column].scale, each.factors
+        name, factors = each.channel.scale, each.factors
         if name is not None and factors[0] != 0.0:
             low, high = model.parameter(name).bounds
             values[name] = float(np.clip(factors[0] * model.values[name], low, high))
@@ -193,32 +190,23 @@ def scaled(model: Model, found: Sequence[Further]) -> tuple[Model, tuple[Further
 
 
 def predicted_further(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    theta: FloatArray,
-    fitted: Further,
-    *,
-    way: Way,
+    experiments: Sequence[Experiment], predictions: Sequence[Prediction], fitted: Further
 ) -> dict[int, FloatArray]:
-    """Return a further column of whole records (n,) as predicted, by the index of the record.
+    """Return a further channel of whole records (n,) as predicted, by the index of the record.
 
-    Factors are those of the fit, offsets those of the known samples. Raises PsaError.
+    Factors are those of the fit, offsets those of the known samples. The predictions are those of
+    whole records, with the further channels' outputs.
     """
-    current = model.with_values(unknowns.values(theta))
     found = {}
-    for k, e in enumerate(experiments):
-        given: FloatArray | None = getattr(e.record, fitted.column)
-        if given is None or not e.known.any():
+    for k, (e, p) in enumerate(zip(experiments, predictions, strict=True)):
+        known = e.at(fitted.number, e.known)
+        if not known.any():
             continue
-        start = unknowns.start(theta, k)
-        total = np.zeros(e.record.n)
-        for factor, output in zip(fitted.factors, COLUMNS[fitted.column].outputs, strict=True):
-            total += factor * trace_record(
-                current, e.record, start, (),
-                stop=e.record.n, way=way, by_start=False, output=output,
-            ).output  # fmt: skip
-        found[k] = total + np.mean((given - total)[e.known])
+        rows = zip(fitted.factors, fitted.channel.outputs, strict=True)
+        total = sum((f * p.further[name][0] for f, name in rows), np.zeros(e.record.n))
+        if fitted.channel.offset:
+            total = total + np.mean((e.measured(fitted.number) - total)[known])
+        found[k] = total
     return found
 
 

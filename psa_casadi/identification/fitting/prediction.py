@@ -1,7 +1,7 @@
 """Predictions of a model for a set of experiments, and their exact derivatives."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -9,14 +9,14 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Channel, Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Traced, Way, record_inputs, trace
 from psa_casadi.simulation.start import (
+    begun,
     initial_slope,
     memory_names,
     settling_time,
-    start_on,
     start_state,
 )
 from psa_casadi.units import FloatArray
@@ -30,14 +30,16 @@ OUTPUT = "measured_displacement"
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted displacement (n,) [m] of one record and its derivative (n, size) by theta.
+    """Predicted first channel (n,) of one record and its derivative (n, size) by theta.
 
-    `way` tells how the record was integrated.
+    `further` are the same of the further channels' outputs by name, where they were asked for, as
+    the model shows them. `way` tells how the record was integrated.
     """
 
     displacement: FloatArray
     jacobian: FloatArray
     way: str
+    further: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
 
 
 def measured(record: Record) -> FloatArray:
@@ -63,19 +65,14 @@ def predict_record(
     of a step.
     """
     found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
-    count = len(wanted)
-    return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
+    count, slopes = len(wanted), found.sensitivity[:, 0]
+    return found.y[:, 0], slopes[:, :count], slopes[:, count:]
 
 
 def record_start(model: Model, record: Record, start: Mapping[str, float]) -> FloatArray:
     """Return the states (nx,) at a record's first sample; `start` as in `predict_record`."""
-    time, memories = record.time - record.time[0], memory_names(model.structure)
-    memory = {n: start.get(n, 0.0) for n in memories}
-    x0 = start_on(model, time, record_inputs(model, record, record.n), memory).x.copy()
-    for name, deviation in start.items():
-        if name not in memories:
-            x0[model.state_names.index(name)] += deviation
-    return x0
+    time, u = record.time - record.time[0], record_inputs(model, record, record.n)
+    return begun(model, time, u, start).x
 
 
 def trace_record(
@@ -87,38 +84,29 @@ def trace_record(
     stop: int,
     way: Way,
     by_start: bool = True,
-    output: str = OUTPUT,
+    outputs: Sequence[str] = (OUTPUT,),
 ) -> Traced:
-    """Return one output (n,) and its derivatives by `wanted` and `start` (n, k + m).
+    """Return outputs (n, m) and their derivatives by `wanted` and `start` (n, m, k + s).
 
-    By `wanted` (n, k) alone if those `by_start` are not asked for.
+    By `wanted` (n, m, k) alone if those `by_start` are not asked for.
     """
-    names = model.state_names
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
-    memories = memory_names(model.structure)
-    found = start_on(model, t, u, {n: start.get(n, 0.0) for n in memories})
-    x0, searched = found.x.copy(), [names.index(n) for n in start]
-    moved = np.zeros((len(names), len(start)))
-    for column, name in enumerate(start):
-        if name in memories:
-            moved[:, column] = found.by_memory[:, memories.index(name)]
-        else:
-            x0[searched[column]] += start[name]
-            moved[searched[column], column] = 1.0
-    columns = [model.parameter_names.index(n) for n in wanted]
-    s0 = found.by_parameter[:, columns]
+    begin = begun(model, t, u, start)
+    s0 = begin.by_parameter[:, [model.parameter_names.index(n) for n in wanted]]
     unknowns: list[str | int] = list(wanted)
     if by_start:
-        s0, unknowns = np.hstack([s0, moved]), [*wanted, *searched]
+        s0 = np.hstack([s0, begin.by_start])
+        unknowns += [model.state_names.index(n) for n in start]
     return trace(
         model,
         t,
         u,
-        x0,
+        begin.x,
         way=way,
-        output=output,
+        outputs=outputs,
         unknowns=unknowns,
         s0=s0,
+        hold=record.hold,
         steps_limit=_STEPS,
         steps_most=int(_MEAN_STEPS * max(1.0, _AT / way.step_rtol) ** (1.0 / _ORDER) * stop),
     )
@@ -165,20 +153,25 @@ def traced_by_theta(
     stop: int,
     way: Way,
     slopes: FloatArray,
-    output: str = OUTPUT,
-) -> tuple[FloatArray, FloatArray, str]:
-    """Return an output (stop,) of one record, its derivative by theta, and the way it was run.
+    outputs: Sequence[str] = (OUTPUT,),
+) -> Traced:
+    """Return outputs (stop, m) of one record and their derivatives by theta (stop, m, size).
 
     Without the sensor's offset. `slopes` are `unknowns.slopes(theta)`.
     """
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
-    found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
+    found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, outputs=outputs)
     count = len(unknowns.names)
     start_slopes = unknowns.place_slopes(theta, index)[0]
     by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
     by_theta[:count, :count] = slopes
-    return found.output, found.sensitivity @ by_theta, found.way
+    return Traced(found.y, found.sensitivity @ by_theta, found.way)
+
+
+def outputs_of(channels: Sequence[Channel]) -> tuple[str, ...]:
+    """Return the model's outputs that channels show, each once, those of the first one first."""
+    return tuple(dict.fromkeys(name for c in channels for name in c.outputs))
 
 
 def predict(
@@ -190,41 +183,57 @@ def predict(
     way: Way,
     everything: bool = False,
     differentiated: bool = True,
+    further: bool = False,
 ) -> list[Prediction]:
     """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
 
     Records are simulated side by side; `differentiated` or not, in which case the Jacobian has no
-    columns.
+    columns. The outputs of `further` channels come too if they are asked for.
     """
     slopes, current = unknowns.slopes(theta), model.with_values(unknowns.values(theta))
 
     def one(index: int) -> Prediction:
-        record, start = experiments[index].record, unknowns.start(theta, index)
-        stop = record.n if everything else experiments[index].stop
+        e = experiments[index]
+        record, start = e.record, unknowns.start(theta, index)
+        outputs = outputs_of(e.channels if further else e.channels[:1])
+        stop = record.n if everything else e.stop
         if not stop:
-            return Prediction(np.zeros(0), np.zeros((0, unknowns.size)), "")
+            none = np.zeros(0), np.zeros((0, unknowns.size))
+            return Prediction(*none, "", {n: none for n in outputs})
         if not differentiated:
-            found = trace_record(current, record, start, (), stop=stop, way=way, by_start=False)
-            x, jacobian, way_taken = found.output, found.sensitivity, found.way
-        else:
-            x, jacobian, way_taken = traced_by_theta(
-                model, record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
+            found = trace_record(
+                current, record, start, (), stop=stop, way=way, by_start=False, outputs=outputs
             )
-            jacobian += unknowns.place_slopes(theta, index)[1]
-        return Prediction(x + unknowns.offset(theta, index), jacobian, way_taken)
+        else:
+            found = traced_by_theta(
+                model, record, unknowns, theta, index,
+                stop=stop, way=way, slopes=slopes, outputs=outputs,
+            )  # fmt: skip
+        shown = {
+            n: (found.y[:, k], found.sensitivity[:, k]) for k, n in enumerate(outputs)
+        }
+        x, jacobian = shown[outputs[0]]
+        if differentiated:
+            jacobian = jacobian + unknowns.place_slopes(theta, index)[1]
+        return Prediction(x + unknowns.offset(theta, index), jacobian, found.way, shown)
 
     return side_by_side(one, range(len(experiments)))
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """How a record was run, and what a finer run differs by (rms of its used samples) [m].
+    """How a record was run, and what a finer run differs by (rms of its used samples).
 
-    `way` is "" for a record that is held out whole.
+    `errors` are those of the channels without factors, the first one foremost, in their units. `way` is "" for a record that is held out whole.
     """
 
     way: str
-    error: float
+    errors: tuple[float, ...]
+
+    @property
+    def error(self) -> float:
+        """That of the first channel."""
+        return self.errors[0] if self.errors else 0.0
 
 
 def simulated(
@@ -239,18 +248,23 @@ def simulated(
     current = model.with_values(unknowns.values(theta))
 
     def one(index: int) -> Simulated:
-        experiment, start = experiments[index], unknowns.start(theta, index)
-        used = experiment.used[: experiment.stop]
-        if not used.size:
-            return Simulated("", 0.0)
-        plain, finer = (
+        e, start = experiments[index], unknowns.start(theta, index)
+        if not e.stop:
+            return Simulated("", ())
+        plain = [k for k, c in enumerate(e.channels) if not c.factors]
+        outputs = [e.channels[k].outputs[0] for k in plain]
+        rough, finer = (
             trace_record(
-                current, experiment.record, start, (), stop=experiment.stop, way=w, by_start=False
+                current, e.record, start, (), stop=e.stop, way=w, by_start=False, outputs=outputs
             )
             for w in (way, way.finer)
         )
-        gap = (plain.output - finer.output)[used]
-        error = float(np.sqrt(np.mean(gap**2))) if gap.size else 0.0
-        return Simulated(plain.way, error if plain.way == finer.way else float("inf"))
+        gap, at = rough.y - finer.y, [e.at(k)[: e.stop] for k in plain]
+        same = rough.way == finer.way
+        errors = [
+            float(np.sqrt(np.mean(g[own] ** 2))) if own.any() else 0.0
+            for g, own in zip(gap.T, at, strict=True)
+        ]
+        return Simulated(rough.way, tuple(errors) if same else (float("inf"),) * len(plain))
 
     return side_by_side(one, range(len(experiments)))

@@ -234,6 +234,10 @@ class Unknowns:
         return np.concatenate([edges[0], -rest]), np.concatenate([edges[1], rest])
 
 
+#: Of every record: sizes and prior widths of the starts that are searched, by the state's name.
+Starts = Mapping[str, tuple[float, float]]
+
+
 def unknowns_of(
     model: Model,
     free: Sequence[str],
@@ -241,39 +245,58 @@ def unknowns_of(
     first_voltage: Sequence[float],
     offset_scale: float,
 ) -> Unknowns:
-    """Set up the coordinates around a model's values.
+    """Set up the coordinates of a stack around a model's values.
 
     `motions` names for every record the states beside the memories whose start is searched, each
     with the size of an ordinary deviation, in the state's unit; `first_voltage` [V] is where each
     record starts.
     """
-    parameters = [model.parameter(n) for n in free]
-    values: Mapping[str, float] = model.values
-    log = np.array([p.log for p in parameters], dtype=bool)
-    prior = np.where(log, LOG_PRIOR, LINEAR_PRIOR)
-    prior = np.where([n in _LAGS for n in free], LAG_PRIOR, prior)
+    memories = dict(zip(memory_sizes(model).items(), memory_priors(model), strict=True))
+    own = {name: (size, prior) for (name, size), prior in memories.items()}
+    starts = [own | {n: (size, MOTION_PRIOR) for n, size in m.items()} for m in motions]
+    found = coordinates_of(model, free, starts, offset_scale, np.inf)
+    values, prior, log = model.values, found.prior, found.log
+    prior[[k for k, n in enumerate(free) if n in _LAGS]] = LAG_PRIOR
     loop = None
     slope = values.get("k_L", 0.0) + values.get("A", 0.0)
     if all(n in free for n in _LOOP) and values["A"] != 0 and slope > 0:
         loop = tuple(list(free).index(n) for n in _LOOP)
         log[list(loop)] = False
         prior[list(loop)] = [LOG_PRIOR, LOG_PRIOR, LINEAR_PRIOR, LINEAR_PRIOR]
-    sizes, own = memory_sizes(model), list(memory_priors(model))
-    each = [own + [MOTION_PRIOR] * len(m) + [np.inf] for m in motions]
+    return replace(
+        found, first_voltage=tuple(first_voltage), compliance=static_compliance(values), loop=loop
+    )
+
+
+def coordinates_of(
+    model: Model,
+    free: Sequence[str],
+    starts: Sequence[Starts],
+    offset_scale: float,
+    offset_prior: float,
+) -> Unknowns:
+    """Set up the coordinates around a model's values: parameters on the scale that they declare.
+
+    `starts` are those that are searched in each record; its offset is searched where the prior is
+    infinite, else it stays at 0.
+    """
+    values: Mapping[str, float] = model.values
+    parameters = [model.parameter(n) for n in free]
+    log = np.array([p.log and values[p.name] > 0 for p in parameters], dtype=bool)
+    own = [np.array([prior for _, prior in s.values()] + [offset_prior]) for s in starts]
     return Unknowns(
         names=tuple(free),
-        started=tuple((*sizes, *motion) for motion in motions),
+        started=tuple(tuple(s) for s in starts),
         reference=np.array([values[n] for n in free]),
         scale=np.array([p.typical(values) for p in parameters]),
         log=log,
         low=np.array([p.bounds[0] for p in parameters]),
         high=np.array([p.bounds[1] for p in parameters]),
-        start_scale=tuple(np.array([*sizes.values(), *motion.values()]) for motion in motions),
-        first_voltage=tuple(first_voltage),
-        compliance=static_compliance(values),
+        start_scale=tuple(np.array([size for size, _ in s.values()]) for s in starts),
+        first_voltage=(0.0,) * len(starts),
+        compliance=0.0,
         offset_scale=offset_scale,
-        prior=np.concatenate([prior, *each]),
-        loop=loop,
+        prior=np.concatenate([np.where(log, LOG_PRIOR, LINEAR_PRIOR), *own]),
     )
 
 
