@@ -109,11 +109,11 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     ),
     "OdeIdentification": (
         lambda: own()[1],
-        lambda i: [*i.fit.predicted(i.runs), repr(i), *driven(i.model)],
+        lambda i: [*i.fit.outputs(i.experiments), repr(i), *driven(i.model)],
     ),
     "OdeDiagnosis": (
         lambda: own()[2],
-        lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.predicted(d.runs)],
+        lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.outputs(d.experiments)],
     ),
     "HysteresisObserver": (
         lambda: moved(psa.HysteresisObserver(values()), 60.0), lambda b: block(b, 31.0),

@@ -8,37 +8,46 @@ from inspect import signature
 from typing import Any, overload
 
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.fit import refuse_unfit
-from psa_casadi.any_model.hypothesis import Table
 from psa_casadi.any_model.identify import (
     OdeIdentification,
     free_of,
     identify_ode,
     known_zeros,
+    refuse_unfit,
     reweighted,
     search_starts,
     unlike,
     with_noise,
 )
 from psa_casadi.any_model.judge import judged
-from psa_casadi.any_model.predict import sized, sizes_of
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.any_model.runs import runs_of, told_of_columns
-from psa_casadi.any_model.search import search
+from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import diagnose as stacks
+from psa_casadi.diagnosis.pack import Pack
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.task import Method
+from psa_casadi.diagnosis.search.best_first import best_first
+from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.task import Method, Task
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
+from psa_casadi.model.ports import with_ports
 from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold, signals_given
+from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
-from psa_casadi.simulation.simulate import output_of
+from psa_casadi.simulation.start import is_stack
+
+#: The steps of a search that are a stack's: they need its voltage, its loop or its resonances.
+_OF_STACKS = frozenset(
+    {"one clock", "fits afresh", "all afresh", "resonances", "several modes", "between samples"}
+)
 
 
 def diagnose_ode(
@@ -74,13 +83,10 @@ def diagnose_ode(
     given = signals_given(records, hold)
     none = isinstance(holdout, tuple | list) and not holdout
     held = [] if none else signals_given(holdout, hold, len(given) + 1)
-    runs = runs_of(model, given, held)
     shifted = known_zeros(model, zeros)
+    runs = runs_of(model, given, held, zeros=shifted, known_start=known_start)
     progress("fitting from several starts")
-    base, runs, _ = search_starts(
-        sized(model, runs), runs, free_of(model, free), starts=starts, zeros=shifted,
-        known_start=known_start,
-    )  # fmt: skip
+    base, runs, _ = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)
     if base.interrupted:
         raise KeyboardInterrupt
     sizes = sizes_of(base.model, runs, base.starts())
@@ -94,14 +100,21 @@ def diagnose_ode(
                 f"`leave_out` has '{name}', which begins the name of no effect; of the"
                 f" {len(known_names)} there are, the nearest are {', '.join(near)}."
             )
-    table = Table(base.model, tuple(e for e in every if not e.name.startswith(gone)))
-    known = search(base, runs, table, progress)
-    runs = with_noise(known.best().fit, runs)
-    if unlike(runs, known.runs):
+    table = {e.name: e for e in every if not e.name.startswith(gone)}
+    effects = tuple(e.component for e in table.values())
+
+    def search(base: Fit, experiments: tuple[Experiment, ...]) -> Known:
+        opened = replace(base, model=with_ports(base.model))
+        method = Method(without=_OF_STACKS)
+        return best_first(opened, Task(experiments, effects, Pack(), method, progress))
+
+    known = search(base, runs)
+    told = with_noise(known.answer.fit, runs)
+    if unlike(told, runs):
         progress("searching again, noise by record")
-        known = search(reweighted(base, runs), runs, table, progress)
+        known = search(reweighted(base, told), told)
     progress("judging")
-    found = judged(known)
+    found = judged(known, base.model, table)
     return replace(found, remarks=(*found.remarks, *told_of_columns(model, runs)))
 
 
@@ -144,7 +157,7 @@ def identify(
 def identify(*given: Any, **words: Any) -> Any:
     """Identify a stack from its records, or a model of one's own, given first, from its."""
     model, records = _models_first(given, words)
-    if model is None or _is_stack(model):
+    if model is None or is_stack(model):
         return stack.identify(records, model=model, **_known(words, stack.identify))
     return _own(identify_ode, model, records, words)
 
@@ -180,7 +193,7 @@ def diagnose(
 def diagnose(*given: Any, **words: Any) -> Any:
     """Diagnose a stack's records, or a model of one's own, given first, on its records."""
     model, records = _models_first(given, words)
-    if model is None or _is_stack(model):
+    if model is None or is_stack(model):
         return stacks.diagnose(records, model=model, **_known(words, stacks.diagnose))
     return _own(diagnose_ode, model, records, words)
 
@@ -214,8 +227,3 @@ def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model 
     if records is None or left:
         raise InputError("Give records, or a model of your own and its records, and words beside.")
     return model, records
-
-
-def _is_stack(model: Model) -> bool:
-    own = "voltage" in model.input_names and output_of(model) is not None
-    return own and not model.structure.foreign

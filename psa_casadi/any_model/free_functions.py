@@ -8,7 +8,7 @@ or up to the fifth of a signal, each over its size. They have no memory and no t
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from math import prod
 
@@ -16,20 +16,26 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
-from psa_casadi.any_model.fit import OdeFit, refitted
-from psa_casadi.any_model.hypothesis import OdeView, hypothesis_of, slopes_of
-from psa_casadi.any_model.identify import noise_left
-from psa_casadi.any_model.predict import Sizes, shown_by, sizes_of, states_of
+from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached
+from psa_casadi.any_model.identify import noise_left, refitted
 from psa_casadi.any_model.result import FreeFunction, removed_from
-from psa_casadi.any_model.runs import Run
-from psa_casadi.any_model.search import Known
+from psa_casadi.any_model.sizes import Sizes, sizes_of, states_of
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.diagnosis.held_out import Share
-from psa_casadi.diagnosis.screening import independent, whitened_jacobian, without
+from psa_casadi.diagnosis.probes import changes
+from psa_casadi.diagnosis.screening import (
+    independent,
+    whitened_jacobian,
+    whitened_residuals,
+    without,
+)
+from psa_casadi.diagnosis.search.hypothesis import View, hypothesis
+from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, true_output
+from psa_casadi.records.split import Experiment
 from psa_casadi.variables import Parameter
 
 FloatArray = npt.NDArray[np.float64]
@@ -58,7 +64,7 @@ class Free:
 
     `removes` is that with its interval, `law` are its monomials in the variables over their
     `scales`, `fit` the base with it and `errors` what that leaves of every output
-    (`OdeHypothesis.errors`).
+    (`Hypothesis.errors`).
     """
 
     port: Port
@@ -66,7 +72,7 @@ class Free:
     evidence: float
     removes: Share
     law: _Law
-    fit: OdeFit
+    fit: Fit
     errors: tuple[float, ...]
 
     @property
@@ -75,17 +81,17 @@ class Free:
         return self.removes.share
 
 
-def correction_of(free: Free, runs: Sequence[Run]) -> FreeFunction | None:
+def correction_of(free: Free, experiments: Sequence[Experiment]) -> FreeFunction | None:
     """Return what a free function adds along all records, beside the variable it follows most.
 
     None where it cannot be simulated.
     """
     try:
-        values = {n: _along(free, runs, n) for n in free.law.names}
+        values = {n: _along(free, experiments, n) for n in free.law.names}
     except PsaError:
         return None
-    (component,) = free.fit.model.effects
     model = free.fit.model
+    (component,) = model.effects
     added = sum(
         model.values[c] * prod(values[n] / free.law.scales[n] for n in term)
         for c, term in zip(free.law.coefficients(component.name), free.law.terms, strict=True)
@@ -108,69 +114,68 @@ def correction_of(free: Free, runs: Sequence[Run]) -> FreeFunction | None:
     )  # fmt: skip
 
 
-def _along(free: Free, runs: Sequence[Run], name: str) -> FloatArray:
+def _along(free: Free, experiments: Sequence[Experiment], name: str) -> FloatArray:
     """Return a variable along all records: an input, a state, or an output before its sensor."""
-    model, fit, starts = free.fit.model, free.fit, free.fit.starts()
+    model, fit = free.fit.model, free.fit
     if name in model.input_names:
-        return np.concatenate([r.inputs[:, model.input_names.index(name)] for r in runs])
+        return np.concatenate([e.record.column(name) for e in experiments])
     if name in model.state_names:
-        k = model.state_names.index(name)
-        rows = zip(runs, starts, strict=True)
-        return np.concatenate([states_of(model, r, s, fit.rtol)[:, k] for r, s in rows])
+        k, theta = model.state_names.index(name), fit.placed(experiments)
+        rows = [
+            states_of(model, e, fit.unknowns.start(theta, r), fit.way.step_rtol)[:, k]
+            for r, e in enumerate(experiments)
+        ]
+        return np.concatenate(rows)
     (component,) = model.effects
     none = model.with_values(dict.fromkeys(free.law.coefficients(component.name), 0.0))
     k = model.output_names.index(name)
-    parts = [
-        shown_by(none, r, s, r.signals.n, fit.rtol)[:, k] for r, s in zip(runs, starts, strict=True)
-    ]
-    return np.concatenate(parts)
+    return np.concatenate([y[:, k] for y in replace(fit, model=none).outputs(experiments)])
 
 
-def free_functions(known: Known, view: OdeView) -> tuple[Free, ...]:
+def free_functions(known: Known, view: View, base: Model) -> tuple[Free, ...]:
     """Return the most telling free functions beside the base, fitted, the best first."""
-    root = view.of
-    sizes = sizes_of(known.table.base, known.runs, root.fit.starts())
-    tried = [_free(known.table.base, p, sizes) for p in ports_of(known.table.base)]
+    root, experiments = view.of, known.task.experiments
+    sizes = sizes_of(base, experiments, root.fit.starts())
+    tried = [_free(base, p, sizes) for p in ports_of(base)]
     scored: list[tuple[float, Attached, _Law]] = []
     for attached, law in tried:
         try:
-            scored.append((_decrease(known, view, attached), attached, law))
+            scored.append((_decrease(view, attached, experiments), attached, law))
         except PsaError:
             continue
     scored.sort(key=lambda s: -s[0])
     found = []
     for _, attached, law in scored[:_FITTED]:
-        known.progress(f"a free function in {attached.port.words}")
-        fitted: OdeFit | None = None
+        known.task.progress(f"a free function in {attached.port.words}")
+        fitted: Fit | None = None
         with suppress(PsaError):
-            model = extended(known.table.base, [attached])
+            model = root.fit.model.with_effect(attached.component)
             fitted = refitted(
-                root.fit, known.runs, model=model, evaluations=_EVALUATIONS, tolerance=1e-4
+                root.fit, experiments, model=model, evaluations=_EVALUATIONS, tolerance=1e-4
             )
-        h = hypothesis_of((attached.component,), fitted, known.runs)
+        h = hypothesis((attached.component,), fitted, experiments)
         if h is not None:
             of = " and ".join(law.names)
             # of the base's held-out error above the noise that it leaves
             noise = noise_left(h.fit, view.screening.colour)
-            of_base = removed_from(known.runs, h.fit.places, root.predicted, noise)
+            of_base = removed_from(experiments, root.shown, noise)
             what = f"{of} in {attached.port.words}"
-            removes = of_base.share(what, root.predicted, h.predicted)
+            removes = of_base.share(what, root.shown, h.shown)
             found.append(
                 Free(attached.port, of, known.scale.evidence(h), removes, law, h.fit, h.errors)
             )
     return tuple(sorted(found, key=lambda f: -f.evidence))
 
 
-def _decrease(known: Known, view: OdeView, attached: Attached) -> float:
+def _decrease(view: View, attached: Attached, experiments: Sequence[Experiment]) -> float:
     """Return the decrease of the whitened sum of squares that the coefficients promise together."""
     fit, colour = view.of.fit, view.screening.colour
-    model = extended(known.table.base, [attached])
-    columns = slopes_of(fit, known.runs, model, attached.component.fitted)
-    whole = colour.whiten_all(columns[0], columns[1:])
+    model = fit.model.with_effect(attached.component)
+    moved = dict.fromkeys(attached.component.fitted, 1.0)
+    columns, further = changes(fit, experiments, model, moved, tuple(fit.starts()), 0.0)
     basis = independent(whitened_jacobian(fit, colour))
-    residual = colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])
-    free = independent(without(whole, basis))
-    return float(np.sum((free.T @ without(residual, basis)) ** 2))
+    free = independent(without(colour.whiten_all(columns, further), basis))
+    return float(np.sum((free.T @ without(whitened_residuals(fit, colour), basis)) ** 2))
 
 
 def _free(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, _Law]:

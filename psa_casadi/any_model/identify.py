@@ -7,26 +7,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.fit import (
-    Certainty,
-    OdeFit,
-    certainty,
-    fit_ode,
-    measured_outputs,
-    refitted,
-    refuse_unfit,
-)
-from psa_casadi.any_model.predict import shown_by, sized
-from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
+from psa_casadi.any_model.runs import noise_share, runs_of, told_of_columns
+from psa_casadi.any_model.sizes import sized
 from psa_casadi.diagnosis.colour import Colour, noise_rms, uncertain
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.refitting import relevelled_all, weighted
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
-from psa_casadi.records.noise import first_order_noise
+from psa_casadi.records.noise import filtered, first_order_noise
 from psa_casadi.records.signals import Hold, signals_given
+from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.variables import Parameter, Provenance
+from psa_casadi.variables import Interval, Parameter, Provenance
 from psa_casadi.version import __version__
 
 FloatArray = npt.NDArray[np.float64]
@@ -35,33 +29,41 @@ FloatArray = npt.NDArray[np.float64]
 _TELLING, _SURE = 32, 3.0
 
 
-def relevelled(fit: OdeFit, runs: Sequence[Run], rounds: int = 4) -> OdeFit:
-    """Fit again with every output's residual as its noise level, until that stays the same."""
-    for _ in range(rounds if len(fit.outputs) > 1 else 1):
-        levels = tuple(max(o.rms, o.straight, 1e-300) for o in fit.outputs)
-        change = np.max(np.abs(np.log(np.array(levels) / np.array(fit.levels))))
-        if change < 0.02 or fit.interrupted:
-            break
-        fit = refitted(fit, runs, levels=levels)
-    return fit
+def refitted(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    *,
+    model: Model | None = None,
+    evaluations: int = 60,
+    tolerance: float = 1e-6,
+) -> Fit:
+    """Go on with a fit from where it stopped, or with another model from its values.
+
+    What another model has of the parameters is free, and its effects' fitted parameters too.
+    """
+    other = model or before.model
+    own = [n for n in before.unknowns.names if n in other.values]
+    own += [n for c in other.effects for n in c.fitted if n not in own]
+    return fit(
+        other, weighted(before, experiments), own, sigma=before.sigma,
+        start_states=before.starts(), evaluations=evaluations, tolerance=tolerance,
+    )  # fmt: skip
 
 
-def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
+def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
     """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
 
     Of every output, over the usual one of all experiments (the geometric mean by samples). A share
     that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
     """
-    shares = [r.noise.copy() for r in runs]
-    beginnings = []
-    for k, run in enumerate(runs):
-        if run.held_out_whole:
-            first = run.of_beginning()
-            shown = shown_by(fit.model, first, fit.starts()[k], first.stop, fit.rtol, fit.zeros)
-            beginnings.append((k, first, (run.outputs[: first.stop] - shown) / run.noise))
-    for o in fit.outputs:
-        fitted = zip(o.runs, o.parts, strict=True)
-        begun = ((k, e[r.fitted(o.index)[: r.stop], o.index]) for k, r, e in beginnings)
+    shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
+    whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
+    shown = fit.shown(experiments) if whole else []
+    for o in fit.channels:
+        j = o.number
+        rows = ((k, experiments[k], shown[k][:, j]) for k in whole)
+        begun = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
+        fitted = zip(o.records, o.parts, strict=True)
         found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
         if len(found) < 2:
             continue
@@ -69,38 +71,40 @@ def with_noise(fit: OdeFit, runs: Sequence[Run]) -> tuple[Run, ...]:
         over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in found])
         for (k, part), own in zip(found, over, strict=True):
             if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
-                shares[k][o.index] *= float(np.exp(own))
-    return tuple(replace(r, noise=share) for r, share in zip(runs, shares, strict=True))
+                shares[k][j] *= float(np.exp(own))
+    return tuple(replace(e, noise=tuple(own)) for e, own in zip(experiments, shares, strict=True))
 
 
-def unlike(runs: Sequence[Run], others: Sequence[Run]) -> bool:
+def unlike(experiments: Sequence[Experiment], others: Sequence[Experiment]) -> bool:
     """Whether the shares of the noise differ."""
-    return any(np.any(a.noise != b.noise) for a, b in zip(runs, others, strict=True))
+    channels = range(len(experiments[0].channels))
+    pairs = zip(experiments, others, strict=True)
+    return any(a.share(j) != b.share(j) for a, b in pairs for j in channels)
 
 
-def reweighted(fit: OdeFit, runs: Sequence[Run]) -> OdeFit:
+def reweighted(fit: Fit, experiments: Sequence[Experiment]) -> Fit:
     """Fit again with other shares of the noise."""
-    return relevelled(refitted(fit, runs, evaluations=100), runs)
+    return relevelled_all(refitted(fit, experiments, evaluations=100), experiments)
 
 
-def noise_left(fit: OdeFit, colour: Colour) -> list[float]:
+def noise_left(fit: Fit, colour: Colour) -> list[float]:
     """Return the noise in every output's residual, over the shares that weighted it."""
-    rows = zip(fit.outputs, colour.each, strict=True)
+    rows = zip(fit.channels, colour.each, strict=True)
     return [noise_rms(o.residuals, own) for o, own in rows]
 
 
 def noise_told(
-    fit: OdeFit, colour: Colour, runs: Sequence[Run]
-) -> tuple[tuple[Run, ...], tuple[float, ...]]:
+    fit: Fit, colour: Colour, experiments: Sequence[Experiment]
+) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
     """Return the experiments and every output's noise over them, in its unit, as a fit leaves it.
 
     What a search has weighted by is from the base's residual, which holds more than noise.
     """
-    told, levels = with_noise(fit, runs), []
-    for o, own in zip(fit.outputs, colour.each, strict=True):
-        j = o.index
-        rows = zip(o.runs, o.parts, strict=True)
-        left = np.concatenate([p * (runs[k].noise[j] / told[k].noise[j]) for k, p in rows])
+    told, levels = with_noise(fit, experiments), []
+    for o, own in zip(fit.channels, colour.each, strict=True):
+        j = o.number
+        rows = zip(o.records, o.parts, strict=True)
+        left = np.concatenate([p * (experiments[k].share(j) / told[k].share(j)) for k, p in rows])
         levels.append(noise_rms(left, own) * noise_share(told, j))
     return told, tuple(levels)
 
@@ -125,12 +129,12 @@ class OdeIdentification(Reported):
     `errors` are the parameters' standard errors, `intervals` their 95 % intervals in
     `model.provenance`; `rms` is what is left of every measured output and `noise` the fast part of
     that over all records, in the outputs' units. `costs` are those of the starts, nan for one that
-    failed; `agreed` of them led to the same minimum. `runs` are the records.
+    failed; `agreed` of them led to the same minimum.
     """
 
     model: Model
-    fit: OdeFit
-    runs: tuple[Run, ...]
+    fit: Fit
+    experiments: tuple[Experiment, ...]
     errors: Mapping[str, float]
     undetermined: tuple[str, ...]
     rms: Mapping[str, float]
@@ -190,11 +194,11 @@ def identify_ode(
     be simulated at its values.
     """
     refuse_unfit(model)
-    runs = runs_of(model, signals_given(records, hold), judged=False)
-    fit, runs, costs = search_starts(
-        sized(model, runs), runs, free_of(model, free), starts=starts,
-        zeros=known_zeros(model, zeros), known_start=known_start,
+    runs = runs_of(
+        model, signals_given(records, hold), judged=False, zeros=known_zeros(model, zeros),
+        known_start=known_start,
     )  # fmt: skip
+    fit, runs, costs = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)
     return _told(fit, runs, costs)
 
 
@@ -219,35 +223,27 @@ def known_zeros(model: Model, zeros: Sequence[str]) -> tuple[str, ...]:
 
 
 def search_starts(
-    model: Model,
-    runs: Sequence[Run],
-    free: Sequence[str],
-    *,
-    starts: int,
-    zeros: tuple[str, ...],
-    known_start: bool,
-) -> tuple[OdeFit, tuple[Run, ...], tuple[float, ...]]:
+    model: Model, experiments: Sequence[Experiment], free: Sequence[str], *, starts: int
+) -> tuple[Fit, tuple[Experiment, ...], tuple[float, ...]]:
     """Return the best fit from several starts, the experiments with their noise, and all costs.
 
     The costs are those of the starts with the same noise in all experiments. Raises SimulationError
     where none can be simulated.
     """
-    # to begin with: a tenth of every measured output's standard deviation
-    levels = [0.1 * _movement(runs, j) for j in measured_outputs(runs)]
-    found: list[OdeFit] = []
+    sigma = [experiments[0].channels[0].level] * len(experiments)
+    seen = None if experiments[0].known_start else seen_starts(model, experiments)
+    found: list[Fit] = []
     costs: list[float] = []
     rng = np.random.default_rng(_SEED)
     for number in range(max(1, starts)):
         declared = model.values  # the first start; random ones about them, within the bounds
         values = {n: _drawn(model.parameter(n), declared, rng) for n in free} if number else {}
         try:
-            own = fit_ode(
-                model.with_values(values), runs, free, levels=levels,
-                starts=seen_starts(model, runs) if not known_start else None,
-                evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4, zeros=zeros,
-                known_start=known_start,
+            own = fit(
+                model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
+                evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4,
             )  # fmt: skip
-        except SimulationError:
+        except PsaError:
             costs.append(float("nan"))
             continue
         costs.append(own.cost)
@@ -261,34 +257,36 @@ def search_starts(
         )
     found.sort(key=lambda f: f.cost)
     if found[-1].interrupted or found[0].interrupted:
-        return replace(found[0], interrupted=True, converged=False), tuple(runs), tuple(costs)
-    ended = [refitted(f, runs, evaluations=100) for f in found[:_FOLLOWED]]
+        return replace(found[0], interrupted=True, converged=False), (*experiments,), tuple(costs)
+    ended = [refitted(f, experiments, evaluations=100) for f in found[:_FOLLOWED]]
     for quick, end in zip(found, ended, strict=False):
         costs[costs.index(quick.cost)] = end.cost
-    best = relevelled(min(ended, key=lambda f: f.cost), runs)
-    weighted = with_noise(best, runs)
-    if unlike(weighted, runs):
-        best = reweighted(best, weighted)
-    return best, weighted, tuple(costs)
+    best = relevelled_all(min(ended, key=lambda f: f.cost), experiments)
+    again = with_noise(best, experiments)
+    if unlike(again, experiments):
+        best = reweighted(best, again)
+    return best, again, tuple(costs)
 
 
-def seen_starts(model: Model, runs: Sequence[Run]) -> list[dict[str, float]]:
+def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[str, float]]:
     """Return deviations of initial states that an output shows at its first sample."""
     y, x = model.structure.y, model.structure.x
     names = [x[k].name() for k in range(x.numel())]
     shown = [
-        (j, names.index(y[j].name()))
+        (model.output_names[j], names.index(y[j].name()))
         for j in range(y.numel())
         if y[j].is_symbolic() and y[j].name() in names
     ]
     found = []
-    for run in runs:
-        own, known = {}, run.of_beginning() if run.held_out_whole else run
-        for j, k in shown:
-            valid = np.flatnonzero(known.fitted(j))
+    for e in experiments:
+        own, known = {}, e.known if e.held_out_whole else e.used
+        for output, k in shown:
+            readings = e.record.column(output)
+            if readings is None:
+                continue
+            valid = readings[known & np.isfinite(readings)]
             if valid.size:
-                declared = model.structure.states[k].start
-                own[names[k]] = float(run.outputs[valid[0], j]) - declared
+                own[names[k]] = float(valid[0]) - model.structure.states[k].start
         found.append(own)
     return found
 
@@ -306,11 +304,11 @@ def _drawn(p: Parameter, values: Mapping[str, float], rng: np.random.Generator) 
 
 
 def with_told(
-    model: Model, runs: Sequence[Run], found: Certainty, interrupted: bool = False
+    model: Model, experiments: Sequence[Experiment], found: "Certainty", interrupted: bool = False
 ) -> Model:
     """Return a fitted model that says from which records it comes and how sure its values are."""
     provenance = Provenance(
-        identified_from=tuple((r.name, r.signals.sha256) for r in runs),
+        identified_from=tuple((e.record.name, e.record.sha256) for e in experiments),
         package_version=__version__,
         free=tuple(found.errors),
         intervals=found.intervals,
@@ -320,13 +318,18 @@ def with_told(
     return replace(model, provenance=provenance, evidence=None)
 
 
-def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIdentification:
+def _told(
+    fit: Fit, experiments: Sequence[Experiment], costs: tuple[float, ...]
+) -> OdeIdentification:
     sure = certainty(fit)
-    noise, rms = {}, {}
-    for o in fit.outputs:
-        noise[o.column] = first_order_noise(o.residuals)[0] * noise_share(runs, o.index)
-        left = [p * runs[k].noise[o.index] for k, p in zip(o.runs, o.parts, strict=True)]
-        rms[o.column] = float(np.sqrt(np.mean(np.concatenate(left) ** 2)))
+    noise, rms, left_of = {}, {}, {}
+    for o in fit.channels:
+        j, readings = o.number, [e.measured(o.number)[e.at(o.number)] for e in experiments]
+        noise[o.column] = first_order_noise(o.residuals)[0] * noise_share(experiments, j)
+        rows = zip(o.records, o.parts, strict=True)
+        left = np.concatenate([p * experiments[k].share(j) for k, p in rows])
+        rms[o.column] = float(np.sqrt(np.mean(left**2)))
+        left_of[o.column] = rms[o.column] / float(np.std(np.concatenate(readings)))
     good = [c for c in costs if np.isfinite(c)]
     agreed = sum(c <= (1.0 + _SAME) * min(good) for c in good)
     said = []
@@ -338,13 +341,12 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
     said += [note("on_bound", name=n) for n in sure.on_bound]
     missed = {n: rms[n] / noise[n] for n in rms if noise[n] > 0}
     said += [note("output_missed", output=n, ratio=r) for n, r in missed.items() if r > MISSED]
-    left_of = {o.column: rms[o.column] / _movement(runs, o.index) for o in fit.outputs}
     said += [note("output_not_followed", output=n, share=s) for n, s in left_of.items() if s > _ALL]
-    said += told_of_columns(fit.model, runs)
+    said += told_of_columns(fit.model, experiments)
     return OdeIdentification(
-        model=with_told(fit.model, runs, sure, fit.interrupted),
+        model=with_told(fit.model, experiments, sure, fit.interrupted),
         fit=fit,
-        runs=tuple(runs),
+        experiments=tuple(experiments),
         errors=sure.errors,
         undetermined=sure.undetermined,
         rms=rms,
@@ -355,6 +357,72 @@ def _told(fit: OdeFit, runs: Sequence[Run], costs: tuple[float, ...]) -> OdeIden
     )
 
 
-def _movement(runs: Sequence[Run], output: int) -> float:
-    """Return the standard deviation of an output over the fitted samples of all experiments."""
-    return float(np.std(np.concatenate([r.outputs[r.fitted(output), output] for r in runs])))
+def refuse_unfit(model: Model) -> None:
+    """Refuse a model without an output, and one with sampled states. Raises InputError."""
+    if not model.output_names:
+        raise InputError(f"The model '{model.name}' has no output; a fit compares with one.")
+    if model.structure.sampled:
+        raise InputError(
+            f"The model '{model.name}' has sampled states, whose sensitivities are not computed;"
+            " leave the sampled component out."
+        )
+
+
+#: A parameter with a larger standard error than this, over its ordinary change, is not determined.
+_UNDETERMINED = 0.5
+#: Half a 95 % interval over the standard error.
+_NORMAL = 1.96
+#: Correlations of neighbours below this count as none.
+_WHITE = 0.05
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """Standard errors and 95 % intervals of the parameters by name, and what is wrong with some.
+
+    The interval of a parameter that spans decades is that of its logarithm; none goes beyond the
+    parameter's bounds. `undetermined` are not
+    told by the records, `on_bound` sit on a bound of their range.
+    """
+
+    errors: dict[str, float]
+    intervals: dict[str, Interval]
+    undetermined: tuple[str, ...]
+    on_bound: tuple[str, ...]
+
+
+def certainty(fit: Fit) -> Certainty:
+    """Return how sure a fit's parameters are.
+
+    Cov = (sum_j J_j^T J_j / s_j^2 + prior)^-1 over outputs j, residuals and derivatives whitened by
+    the correlation of the residual's neighbours, s_j the rms that is left.
+    """
+    information = np.diag(1.0 / fit.unknowns.prior**2)
+    for output in fit.channels:
+        white = np.column_stack([output.residuals, output.jacobian])
+        top = sum(float(p[1:] @ p[:-1]) for p in output.parts)
+        r = min(top / max(float(output.residuals @ output.residuals), 1e-300), 0.98)
+        if r >= _WHITE:  # the correlation of neighbours within the experiments
+            parts = np.split(white, np.cumsum(output.lengths)[:-1])
+            white = np.vstack([filtered([1.0, -r], [1.0], part)[1:] for part in parts])
+        level = max(float(np.sqrt(np.mean(white[:, 0] ** 2))), 1e-300)
+        information = information + white[:, 1:].T @ white[:, 1:] / level**2
+    names = fit.unknowns.names
+    spread = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[: len(names)]
+    slopes = np.diag(fit.unknowns.slopes(fit.theta))
+    errors, intervals, on_bound = {}, {}, []
+    for k, name in enumerate(names):
+        value, error = fit.model.values[name], float(spread[k] * abs(slopes[k]))
+        errors[name] = error
+        factor = float(np.exp(min(_NORMAL * spread[k], 300.0)))
+        half = _NORMAL * error
+        low, high = float(fit.unknowns.low[k]), float(fit.unknowns.high[k])
+        least, most = value - half, value + half
+        if fit.unknowns.log[k]:
+            least, most = value / factor, value * factor
+        intervals[name] = Interval(max(least, low), min(most, high))
+        edge = 1e-6 * (high - low) if np.isfinite(high - low) else 0.0
+        if value <= low + edge or value >= high - edge:
+            on_bound.append(name)
+    undetermined = [n for n, s in zip(names, spread, strict=True) if s > _UNDETERMINED]
+    return Certainty(errors, intervals, tuple(undetermined), tuple(on_bound))

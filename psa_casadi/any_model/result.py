@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.fit import OdeFit
-from psa_casadi.any_model.runs import Run, counted
+from psa_casadi.any_model.runs import counted
 from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict, told
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame, with_units
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,29 +40,30 @@ class OdeBudget:
 
 
 def removed_from(
-    runs: Sequence[Run], outputs: Sequence[int], base: Sequence[FloatArray], noise: Sequence[float]
+    experiments: Sequence[Experiment], base: Sequence[FloatArray], noise: Sequence[float]
 ) -> Removed:
-    """Return what models remove of a base's held-out error in the given outputs of a model.
+    """Return what models remove of a base's held-out error in all channels.
 
-    `base` are its predictions (n, ny) of all runs, `noise` is the rms of each output's noise in the
-    output's unit.
+    `base` are its predictions (n, channels) of all records, `noise` is the rms of each channel's
+    noise in its unit.
     """
-    return Removed(partial(_judged_errors, runs, tuple(outputs)), base, tuple(noise))
+    return Removed(partial(_judged_errors, experiments), base, tuple(noise))
 
 
 def _judged_errors(
-    runs: Sequence[Run], outputs: Sequence[int], predicted: Sequence[FloatArray]
+    experiments: Sequence[Experiment], shown: Sequence[FloatArray]
 ) -> list[FloatArray]:
-    """Return the errors (n, outputs) where any output is judged, else nan.
+    """Return the errors (n, channels) where any channel is judged, else nan.
 
-    An output of which no sample is held out is judged by its fitted ones.
+    A channel of which no sample is held out is judged by its fitted ones.
     """
     parts = []
-    told = zip(*(counted(runs, j) for j in outputs), strict=True)
-    for r, y, own in zip(runs, predicted, told, strict=True):
+    channels = range(len(experiments[0].channels))
+    told = zip(*(counted(experiments, j) for j in channels), strict=True)
+    for e, y, own in zip(experiments, shown, told, strict=True):
         which = np.column_stack(own)
-        errors = np.where(which, r.errors(y)[:, outputs], np.nan)
-        parts.append(errors[which.any(axis=1)])
+        errors = np.column_stack([e.errors(j, y[:, j]) for j in channels])
+        parts.append(np.where(which, errors, np.nan)[which.any(axis=1)])
     return parts
 
 
@@ -129,11 +131,11 @@ class OdeDiagnosis(Reported):
     """A diagnosis of any model: verdict, causes, the extended model, errors, and what remains.
 
     The words of the verdict are those of a stack's diagnosis. `base` and `extended` (n, ny) are the
-    predictions of every experiment in full, in the order of `runs`. `candidates` are all effects
-    tried. `budget` says where the base's held-out error goes, with 95 % intervals. `missed` is what
-    the base leaves, `remaining` what the extended model does. `free_function` says where one would
-    remove most of what is left, None if nothing is; `correction` is that function. `remarks` are
-    what else there is to say.
+    predictions of every experiment in full, in the order of `experiments`. `candidates` are all
+    effects tried. `budget` says where the base's held-out error goes, with 95 % intervals. `missed`
+    is what the base leaves, `remaining` what the extended model does. `free_function` says where
+    one would remove most of what is left, None if nothing is; `correction` is that function.
+    `remarks` are what else there is to say.
     """
 
     verdict: Verdict
@@ -143,9 +145,9 @@ class OdeDiagnosis(Reported):
     remaining: Remaining
     remarks: tuple[Note | str, ...]
     model: Model
-    base_fit: OdeFit
-    extended_fit: OdeFit
-    runs: tuple[Run, ...]
+    base_fit: Fit
+    extended_fit: Fit
+    experiments: tuple[Experiment, ...]
     base: tuple[FloatArray, ...]
     extended: tuple[FloatArray, ...]
     missed: Remaining
@@ -200,7 +202,9 @@ class OdeDiagnosis(Reported):
             "budget": asdict(self.budget),
             "notes": list(self.notes),
             "values": dict(self.model.values),
-            "records": [{"name": r.name, "sha256": r.signals.sha256} for r in self.runs],
+            "records": [
+                {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments
+            ],
         }
 
     def to_json(self) -> str:
@@ -212,17 +216,20 @@ class OdeDiagnosis(Reported):
 
         Names carry units: `speed [m/s]`, `speed_base [m/s]`, `speed_extended [m/s]`.
         """
+        records = [e.record for e in self.experiments]
         columns: dict[str, Any] = {
-            "record": np.repeat([r.name for r in self.runs], [len(r.time) for r in self.runs]),
-            "time": np.concatenate([r.signals.time for r in self.runs]),
-            "held_out": np.concatenate([r.held_out for r in self.runs]),
+            "record": np.repeat([r.name for r in records], [r.n for r in records]),
+            "time": np.concatenate([r.time for r in records]),
+            "held_out": np.concatenate([e.held_out for e in self.experiments]),
         }
         units = {"time": "s"}
         for k, (name, o) in enumerate(
             zip(self.model.output_names, self.model.structure.outputs, strict=True)
         ):
             units |= dict.fromkeys((name, f"{name}_base", f"{name}_extended"), o.unit)
-            columns[name] = np.concatenate([r.outputs[:, k] for r in self.runs])
+            columns[name] = np.concatenate(
+                [np.full(r.n, np.nan) if (y := r.column(name)) is None else y for r in records]
+            )
             columns[f"{name}_base"] = np.concatenate([y[:, k] for y in self.base])
             columns[f"{name}_extended"] = np.concatenate([y[:, k] for y in self.extended])
         return frame(with_units(columns, units))

@@ -1,8 +1,8 @@
-"""The experiments that a model is fitted to: inputs, outputs, what is used and what is held out."""
+"""The experiments of any model: its records, what is used and what is held out of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -12,82 +12,38 @@ from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals, stairs, unit_hint
-from psa_casadi.records.split import divided, whole
+from psa_casadi.records.split import Channel, Experiment, divided, whole
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """One experiment on a model.
-
-    `time` (n,) [s] counts from the first sample; `inputs` (n, nu) and `outputs` (n, ny) are in the
-    order of the model's, in its units, nan where an output was not measured; `used` and `held_out`
-    (n,) are the samples that are fitted and those that judge. `noise` (ny,) is the noise of its
-    outputs over what is usual in all experiments, 1 where nothing else is known.
-    """
-
-    signals: Signals
-    time: FloatArray
-    inputs: FloatArray
-    outputs: FloatArray
-    used: BoolArray
-    held_out: BoolArray
-    noise: FloatArray
-
-    @property
-    def name(self) -> str:
-        """Name of the experiment."""
-        return self.signals.name
-
-    @cached_property
-    def stop(self) -> int:
-        """One past the last used sample: a fit need not simulate further; 0 without any."""
-        return int(np.max(np.flatnonzero(self.used), initial=-1)) + 1
-
-    @property
-    def held_out_whole(self) -> bool:
-        """Whether no sample is fitted; the first tenth, which is not judged, finds the start."""
-        return bool(self.held_out.any() and not self.used.any())
-
-    def of_beginning(self) -> "Run":
-        """Return the experiment with the samples before the judged ones as those to fit."""
-        return replace(self, used=np.arange(len(self.used)) < np.argmax(self.held_out))
-
-    def fitted(self, output: int) -> BoolArray:
-        """True where an output is measured and fitted, shape (n,)."""
-        found: BoolArray = self.used & np.isfinite(self.outputs[:, output])
-        return found
-
-    def judged(self, output: int) -> BoolArray:
-        """True where an output is measured and held out, shape (n,)."""
-        found: BoolArray = self.held_out & np.isfinite(self.outputs[:, output])
-        return found
-
-    def errors(self, predicted: FloatArray) -> FloatArray:
-        """Return measured minus predicted outputs (n, ny), over the experiment's share of noise."""
-        return np.asarray((self.outputs - predicted) / self.noise)
+#: Share of an output's range below which no difference between a device and a model is told.
+STRAIGHT = 2e-5
+#: Noise level to begin with, over an output's standard deviation.
+_FIRST_LEVEL = 0.1
 
 
-def noise_share(runs: Sequence[Run], output: int) -> float:
-    """Return the rms of an output's `noise` over the samples that judge, else over the fitted."""
-    counts = [int(c.sum()) for c in counted(runs, output)]
-    squares = [r.noise[output] ** 2 for r in runs]
+def noise_share(experiments: Sequence[Experiment], channel: int) -> float:
+    """Return the rms of a channel's `noise` over the samples that judge, else over the fitted."""
+    counts = [int(c.sum()) for c in counted(experiments, channel)]
+    squares = [e.share(channel) ** 2 for e in experiments]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 
-def missed_rms(runs: Sequence[Run], predicted: Sequence[FloatArray], output: int) -> float:
-    """Return the rms of measured minus predicted of an output, in its unit, over these samples."""
-    rows = zip(runs, predicted, counted(runs, output), strict=True)
-    errors = np.concatenate([(r.outputs - y)[c, output] for r, y, c in rows])
+def missed_rms(
+    experiments: Sequence[Experiment], shown: Sequence[FloatArray], channel: int
+) -> float:
+    """Return the rms of measured minus predicted of a channel, in its unit, over these samples."""
+    rows = zip(experiments, shown, counted(experiments, channel), strict=True)
+    errors = np.concatenate([(e.measured(channel) - y[:, channel])[c] for e, y, c in rows])
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def counted(runs: Sequence[Run], output: int) -> list[BoolArray]:
-    """Return the samples of an output that judge, the fitted ones where none does."""
-    judged = [r.judged(output) for r in runs]
-    return judged if any(j.any() for j in judged) else [r.fitted(output) for r in runs]
+def counted(experiments: Sequence[Experiment], channel: int) -> list[BoolArray]:
+    """Return the samples of a channel that judge, the fitted ones where none does."""
+    judged = [e.at(channel, e.held_out) for e in experiments]
+    some = any(j.any() for j in judged)
+    return judged if some else [e.at(channel) for e in experiments]
 
 
 def runs_of(
@@ -96,11 +52,14 @@ def runs_of(
     holdout: Sequence[Signals] = (),
     *,
     judged: bool = True,
-) -> tuple[Run, ...]:
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+) -> tuple[Experiment, ...]:
     """Return the experiments of a model; some samples of them are held out if they are `judged`.
 
     Those of `holdout`, but for the tenth that finds their state; without such a record a quarter of
-    every one in blocks, as `split` chooses them along the input that moves most.
+    every one in blocks, as `split` chooses them along the input that moves most. Their channels are
+    the outputs that move; those of `zeros` have an offset of their own in every record.
 
     Raises InputError for inputs that are missing or have gaps, and where no output was measured.
     """
@@ -115,27 +74,39 @@ def runs_of(
         )
     problems.raise_if_any()
     shadows = [[_shadow(model, s) for s in part] for part in (given, holdout)]
-    experiments = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
-    both = zip((*given, *holdout), experiments, strict=True)
-    runs = []
-    for s, e in both:
-        inputs = np.column_stack([np.empty((s.n, 0)), *(s.columns[n] for n in model.input_names)])
-        outputs, noise = _outputs(model, s), np.ones(len(model.output_names))
-        runs.append(Run(s, s.time - s.time[0], inputs, outputs, e.used, e.held_out, noise))
-    return tuple(runs)
+    split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
+    records = cast("Sequence[Any]", (*given, *holdout))
+    found = [
+        replace(e, record=r, known_start=known_start) for e, r in zip(split, records, strict=True)
+    ]
+    channels = []
+    for o in model.structure.outputs:
+        channel = Channel(
+            o.name, o.unit, (o.name,), straight=STRAIGHT, offset=o.name in zeros, factors=False
+        )
+        own = [replace(e, channels=(channel,)) for e in found]
+        parts = [e.measured(0)[e.at(0)] for e in own]
+        spread = float(np.std(np.concatenate(parts))) if any(p.size for p in parts) else 0.0
+        if spread > 0.0:
+            channels.append(replace(channel, level=_FIRST_LEVEL * spread))
+    if not channels:
+        raise InputError("No output moves in these records; there is nothing to fit.")
+    return tuple(replace(e, channels=tuple(channels)) for e in found)
 
 
-def varied(run: Run) -> int | None:
+def varied(model: Model, e: Experiment) -> str | None:
     """Return the input that moves most, over its own size; None where none does."""
-    spans = [_moves(column) for column in run.inputs.T]
-    return int(np.argmax(spans)) if spans and max(spans) > 0 else None
+    spans = {n: _moves(e.record.column(n)) for n in model.input_names}
+    most = max(spans, key=lambda n: spans[n], default=None)
+    return most if most is not None and spans[most] > 0 else None
 
 
-def told_of_columns(model: Model, runs: Sequence[Run]) -> tuple[Note, ...]:
+def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note, ...]:
     """Return which inputs look held between samples and are read as lines, which outputs lack."""
-    lines = [r.signals for r in runs if r.signals.hold == "linear"]
+    records = cast("Sequence[Any]", [e.record for e in experiments])
+    lines = [r for r in records if r.hold == "linear"]
     held = {n: tuple(s.name for s in lines if n in stairs(s, (n,))) for n in model.input_names}
-    absent = [n for n in model.output_names if not any(n in r.signals.columns for r in runs)]
+    absent = [n for n in model.output_names if all(r.column(n) is None for r in records)]
     return (
         *(note("stairs", input=n, records=records) for n, records in held.items() if records),
         *(note("no_column", output=n) for n in absent),
@@ -179,17 +150,7 @@ def _shadow(model: Model, s: Signals) -> Record:
     )
 
 
-def _moves(column: FloatArray) -> float:
+def _moves(column: FloatArray | None) -> float:
+    if column is None:
+        return 0.0
     return float(np.ptp(column)) / max(float(np.max(np.abs(column))), 1e-300)
-
-
-def measured_spans(runs: Sequence[Run]) -> FloatArray:
-    """Return the range of every output over all experiments (ny,). Raises InputError at rest."""
-    every = np.vstack([r.outputs[r.used] for r in runs])
-    there = np.isfinite(every)
-    low = np.min(np.where(there, every, np.inf), axis=0)
-    high = np.max(np.where(there, every, -np.inf), axis=0)
-    spans: FloatArray = np.where(there.any(axis=0), high - low, 0.0)
-    if not np.any(spans > 0):
-        raise InputError("No output moves in these records; there is nothing to fit.")
-    return spans

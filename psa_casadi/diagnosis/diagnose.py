@@ -11,6 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
 from psa_casadi.diagnosis.judgement import told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
+from psa_casadi.diagnosis.pack import STACK
 from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupted, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
@@ -186,7 +187,7 @@ def decisions(
         if column == LOAD:
             effects = tuple(e for e in table if e in effects or e.measured_by == LOAD)
         apart = without_column(experiments, column)
-        alone = Task(apart, effects, task.method, task.progress, hidden=task.hidden)
+        alone = Task(apart, effects, STACK, task.method, task.progress, hidden=task.hidden)
         now, then = (
             _named(steps, task.limits) if verdict in NAMING else {},
             _named(search(alone), task.limits),
@@ -200,8 +201,8 @@ def decisions(
                 role="input" if k is None else "output",
                 unit="N" if k is None else COLUMNS[column].unit,
                 noise=None if k is None else colour.further[k].rms,
-                base_rms=None if k is None else first.held_further[k],
-                extended_rms=None if k is None else last.held_further[k],
+                base_rms=None if k is None else first.held[k + 1],
+                extended_rms=None if k is None else last.held[k + 1],
                 named=now,
                 named_without=then,
                 ruled_out=tuple(n for n in then if n not in now),
@@ -322,7 +323,9 @@ def diagnose(
         table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
         said += [*columns.left_out, *([why] if why else [])]
     so_far: list[Fit] = []
-    task = Task(experiments, tuple(table), method, progress, so_far.append, watch, hidden=hidden)
+    task = Task(
+        experiments, tuple(table), STACK, method, progress, so_far.append, watch, hidden=hidden
+    )
     try:
         # from the end: the screening begins at the front
         with compiled_ahead(start.with_effect(e) for e in reversed(table)):

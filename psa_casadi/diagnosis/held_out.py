@@ -23,9 +23,7 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.colour import Colour, rms
-from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.further import predicted_further
-from psa_casadi.identification.fitting.prediction import Prediction, measured
+from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import Experiment
 
 FloatArray = npt.NDArray[np.float64]
@@ -108,27 +106,6 @@ def held_out_residuals(
 def held_out_rms(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> float:
     """Return the root mean square over all held-out samples [m]."""
     return rms(np.concatenate(held_out_residuals(experiments, predicted)))
-
-
-def held_out_further(
-    fit: Fit, experiments: Sequence[Experiment], predictions: Sequence[Prediction]
-) -> tuple[float, ...]:
-    """Return the root mean square errors of the further channels over all held-out samples.
-
-    In their units; those of the fitted samples where none is held out. The predictions are those of
-    whole records.
-    """
-    found = []
-    for f in fit.further:
-        rows = predicted_further(experiments, predictions, f).items()
-        held = np.concatenate([_held_out(experiments[k], f.number, shown) for k, shown in rows])
-        found.append(rms(held) if held.size else f.rms)
-    return tuple(found)
-
-
-def _held_out(e: Experiment, channel: int, shown: FloatArray) -> FloatArray:
-    at = e.at(channel, e.held_out)
-    return np.asarray((e.measured(channel) - shown)[at] / e.share(channel))
 
 
 def held_out_gain(

@@ -153,7 +153,7 @@ class Balance:
     """What hypotheses of one search are weighed with: records, score, rms of the noise [m]."""
 
     experiments: Sequence[Experiment]
-    scale: Scale[Hypothesis]
+    scale: Scale
     noise: float
 
     def weigh(self, before: Hypothesis, after: Hypothesis, *, beside: bool = True) -> Weighed:

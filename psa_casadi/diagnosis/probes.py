@@ -37,7 +37,7 @@ from psa_casadi.records.noise import peaks as highest_peaks
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import compiled, side_by_side
 from psa_casadi.simulation.simulate import Way
-from psa_casadi.simulation.start import memory_names
+from psa_casadi.simulation.start import is_stack, memory_names
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -169,7 +169,9 @@ def directions(
     Without `finite_steps` only derivatives are taken, which some effects have not at their null.
     They are simulated side by side.
     """
-    peaks = {SPECTRAL_PEAKS: residual_peaks(fit, experiments)}
+    peaks = {}
+    if any(SPECTRAL_PEAKS in e.probe.values() for e in effects):
+        peaks[SPECTRAL_PEAKS] = residual_peaks(fit, experiments)
     if any(DISPLACEMENT_PEAKS in e.probe.values() for e in effects):
         peaks[DISPLACEMENT_PEAKS] = residual_periods(fit, experiments)
     if any(DISPLACEMENT_STEPS in e.probe.values() for e in effects):
@@ -229,7 +231,7 @@ def _directions_at(
     for memory in _histories(fit, experiments, effect, model):
         for step in steps:
             try:
-                columns, further = _changes(fit, experiments, model, moved, memory, step)
+                columns, further = changes(fit, experiments, model, moved, memory, step)
             except PsaError:
                 continue
             for k, (name, size) in enumerate(moved.items()):
@@ -252,6 +254,7 @@ def _histories(
     """The effect's memories at rest, and for settling ones also as after long cycling."""
     known = fit.starts()
     settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
+    settling = settling if is_stack(model) else []
     variants = [tuple(known)]
     if settling:
         cycled = []
@@ -264,7 +267,7 @@ def _histories(
     return variants
 
 
-def _changes(
+def changes(
     fit: Fit,
     experiments: Sequence[Experiment],
     model: Model,
@@ -272,10 +275,11 @@ def _changes(
     memory: tuple[dict[str, float], ...],
     step: float,
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return what parameters change in the displacement's used samples (samples, m) [m].
+    """Return what parameters change in the first channel's fitted samples (samples, m).
 
-    They are `moved` along their derivatives, by their sizes, or the one by a finite `step`. With it
-    comes what each changes in every further column, beyond offsets and factors.
+    In its unit, over the records' shares of the noise. They are `moved` along their derivatives, by
+    their sizes, or the one by a finite `step`. With it comes what each changes in every further
+    channel, beyond offsets and factors.
     """
     stepped = model.with_values(dict.fromkeys(moved, step)) if step else model
     rtol = fit.way.rtol if step else _RTOL
@@ -284,35 +288,33 @@ def _changes(
     def changed(k: int) -> FloatArray:
         """Return outputs after the step, or their changes along the derivatives (n, outputs, m)."""
         e = experiments[k]
-        if e.held_out_whole:
+        if not e.stop:
             return np.zeros((0, len(outputs), len(moved)))
         found = trace_record(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
             stop=e.stop, way=Way(rtol, rtol), by_start=False, outputs=outputs,
         )  # fmt: skip
-        own = found.y[:, :, None] if step else found.sensitivity * sizes
-        return own[e.used[: e.stop]]
+        own: FloatArray = found.y[:, :, None] if step else found.sensitivity * sizes
+        return own
 
     outputs = outputs_of(experiments[0].channels)
-    every = [changed(k) for k in range(len(experiments))]
-    parts, further = [own[:, 0] for own in every], []
-    if step:
-        for k, (e, residual) in enumerate(
-            zip(experiments, fit.residuals_of(experiments), strict=True)
-        ):
-            shown = measured(e.record)[: e.stop][e.used[: e.stop]]
-            parts[k] = parts[k] + (fit.offset(k) - (shown - residual))[:, None]
-    for f in fit.further:
-        columns = []
-        for k in f.records:
-            e = experiments[k]
-            total = -e.measured(f.number)[e.used][:, None] if step else 0.0
-            for factor, name in zip(f.factors, f.channel.outputs, strict=True):
-                total = total + factor * every[k][:, outputs.index(name)]
-            columns.append(total)
-        left = f.left_of(np.concatenate(columns))
-        further.append(left + f.residuals[:, None] if step else left)
-    return np.concatenate(parts), tuple(further)
+    every, columns = [changed(k) for k in range(len(experiments))], []
+    for f in fit.channels:
+        parts = []
+        for k, residual in zip(f.records, f.parts, strict=True):
+            e, at = experiments[k], experiments[k].at(f.number)
+            rows = zip(f.factors, f.channel.outputs, strict=True)
+            total = sum(
+                factor * every[k][at[: e.stop], outputs.index(name)] for factor, name in rows
+            )
+            if step:  # what is shown beyond what the fit shows
+                offset = 0.0 if f.number else fit.offset(k)
+                total = total + (offset - e.measured(f.number)[at])[:, None]
+                parts.append(total / e.share(f.number) + residual[:, None])
+            else:
+                parts.append(total / e.share(f.number))
+        columns.append(f.left_of(np.concatenate(parts)))
+    return columns[0], tuple(columns[1:])
 
 
 def spans(trials: Sequence[Direction]) -> list[list[int]]:

@@ -6,11 +6,14 @@ these here decide what is said. `python -m tests.studies ablation` doubles and h
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from psa_casadi.component import Component
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment, fitted
+
+if TYPE_CHECKING:
+    from psa_casadi.diagnosis.pack import Pack
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ class Tried:
 
 @dataclass(frozen=True)
 class Task:
-    """The records, the table of effects to search, the method, and who is told of the progress.
+    """The records, the effects to search, what knows the device, the method, and who is told.
 
     `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
     interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made.
@@ -162,6 +165,7 @@ class Task:
 
     experiments: tuple[Experiment, ...]
     table: tuple[Component, ...]
+    pack: "Pack"
     method: Method = field(default_factory=Method)
     progress: Callable[[str], None] = lambda _: None
     keep: Callable[[Fit], None] = lambda _: None
@@ -175,12 +179,12 @@ class Task:
 
     @property
     def fast(self) -> bool:
-        """Whether a stack may ring within a record's band."""
-        return shows_ringing(self.experiments)
+        """Whether the device may ring within a record's band."""
+        return self.pack.fast(self.experiments)
 
     def alike(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot tell apart but by forms nobody knows."""
-        return same_curves(self.experiments, self.table, fit)
+        return self.pack.alike(self.experiments, self.table, fit)
 
 
 def same_curves(

@@ -159,6 +159,28 @@ def relevelled(best: Fit, experiments: Sequence[Experiment]) -> tuple[Fit, tuple
     return best, now
 
 
+def relevelled_all(best: Fit, experiments: Sequence[Experiment], rounds: int = 4) -> Fit:
+    """Fit again with every channel's residual as its noise level, until that stays the same."""
+    for _ in range(rounds if best.further else 1):
+        first = best.channels[0].relevelled().level
+        levels = [f.relevelled() for f in best.further]
+        before = [best.sigma[0], *(f.level for f in best.further)]
+        change = np.log(np.array([first, *(c.level for c in levels)]) / np.array(before))
+        if best.interrupted or np.max(np.abs(change)) < _SAME_LEVEL:
+            break
+        best = fit(
+            best.model, [e.beside(levels) for e in experiments], best.unknowns.names,
+            sigma=[max(first, 1e-300)] * len(experiments), start_states=best.starts(),
+            evaluations=POLISH, tolerance=1e-6,
+        )  # fmt: skip
+    return best
+
+
+def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]:
+    """Return the experiments with the levels of the further channels that weighted a fit."""
+    return [e.beside(f.channel for f in before.further) for e in experiments]
+
+
 def refit_or_keep(
     previous: Fit, experiments: Sequence[Experiment], free: Sequence[str], sigma: Sequence[float]
 ) -> Fit:

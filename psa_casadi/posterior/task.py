@@ -1,7 +1,7 @@
 """What is sampled: the records as a fit has them, the priors, the fit, and the density there."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np

@@ -229,6 +229,10 @@ class Experiment:
         values = self.record.column(self.channels[channel].column)
         return np.full(self.record.n, np.nan) if values is None else values
 
+    def errors(self, channel: int, predicted: FloatArray) -> FloatArray:
+        """Return measured minus predicted readings of a channel (n,), over its share of noise."""
+        return np.asarray((self.measured(channel) - predicted) / self.share(channel))
+
     def at(self, channel: int, samples: BoolArray | None = None) -> BoolArray:
         """Return which of the samples, by default the used ones, have a reading of a channel."""
         found: BoolArray = (self.used if samples is None else samples) & np.isfinite(

@@ -84,7 +84,7 @@ def trace(
     steps_limit: int = 0,
     steps_most: int = 0,
 ) -> Traced:
-    """SHIM"""
+    """SHIM."""
     ys, ss, ways = [], [], ""
     for output in outputs:
         y = None

@@ -75,9 +75,7 @@ class Begun:
     by_start: FloatArray
 
 
-def begun(
-    model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, float]
-) -> Begun:
+def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, float]) -> Begun:
     """Return the start for samples u (n, nu) at times t (n,) [s], and deviations of some states.
 
     A stack begins where the first inputs and their rates put it (`start_on`); any other model at
@@ -86,7 +84,9 @@ def begun(
     names = model.state_names
     if not is_stack(model):
         found = _declared(model, u[0], deviations)
-        return Begun(found.x, found.by_parameter, found.by_start[:, [*map(names.index, deviations)]])
+        return Begun(
+            found.x, found.by_parameter, found.by_start[:, [*map(names.index, deviations)]]
+        )
     memories = memory_names(model.structure)
     start = start_on(model, t, u, {n: deviations.get(n, 0.0) for n in memories})
     x, moved = start.x.copy(), np.zeros((len(names), len(deviations)))

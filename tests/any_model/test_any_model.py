@@ -16,11 +16,12 @@ from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import block_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.predict import Sizes, sizes_of
 from psa_casadi.any_model.runs import runs_of
+from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.own_words import own_verdict_sentence
+from psa_casadi.simulation.simulate import record_inputs
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor, oscillator, pair, tanks
 from tests.report.browser import DARK, find_browser
@@ -84,8 +85,8 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     psa.write_report(d, path)
     text = path.read_text("utf-8")
     page = Page(text)
-    (run,) = d.runs
-    held = (run.outputs[:, 0] - d.extended[0][:, 0])[run.held_out]
+    (run,) = d.experiments
+    held = (run.measured(0) - d.extended[0][:, 0])[run.held_out]
     rms = 1e6 * np.sqrt(np.mean(held**2))
     assert page.text.startswith("Diagnosis of oscillator: cause named")
     assert (
@@ -102,7 +103,7 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert page.targets <= page.names
     assert "default-src 'none'" in text
     above, below, *_ = (t for t in figures(text)[0]["data"] if t["name"] == "base model")
-    miss = 1e3 * (run.outputs - d.base[0])[:, 0]  # in mm
+    miss = 1e3 * (run.measured(0) - d.base[0][:, 0])  # in mm
     assert np.max(np.abs(numbers(below["y"]))) == pytest.approx(np.max(np.abs(miss)), rel=1e-5)
     assert len(numbers(above["y"])) == len(numbers(below["y"])) > 1000
     assert path.stat().st_size < 3_000_000
@@ -110,7 +111,8 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert told[0].startswith("verdict    cause named. The cause is hysteresis of x in v")
     assert f"error      position: held-out rms 160 µm of the base, {rms:.2f} µm of the e" in told[3]
     linear = psa.run(
-        d.model.with_values({"hysteresis_of_x_in_v_size": 0.0}), run.time, run.inputs,
+        d.model.with_values({"hysteresis_of_x_in_v_size": 0.0}), run.record.time,
+        record_inputs(d.model, run.record, run.record.n),
         np.zeros(len(d.model.state_names)), hold="linear",
     ).y[:, 0]  # fmt: skip
     size = f"it moves the position by up to {1e3 * np.ptp(d.extended[0][:, 0] - linear):.3g} mm"
@@ -131,10 +133,10 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
 @shares_hysteresis
 def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
     d, path = _hysteresis(), tmp_path / "page.html"
-    (run,), (cause,) = d.runs, d.causes
+    (run,), (cause,) = d.experiments, d.causes
     hostile = replace(
         d,
-        runs=(replace(run, signals=replace(run.signals, name=_HOSTILE)),),
+        experiments=(replace(run, record=replace(run.record, name=_HOSTILE)),),
         causes=(replace(cause, description=_HOSTILE),),
         missed=replace(d.missed, seen=_HOSTILE),
         remarks=(_HOSTILE,),
@@ -186,7 +188,7 @@ def test_a_cause_that_no_effect_has_is_unexplained() -> None:
     told = d.budget.unnamed
     assert told is not None
     assert told.interval[0] < told.share == free.share < told.interval[1]
-    x = d.runs[0].outputs[:, 0]  # the state that it follows is what was measured
+    x = d.experiments[0].measured(0)  # the state that it follows is what was measured
     assert free.variable == "x"
     assert len(free.along) == len(free.added) == len(x)
     assert np.std(x - free.along) < np.std(x - d.base[0][:, 0])  # with it, the model is nearer
@@ -202,7 +204,7 @@ def test_ports_and_effects_of_gain_0_leave_a_model_as_it_is(make: Callable[[], p
     table = effects_of(model, sizes_of(model, runs))
     assert len({e.name for e in table}) == len(table)
     opened, every = with_ports(model), extended(model, table)
-    t, u = runs[0].time, runs[0].inputs
+    t, u = runs[0].record.time, record_inputs(model, runs[0].record, runs[0].record.n)
     x0 = np.array([s.start for s in model.structure.states])
     plain = psa.run(model, t, u, x0, rtol=1e-8)
     beside = np.array([s.start for s in every.structure.states])

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,9 +10,9 @@ import pytest
 from scipy.stats import binom
 
 from psa_casadi.any_model.result import removed_from
-from psa_casadi.any_model.runs import Run
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.records.signals import Signals
+from psa_casadi.records.split import Channel, Experiment
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,9 +24,17 @@ SHARE = 13.0 / 30.0
 SAMPLES, DRAWS = 240, 150
 
 
+CHANNELS = tuple(Channel(n, "1", (n,), offset=False, factors=False) for n in "yz")
+
+
+def _signals(outputs: FloatArray) -> Any:
+    columns = dict(zip("yz", outputs.T, strict=True))
+    return Signals(name="run", time=np.arange(SAMPLES, dtype=np.float64), columns=columns)
+
+
 def _drawn(
     rng: np.random.Generator, records: int
-) -> tuple[list[Run], list[FloatArray], list[FloatArray]]:
+) -> tuple[list[Experiment], list[FloatArray], list[FloatArray]]:
     """Return runs of two outputs with noise, and what either cause adds along each."""
     runs, one, other = [], [], []
     for k in range(records):
@@ -33,8 +42,7 @@ def _drawn(
         outputs = NOISE * rng.standard_normal((SAMPLES, 2))
         outputs[rng.random(SAMPLES) < 0.3, 1] = np.nan  # the second sensor is slower
         held = time % 4 == 3 if records < 4 else np.full(SAMPLES, k > 0)
-        signals = Signals(name=f"run {k}", time=time, columns={"y": outputs[:, 0]})
-        runs.append(Run(signals, time, np.zeros((SAMPLES, 0)), outputs, ~held, held, np.ones(2)))
+        runs.append(Experiment(_signals(outputs), ~held, held, CHANNELS))
         one.append(ONE * rng.standard_normal((SAMPLES, 2)))
         other.append(OTHER * rng.standard_normal((SAMPLES, 2)))
     return runs, one, other
@@ -51,7 +59,7 @@ def _shares(rng: np.random.Generator, records: int) -> _Drawn:
     runs, one, other = _drawn(rng, records)
     none = [np.zeros((SAMPLES, 2)) for _ in runs]
     both = [a + b for a, b in zip(one, other, strict=True)]
-    removed = removed_from(runs, (0, 1), both, NOISE.tolist())
+    removed = removed_from(runs, both, NOISE.tolist())
     return _Drawn(
         removed.share("first", one, none),
         removed.share("other", other, none),
@@ -88,8 +96,8 @@ def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power(
     assert Share("little", 0.004, (0.0, 0.02)).text == "under 1 % (0 to 2 %)"
     runs, one, _ = _drawn(np.random.default_rng(2), 1)
     (run,) = runs
-    quiet = [replace(run, outputs=np.zeros((SAMPLES, 2)))]
-    left = removed_from(quiet, (0, 1), one, (0.0, 0.0)).share("half", one, [0.5 * one[0]])
+    quiet = [replace(run, record=_signals(np.zeros((SAMPLES, 2))))]
+    left = removed_from(quiet, one, (0.0, 0.0)).share("half", one, [0.5 * one[0]])
     assert left.share == pytest.approx(0.75, rel=1e-9)
-    still = removed_from(quiet, (0, 1), [0.0 * one[0]], (0.0, 0.0)).share("none", one, one)
+    still = removed_from(quiet, [0.0 * one[0]], (0.0, 0.0)).share("none", one, one)
     assert (still.share, still.interval) == (0.0, (0.0, 0.0))

@@ -9,6 +9,7 @@ from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.components import BASE
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.pack import STACK
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
@@ -38,7 +39,7 @@ def test_bends_are_alike_where_no_resonance_shows(
     shown = simulate(model, time, voltage).displacement
     experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=shown)),)
     found = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
-    groups = Task(experiments, TABLE).alike(found)
+    groups = Task(experiments, TABLE, STACK).alike(found)
     assert tuple(tuple(sorted(group)) for group in groups) == alike
 
 

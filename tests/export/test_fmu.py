@@ -10,7 +10,7 @@ import pytest
 
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.predict import Sizes
+from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Component, Equations
 from psa_casadi.export.check.agreement import has_reference
 from psa_casadi.export.check.check import as_exported, check_fmu

@@ -14,7 +14,7 @@ from psa_casadi.any_model.effects.attached import (
     size_of,
 )
 from psa_casadi.any_model.effects.of_signals import ANGLE, bent, beyond, level_of, signal_effects
-from psa_casadi.any_model.predict import Sizes
+from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, state_unit

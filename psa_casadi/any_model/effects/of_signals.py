@@ -19,7 +19,7 @@ from psa_casadi.any_model.effects.attached import (
     scale_of,
     size_of,
 )
-from psa_casadi.any_model.predict import Sizes
+from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.model.ports import Port, true_output
 from psa_casadi.shapes import ANGLES, pade_section, softplus

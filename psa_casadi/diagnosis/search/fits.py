@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis, near_
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
-from psa_casadi.identification.refitting import quick_rtol, refit
+from psa_casadi.identification.refitting import quick_rtol, refit, weighted
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -81,7 +81,7 @@ def fit_with_all(
                 model = model.with_effect(effect, {**effect.at_gain(own, values), **reset})
             found = fit(
                 model,
-                experiments,
+                weighted(before, experiments),
                 names,
                 sigma=before.sigma,
                 start_states=memory,
@@ -118,7 +118,7 @@ def continued(
     names = current.unknowns.names
     return fit(
         current.model,
-        experiments,
+        weighted(current, experiments),
         [*names, *(n for n in series_parameters(current) if n not in names)],
         sigma=current.sigma,
         start_states=current.starts(),
@@ -318,7 +318,8 @@ def without(
     for share in _SHARES:
         try:
             start = model.with_values({n: share * model.values[n] for n in gains})
-            found = refit(replace(whole.fit, model=start), experiments, names, least=least)
+            parts = weighted(whole.fit, experiments)
+            found = refit(replace(whole.fit, model=start), parts, names, least=least)
         except PsaError:
             continue
         return hypothesis(causes, found, experiments, final=True)
@@ -328,7 +329,7 @@ def without(
 def together(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
     """Fit all parameters once more, weighted by the noise that the residuals now suggest."""
     try:
-        found = refit(of.fit, experiments, of.fit.unknowns.names)
+        found = refit(of.fit, weighted(of.fit, experiments), of.fit.unknowns.names)
     except PsaError:
         return None
     return hypothesis(of.causes, found, experiments, final=True)

@@ -14,40 +14,22 @@ inflation by the noise's colour. The evidence of all samples is the product of t
 are held out whole judge alone: of these the score has no L. The price is the prior of a cause.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import DISPLACEMENT_PEAKS, Component
-from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus, residual_colour, rms
-from psa_casadi.diagnosis.held_out import (
-    held_out_further,
-    held_out_gain,
-    held_out_rms,
-    whole_residuals,
-)
-from psa_casadi.diagnosis.noise import knowable_of, known_colour
+from psa_casadi.component import Component
+from psa_casadi.diagnosis.colour import Colour, Omnibus, residual_colour, rms
+from psa_casadi.diagnosis.held_out import held_out_gain
+from psa_casadi.diagnosis.pack import Pack
 from psa_casadi.diagnosis.probes import Direction, directions
-from psa_casadi.diagnosis.screening import (
-    Score,
-    Screening,
-    estimated,
-    evidence,
-    independent,
-    screen,
-    without,
-)
+from psa_casadi.diagnosis.screening import Score, Screening, estimated, evidence, screen
 from psa_casadi.diagnosis.task import LIMITS, Task, Thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.further import with_column
-from psa_casadi.identification.fitting.unknowns import Fitted
-from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
-from psa_casadi.simulation.start import linear_part
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.timings import stage
 
@@ -58,19 +40,34 @@ FloatArray = npt.NDArray[np.float64]
 class Hypothesis:
     """A model with some causes beside the base, fitted to the records.
 
-    `causes` are in the order in which the search found them; `predicted` [m] are the predictions of
-    whole records, `holdout_rms` and `whole_rms` [m] the errors in held-out and in all samples;
-    `final` says that the fit went on to its end. `held_further` are the errors of the further
-    columns in held-out samples, in their units.
+    `causes` are in the order in which the search found them; `shown` (n, channels) are the
+    predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
+    held-out, in fitted and in all samples, over the records' shares of the noise, in its unit;
+    `final` says that the fit went on to its end.
     """
 
     causes: tuple[Component, ...]
     fit: Fit
-    predicted: tuple[FloatArray, ...]
-    holdout_rms: float
-    whole_rms: float
+    shown: tuple[FloatArray, ...]
+    held: tuple[float, ...]
+    train: tuple[float, ...]
+    whole: tuple[float, ...]
     final: bool = False
-    held_further: tuple[float, ...] = ()
+
+    @property
+    def predicted(self) -> tuple[FloatArray, ...]:
+        """The predictions (n,) of the first channel."""
+        return tuple(y[:, 0] for y in self.shown)
+
+    @property
+    def holdout_rms(self) -> float:
+        """The error of the first channel in held-out samples."""
+        return self.held[0]
+
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """The held-out rms of every channel, that of fitted samples where none is held out."""
+        return tuple(held or train for held, train in zip(self.held, self.train, strict=True))
 
     @property
     def names(self) -> frozenset[str]:
@@ -82,9 +79,9 @@ class Hypothesis:
         return frozenset(c.name for c in self.causes[:count])
 
     def removes(self, before: "Hypothesis") -> float:
-        """Power [m^2] that it takes from the residual of another one.
+        """Power, in the first channel's unit, that it takes from the residual of another one.
 
-        What it takes from a further column counts over that column's level, as of the displacement.
+        What it takes from a further channel counts over that one's level, as of the first.
         """
         level, count = rms(np.array(before.fit.sigma)), max(len(before.fit.residuals), 1)
         beside = sum(
@@ -94,10 +91,13 @@ class Hypothesis:
         return before.fit.rms**2 - self.fit.rms**2 + beside
 
     def share(self, before: "Hypothesis", root: "Hypothesis") -> float:
-        """What it takes from another one's error over whole records, over what that one takes."""
-        taken = root.whole_rms**2 - before.whole_rms**2
-        more = before.whole_rms**2 - self.whole_rms**2
-        return more / taken if taken > 0 else np.inf
+        """What it takes from another one's error over whole records, over what that one takes.
+
+        Summed over the channels, each over its level.
+        """
+        levels = np.array([f.level for f in before.fit.channels])
+        base, old, new = (np.square(h.whole / levels).sum() for h in (root, before, self))
+        return float((old - new) / (base - old)) if base > old else np.inf
 
 
 def hypothesis(
@@ -111,14 +111,21 @@ def hypothesis(
     if fit is None:
         return None
     try:
-        whole = fit.predictions(experiments, differentiated=False, further=True)
+        shown = tuple(fit.shown(experiments))
     except PsaError:
         return None
-    beside = held_out_further(fit, experiments, whole)
-    predicted = tuple(p.displacement for p in whole)
-    held = held_out_rms(experiments, predicted)
-    every = rms(np.concatenate(whole_residuals(experiments, predicted)))
-    return Hypothesis(tuple(causes), fit, predicted, held, every, final, beside)
+    rows = []
+    for k, f in enumerate(fit.channels):
+        held, train, every = [], [], []
+        for e, y in zip(experiments, shown, strict=True):
+            left = e.errors(f.number, y[:, k])
+            held.append(left[e.at(f.number, e.held_out)])
+            train.append(left[e.at(f.number)])
+            every.append(left[np.isfinite(left)])
+        own = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
+        rows.append((own[0] or (f.rms if k else 0.0), *own[1:]))
+    held_rms, train_rms, whole = zip(*rows, strict=True)
+    return Hypothesis(tuple(causes), fit, shown, held_rms, train_rms, whole, final)
 
 
 def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
@@ -131,76 +138,55 @@ def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
     return root
 
 
-class Explanation(Protocol):
-    """What a scale needs of a hypothesis: its causes, and the fit with them."""
-
-    @property
-    def causes(self) -> tuple[Component, ...]:
-        """Its causes."""
-
-    @property
-    def fit(self) -> Fitted:
-        """The fit with them."""
-
-
-H = TypeVar("H", bound=Explanation)
-
-
-def _nothing(_of: object, _before: object, _colour: Colour) -> float:
-    return 0.0
-
-
 @dataclass(frozen=True, eq=False)
-class Scale(Generic[H]):
+class Scale:
     """What hypotheses are compared by: the plain base, the colour of the noise, the limits.
 
-    `by_held_out` is ln of what one hypothesis gives the held-out samples over what another one
-    does; they choose between hypotheses, or `judge_only`.
+    `held` are the held-out samples of every channel; they choose between hypotheses, or
+    `judge_only`.
     """
 
-    base: H
+    base: Hypothesis
     colour: Colour
     limits: Thresholds
-    by_held_out: Callable[[H, H, Colour], float] = _nothing
+    held: tuple[int, ...] = ()
     judge_only: bool = False
-    _known: dict[Fitted, float] = field(init=False, default_factory=dict)
+    _known: dict[Fit, float] = field(init=False, default_factory=dict)
 
-    def evidence(self, of: H) -> float:
+    def evidence(self, of: Hypothesis) -> float:
         """Ln B, of the fitted samples alone; more modes than one have their price here."""
         if of.fit not in self._known:
             self._known[of.fit] = evidence(self.base.fit, of.fit, self.colour)
         return self._known[of.fit] - self.limits.price * sum(c.count - 1 for c in of.causes)
 
-    def held_out(self, of: H, before: H) -> float:
+    def held_out(self, of: Hypothesis, before: Hypothesis) -> float:
         """Ln of what one hypothesis gives the held-out samples over what another one does."""
-        return self.by_held_out(of, before, self.colour)
+        if not any(self.held):
+            return 0.0
+        straight = [f.straight for f in of.fit.channels]
+        return held_out_gain(self.held, self.colour, straight, before.held, of.held)
 
-    def gain(self, of: H, before: H) -> float:
+    def gain(self, of: Hypothesis, before: Hypothesis) -> float:
         """Ln of the Bayes factor of one hypothesis over another one, of all samples that choose."""
         held_out = 0.0 if self.judge_only else self.held_out(of, before)
         return self.evidence(of) - self.evidence(before) + held_out
 
-    def score(self, of: H) -> float:
+    def score(self, of: Hypothesis) -> float:
         """Ln of the Bayes factor over the plain base, less the price of the causes."""
         return self.gain(of, self.base) - self.limits.price * len(of.causes)
 
-    def of_fitted(self, of: H) -> float:
+    def of_fitted(self, of: Hypothesis) -> float:
         """The score of the fitted samples alone."""
         return self.evidence(of) - self.limits.price * len(of.causes)
 
 
 def scale_of(
     base: Hypothesis, colour: Colour, limits: Thresholds, experiments: Sequence[Experiment]
-) -> Scale[Hypothesis]:
+) -> Scale:
     """Return the scale of a search; blocks of fitted records choose, whole records judge alone."""
-    held = sum(int(e.held_out.sum()) for e in experiments)
-
-    def gained(of: Hypothesis, before: Hypothesis, colour: Colour) -> float:
-        straight = [0.0, *(f.straight for f in of.fit.further)]
-        errors = [(h.holdout_rms, *h.held_further) for h in (before, of)]
-        return held_out_gain([held] * len(straight), colour, straight, *errors) if held else 0.0
-
-    return Scale(base, colour, limits, gained, any(e.held_out_whole for e in experiments))
+    numbers = [f.number for f in base.fit.channels]
+    held = tuple(sum(int(e.at(j, e.held_out).sum()) for e in experiments) for j in numbers)
+    return Scale(base, colour, limits, held, any(e.held_out_whole for e in experiments))
 
 
 #: So many starts each effect gets.
@@ -208,17 +194,19 @@ _STARTS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Look(Generic[H]):
+class View:
     """What the residual of a hypothesis shows.
 
     `of` is the hypothesis as it was seen, `trials` the directions of further effects there,
-    `screening` their scores with the colour of the noise, `test` the omnibus test.
+    `screening` their scores with the colour of the noise, `test` the omnibus test; `pack` knows the
+    kind of device.
     """
 
-    of: H
+    of: Hypothesis
     trials: tuple[Direction, ...]
     screening: Screening
     test: Omnibus
+    pack: Pack
 
     @property
     def decrease(self) -> float:
@@ -261,10 +249,6 @@ class Look(Generic[H]):
                 starts.append(score)
         return starts
 
-
-class View(Look[Hypothesis]):
-    """What the residual of a stack's hypothesis shows."""
-
     @property
     def promise(self) -> float:
         """Power [m^2] that the best direction would remove, linearly estimated."""
@@ -272,11 +256,12 @@ class View(Look[Hypothesis]):
 
     @property
     def shows(self) -> bool:
-        """Whether a direction is above the threshold and would remove what can be told of a stack.
+        """Whether a direction is above the threshold and would remove what can be told.
 
         Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
         """
-        seen = self.decrease >= self.screening.threshold and self.promise > self.test.knowable**2
+        seen = self.decrease >= self.screening.threshold
+        seen = seen and self.pack.shows(self.of.fit, self.promise, self.test)
         return seen and (self.test.alarm or not self.of.causes)
 
     @property
@@ -303,88 +288,46 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     finite = "finite steps" not in task.method.without
     kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
-    return View(
-        of, tuple(kept), screening,
-        tested(fit, experiments, screening.colour, task.limits, even=bool(of.causes)),
-    )  # fmt: skip
-
-
-def tested(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    colour: Colour,
-    limits: Thresholds,
-    *,
-    even: bool,
-) -> Omnibus:
-    """Return the test of the residual, or that of a further column where only this one alarms."""
-
-    def test_of(
-        residual: FloatArray, parts: Sequence[Experiment], own: Colour, least: float
-    ) -> Omnibus:
-        voltage, time = (
-            np.concatenate([getattr(e.record, name)[e.used] for e in parts])
-            for name in ("voltage", "time")
-        )
-        noise = noise_rms(residual, own)
-        return omnibus(
-            residual, voltage, time, own, noise,
-            knowable=least, even=even, alarms_below=limits.alarm,
-        )  # fmt: skip
-
-    test = test_of(fit.residuals, experiments, colour, knowable_of(fit, experiments, limits))
-    for f, own in zip(fit.further, colour.further, strict=True):
-        if test.alarm:
-            break
-        parts = [experiments[k] for k in with_column(experiments, f.column)]
-        found = test_of(f.residuals, parts, own, f.straight)
-        p = min(1.0, found.p_value * (1 + len(fit.further)))
-        if found.alarm and p < limits.alarm:
-            size = max(test.size, 2.0 * test.knowable)
-            test = replace(found, p_value=p, size=size, knowable=test.knowable, output=f.column)
-    return test
+    even = bool(of.causes)
+    test = task.pack.tested(fit, experiments, screening.colour, task.limits, even=even)
+    return View(of, tuple(kept), screening, test, task.pack)
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
-    lengths = [int(e.used.sum()) for e in task.experiments]
-    residuals = fit.residuals_of(task.experiments)
-    known = [known_colour(e.record, r) for e, r in zip(task.experiments, residuals, strict=True)]
+    lengths = [int(e.at(0).sum()) for e in task.experiments]
+    known, colour = task.pack.colours(fit, task.experiments), None
     if "remainder" in task.method.without:
-        return screen(
-            fit, trials, lengths, colour=residual_colour(fit.residuals, lengths), limits=task.limits
-        )
-    return screen(fit, trials, lengths, known, limits=task.limits)
+        known, colour = None, residual_colour(fit.residuals, lengths)
+    return screen(fit, trials, lengths, known, colour=colour, limits=task.limits)
 
 
 #: Fits of one set whose evidence differs by so many nats at most are the same minimum.
 _SAME = 1.0
-#: Terms of a static curve.
-_CURVE = 8
 #: Share of a range that is near its end.
 _END = 0.1
-#: Damping ratio of a sharp resonance, and halves of its width within which a tone is its ringing.
-_SHARP, _WIDTHS = 0.05, 2.0
 
 
 def held_out_confirms(
-    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale[Hypothesis]
+    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale
 ) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     The rule is `confirmed`; a change of prediction with the sum of squares D promises D/2 over the
-    noise's power.
+    noise's power, summed over the channels.
     """
-    held = np.concatenate([e.held_out for e in experiments])
-    if not np.any(held):
+    if not any(scale.held):
         return True
-    samples = np.count_nonzero(held) / scale.colour.inflation
-    change = np.concatenate(
-        [(new - old) for new, old in zip(of.predicted, before.predicted, strict=True)]
-    )[held]
-    after = max(of.holdout_rms, 1e-300)
-    promise = 0.5 * samples * float(np.mean(change**2)) / after**2
-    gained = scale.held_out(of, before)
-    score = scale.of_fitted(of) - scale.of_fitted(before)
+    promise = 0.0
+    for k, (f, own) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
+        rows = zip(experiments, of.shown, before.shown, strict=True)
+        change = np.concatenate(
+            [(new - old)[e.at(f.number, e.held_out), k] / e.share(f.number) for e, new, old in rows]
+        )
+        if change.size:
+            after = max(float(np.hypot(of.held[k], f.straight)), 1e-300)
+            samples = change.size / own.inflation
+            promise += 0.5 * samples * float(np.mean(change**2)) / after**2
+    gained, score = scale.held_out(of, before), scale.of_fitted(of) - scale.of_fitted(before)
     return confirmed(gained, promise, score, scale.limits)
 
 
@@ -405,77 +348,6 @@ def another_minimum(gained: float, held_out: float) -> bool:
     It has `gained` more evidence, and held-out samples do not object by more than that [nats].
     """
     return gained > _SAME and gained + held_out > 0.0
-
-
-def shows_memory(
-    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], limits: Thresholds
-) -> bool:
-    """Whether what a cause adds to another hypothesis is more than a curve of the voltage.
-
-    At most `static` of the power that the other's parameters cannot follow may be one. Elements
-    that are wider than the voltage's way are such a curve.
-    """
-    pairs = zip(of.predicted, before.predicted, experiments, strict=True)
-    added = np.concatenate([(new - old)[e.used] for new, old, e in pairs])
-    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
-    basis = independent(before.fit.jacobian)
-    target = without(added, basis)
-    place = (voltage - voltage.min()) / max(float(np.ptp(voltage)), 1e-300)
-    curves = np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
-    static = independent(without(curves, basis)).T @ target
-    return float(static @ static) < limits.static * float(target @ target)
-
-
-def in_character(fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
-    """Whether the data ask for this effect and not for something else.
-
-    Not with a parameter pushed to the end of its range, a tone among the harmonics of a periodic
-    drive (a hum at the mains' frequency may lie between them), a hum where the stack itself rings,
-    or a period over the displacement that fits into it less than twice.
-    """
-    values = fit.model.values
-    widest = max(e.record.range_m for e in experiments)
-    periods = [values[n] for n, grid in cause.probe.items() if grid == DISPLACEMENT_PEAKS]
-    if any(period > 0.5 * widest for period in periods):
-        return False
-    tone = cause.tone
-    hum = cause.belongs_to == "environment"
-    if tone is not None and not all(
-        tells_tone(values[tone], e.record, hum=hum) for e in experiments
-    ):
-        return False
-    if tone is not None and hum and _rings_at(fit, values[tone]):
-        return False
-    return inside_ranges(values, cause)
-
-
-def _rings_at(fit: Fit, frequency: float) -> bool:
-    """Whether a frequency [Hz] lies within a sharp resonance of the fitted model."""
-    try:
-        poles = np.linalg.eigvals(linear_part(fit.model).a) / (2.0 * np.pi)
-    except (PsaError, np.linalg.LinAlgError):
-        return False
-    sharp = np.abs(poles.real) < _SHARP * np.abs(poles)
-    near = np.abs(np.abs(poles) - frequency) < _WIDTHS * np.abs(poles.real)
-    return bool(np.any(sharp & near))
-
-
-def inside_ranges(values: Mapping[str, float], cause: Component) -> bool:
-    """Whether no parameter of a cause but its gain was pushed to the end of its range.
-
-    One whose lower end is a limit of the law may be there.
-    """
-    for p in cause.parameters:
-        if not p.fitted or p.name == cause.gain:
-            continue
-        low, high = (0.0, p.bounds[1]) if p.limit else p.bounds
-        margin = 1e-3 * (high - low) if not p.log else 0.0
-        value = values[p.name]
-        if p.log and (value < 1.01 * low or value > high / 1.01):
-            return False
-        if not p.log and (value <= low + margin or value >= high - margin):
-            return False
-    return True
 
 
 def near_end(values: Mapping[str, float], effect: Component) -> bool:

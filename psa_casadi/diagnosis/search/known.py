@@ -11,15 +11,13 @@ from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
-    Scale,
     View,
     another_minimum,
     examine,
     held_out_confirms,
-    in_character,
+    hypothesis,
     root_of,
     scale_of,
-    shows_memory,
 )
 from psa_casadi.diagnosis.task import State, Task, Tried
 from psa_casadi.identification.fitting.fit import Fit
@@ -56,8 +54,7 @@ class Known:
         first = examine(root, task)
         self.trials = first.trials
         own = scale_of(root, first.screening.colour, task.limits, task.experiments)
-        alone = Scale(root, own.colour, own.limits, judge_only=own.judge_only)
-        self.scale = alone if "held out" in task.method.without else own
+        self.scale = replace(own, held=()) if "held out" in task.method.without else own
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
@@ -101,10 +98,12 @@ class Known:
 
     def removes_little(self, h: Hypothesis) -> bool:
         """Whether structure remains and the causes remove too little to be named."""
-        root, noise = self.root.holdout_rms, self.scale.colour.rms
-        if not h.causes or root <= noise:
+        noise = np.array([own.rms for own in self.scale.colour.each])
+        root, left = (np.square(x.held / np.maximum(noise, 1e-300)) for x in (self.root, h))
+        excess = float(np.sum(np.maximum(root - 1.0, 0.0)))
+        if not h.causes or excess <= 0.0:
             return False
-        share = (root**2 - h.holdout_rms**2) / (root**2 - noise**2)
+        share = float(np.sum(root - left)) / excess
         return share < self.task.limits.enough and self.view(h).test.alarm
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
@@ -229,7 +228,7 @@ class Known:
         if hypotheses:
             names = ", ".join("+".join(sorted(h.names)) for h in hypotheses)
             self.task.progress(f"{names} to the end")
-        for ended in side_by_side(lambda h: to_end(h, self.task.experiments), hypotheses):
+        for ended in side_by_side(self._to_end, hypotheses):
             old = self.found[ended.names]
             better = self.scale.evidence(ended) >= self.scale.evidence(old)
             self.found[ended.names] = kept = ended if better else replace(old, final=True)
@@ -240,21 +239,30 @@ class Known:
         for again in side_by_side(lambda h: begun_again(h, self.task.experiments), final):
             self.note(again)
 
-    def worth(self, h: Hypothesis, *, confirmed: bool = True) -> bool:
-        """Whether every cause removes what can be told, and held-out data confirm it."""
-        root = self.root
-        knowable = self.views[root.names].test.knowable
-        experiments, out = self.task.experiments, self.task.method.without
+    def _to_end(self, h: Hypothesis) -> Hypothesis:
+        """Fit a hypothesis to its end, with the noise that it leaves."""
+        experiments, ended = self.task.experiments, to_end(h, self.task.experiments)
+        levelled = self.task.pack.ended(ended.fit, experiments)
+        if levelled is ended.fit:
+            return ended
+        return hypothesis(ended.causes, levelled, experiments, final=True) or ended
+
+    def worth(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
+        """Whether every cause removes what can be told, and held-out data confirm it.
+
+        And whether it removes more than the `form` of the others may miss.
+        """
+        experiments, out, pack = self.task.experiments, self.task.method.without, self.task.pack
+        knowable = self.views[NONE].test.knowable
         for cause in h.causes:
-            if not in_character(h.fit, cause, experiments):
+            if not pack.in_character(h.fit, cause, experiments):
                 return False
             before = self.found.get(h.names - {cause.name})
             if before is None:
                 continue
-            little = before.causes and "form" not in out
-            if h.removes(before) <= knowable**2 or (
-                little and h.share(before, root) <= self.task.limits.further
-            ):
+            if not pack.told(h.fit, before.fit, h.removes(before), knowable):
+                return False
+            if form and "form" not in out and self.little(h, before):
                 return False
             if not self.remembers(h, before, cause):
                 return False
@@ -264,13 +272,24 @@ class Known:
                 return False
         return True
 
+    def little(self, h: Hypothesis, before: Hypothesis) -> bool:
+        """Whether a further cause removes no more than the form of the others may miss."""
+        few = h.share(before, self.root) <= self.task.limits.further
+        return bool(before.causes) and few
+
+    def slight(self, h: Hypothesis) -> tuple[str, ...]:
+        """Name the causes that remove too little beside the others to be told from their form."""
+        less = {c.name: self.found.get(h.names - {c.name}) for c in h.causes}
+        return tuple(n for n, b in less.items() if b is not None and self.little(h, b))
+
     def remembers(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
         """Whether a cause with a memory that stays adds more than a static curve."""
         if not any(s.memory and not s.settles for s in cause.states):
             return True
         if (h, before) not in self.memories:
-            self.memories[h, before] = shows_memory(
-                h, before, self.task.experiments, self.task.limits
+            added = [new - old for new, old in zip(h.predicted, before.predicted, strict=True)]
+            self.memories[h, before] = self.task.pack.remembers(
+                added, before.fit, self.task.experiments, self.task.limits
             )
         return self.memories[h, before]
 

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Omnibus
+from psa_casadi.diagnosis.pack import STACK
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.screening import (
     Screening,
@@ -22,7 +23,6 @@ from psa_casadi.diagnosis.search.hypothesis import (
     View,
     examine,
     hypothesis,
-    in_character,
     root_of,
     scale_of,
 )
@@ -125,7 +125,7 @@ def _view(found: Known, h: Hypothesis, task: Task) -> View:
     own = found.views.get(h.names)
     if own is None or own.of.fit is not h.fit:
         found.views[h.names] = own = examine(h, task, found.trials)
-    return own if own.of is h else View(h, own.trials, own.screening, own.test)
+    return own if own.of is h else replace(own, of=h)
 
 
 def _step(found: Known, task: Task, view: View, chosen: Hypothesis | None) -> Step:
@@ -181,7 +181,7 @@ def _judged(
     fit = {
         n
         for n, h in fitted.items()
-        if in_character(h.fit, next(c for c in h.causes if c.name == n), task.experiments)
+        if task.pack.in_character(h.fit, next(c for c in h.causes if c.name == n), task.experiments)
     }
     for group in alike:
         if good & set(group):
@@ -248,7 +248,7 @@ def fit_contenders(
     plain = hypothesis((), base, experiments, final=True)
     if plain is None:
         raise InputError(["The fitted base cannot be simulated over the whole of these records."])
-    task = Task(experiments, tuple(effects), progress=progress)
+    task = Task(experiments, tuple(effects), STACK, progress=progress)
     seen = examine(plain, task)
     progress("fitting the rivals")
     step = Step(seen, evidence=seen.estimated())

@@ -161,7 +161,9 @@ def _sought(
             offset, moves = (unknowns.offset(there, k), by_offset) if j == 0 else (0.0, 0.0)
             shown = run.y[known[:stop], i] + offset
             missed.append((shown - experiment.measured(j)[known]) / weight)
-            slopes.append((run.sensitivity[known[:stop], i] @ by_start + moves)[:, columns] / weight)
+            slopes.append(
+                (run.sensitivity[known[:stop], i] @ by_start + moves)[:, columns] / weight
+            )
         return np.concatenate([*missed, own * prior]), np.vstack([*slopes, np.diag(prior)])
 
     free = np.full(len(columns), np.inf)
@@ -418,6 +420,17 @@ class Fit:
             self.model, experiments, self.unknowns, self.placed(experiments),
             way=self.way, everything=True, differentiated=differentiated, further=further,
         )  # fmt: skip
+
+    def shown(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+        """Predict all channels over whole records (n, channels); nan where a record has none."""
+        parts = self.predictions(experiments, differentiated=False, further=True)
+        beside = [predicted_further(experiments, parts, f) for f in self.further]
+        return [
+            np.column_stack(
+                [p.displacement, *(own.get(k, np.full(e.record.n, np.nan)) for own in beside)]
+            )
+            for k, (e, p) in enumerate(zip(experiments, parts, strict=True))
+        ]
 
     def outputs(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict all outputs of the model over whole records (n, ny), with sensors' offsets."""

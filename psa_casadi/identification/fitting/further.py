@@ -130,10 +130,7 @@ def _fitted(
     def shown(name: str, part: int) -> FloatArray:
         rows = zip(records, shares, strict=True)
         return np.concatenate(
-            [
-                predictions[k].further[name][part][at[k][: experiments[k].stop]] / s
-                for k, s in rows
-            ]
+            [predictions[k].further[name][part][at[k][: experiments[k].stop]] / s for k, s in rows]
         )
 
     values = np.column_stack([shown(name, 0) for name in channel.outputs])
@@ -170,9 +167,7 @@ def span_of(experiments: Sequence[Experiment], number: int) -> float:
 def with_column(experiments: Sequence[Experiment], column: str) -> list[int]:
     """Return the experiments that have a column and samples of it to fit."""
     return [
-        k
-        for k, e in enumerate(experiments)
-        if e.record.column(column) is not None and e.used.any()
+        k for k, e in enumerate(experiments) if e.record.column(column) is not None and e.used.any()
     ]
 
 

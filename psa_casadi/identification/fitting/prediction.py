@@ -161,7 +161,9 @@ def traced_by_theta(
     """
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
-    found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, outputs=outputs)
+    found = trace_record(
+        current, record, start, unknowns.names, stop=stop, way=way, outputs=outputs
+    )
     count = len(unknowns.names)
     start_slopes = unknowns.place_slopes(theta, index)[0]
     by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
@@ -199,7 +201,7 @@ def predict(
         stop = record.n if everything else e.stop
         if not stop:
             none = np.zeros(0), np.zeros((0, unknowns.size))
-            return Prediction(*none, "", {n: none for n in outputs})
+            return Prediction(*none, "", dict.fromkeys(outputs, none))
         if not differentiated:
             found = trace_record(
                 current, record, start, (), stop=stop, way=way, by_start=False, outputs=outputs
@@ -209,9 +211,7 @@ def predict(
                 model, record, unknowns, theta, index,
                 stop=stop, way=way, slopes=slopes, outputs=outputs,
             )  # fmt: skip
-        shown = {
-            n: (found.y[:, k], found.sensitivity[:, k]) for k, n in enumerate(outputs)
-        }
+        shown = {n: (found.y[:, k], found.sensitivity[:, k]) for k, n in enumerate(outputs)}
         x, jacobian = shown[outputs[0]]
         if differentiated:
             jacobian = jacobian + unknowns.place_slopes(theta, index)[1]
@@ -224,7 +224,8 @@ def predict(
 class Simulated:
     """How a record was run, and what a finer run differs by (rms of its used samples).
 
-    `errors` are those of the channels without factors, the first one foremost, in their units. `way` is "" for a record that is held out whole.
+    `errors` are those of the channels without factors, the first one
+    foremost, in their units. `way` is "" for a record that is held out whole.
     """
 
     way: str

@@ -9,7 +9,6 @@ import numpy as np
 
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import Run
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.signature import signature
@@ -237,7 +236,7 @@ def _own_page(d: OdeDiagnosis) -> str:
     return render(
         "own_diagnosis.html",
         f"Diagnosis of {plain(d.model.name)}: {verdict_words.VERDICTS[d.verdict]}",
-        **_shared(d.model, series, d.runs, "measured"),
+        **_shared(d.model, series, d.experiments, "measured"),
         **_diagnosed(d),
         verdict=own_words.own_verdict_sentence(d),
         advice=what_now(d),
@@ -278,7 +277,7 @@ def _own_fit_page(found: OdeIdentification) -> str:
     return render(
         "own_fit.html",
         f"Identification of {plain(found.model.name)}",
-        **_shared(found.model, series, found.runs, "measured"),
+        **_shared(found.model, series, found.experiments, "measured"),
         found=found,
         verdict=own_words.own_fit_sentence(found),
         errors=own_words.own_fit_table(found, series),
@@ -288,7 +287,7 @@ def _own_fit_page(found: OdeIdentification) -> str:
 def _shared(
     model: Model,
     series: Sequence[Series],
-    given: Sequence[Experiment] | Sequence[Run],
+    given: Sequence[Experiment],
     origin: str,
     found: Identification | None = None,
 ) -> dict[str, Any]:

@@ -7,9 +7,10 @@ import numpy as np
 
 from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import Run, noise_share, varied
+from psa_casadi.any_model.runs import noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.model.compose import Model
+from psa_casadi.records.split import Experiment
 from psa_casadi.report.words import colours, verdict_words
 from psa_casadi.report.words.phrases import (
     added,
@@ -52,9 +53,10 @@ def own_verdict_sentence(d: OdeDiagnosis) -> str:
 
 def _base_errors(d: OdeDiagnosis) -> str:
     """Say the base model's error in every output, over its range in all records."""
-    whole = np.vstack([r.outputs for r in d.runs])
-    spans = np.nanmax(whole, axis=0) - np.nanmin(whole, axis=0)
-    ranges = dict(zip(d.model.output_names, map(float, spans), strict=True))
+    ranges = {}
+    for k, channel in enumerate(d.experiments[0].channels):
+        whole = np.concatenate([e.measured(k) for e in d.experiments])
+        ranges[channel.column] = float(np.nanmax(whole) - np.nanmin(whole))
     shares = {e.output: 100.0 * e.base / ranges[e.output] for e in d.errors}
     each = [f"{number(share, 2)} %" for share in shares.values()]
     if len(each) == 1:
@@ -69,7 +71,9 @@ def _base_errors(d: OdeDiagnosis) -> str:
 def own_lines(d: OdeDiagnosis) -> list[tuple[str, str]]:
     """Return the lines of a terminal's story: a label and what is told."""
     lines = [("verdict", f"{verdict_words.VERDICTS[d.verdict]}. {own_verdict_sentence(d)}")]
-    lines += [("records", listing([f"{r.name} ({len(r.time)} samples)" for r in d.runs]))]
+    lines += [
+        ("records", listing([f"{e.record.name} ({e.record.n} samples)" for e in d.experiments]))
+    ]
     for e in d.errors:
         shown = [with_its_unit(v, e.unit) for v in (e.base, e.extended, e.noise)]
         extended = f", {shown[1]} of the extended model" if added(d) else ""
@@ -172,43 +176,44 @@ def own_series(d: OdeDiagnosis) -> tuple[Series, ...]:
     curves = [("base model", colours.BASE, d.base)]
     if added(d):
         curves.append(("extended model", colours.EXTENDED, d.extended))
-    return tuple(_series(d.model, d.runs, noise, curves))
+    return tuple(_series(d.model, d.experiments, noise, curves))
 
 
 def own_fit_series(found: OdeIdentification) -> tuple[Series, ...]:
     """Return every measured output of every record, with the fitted model."""
-    predicted = found.fit.predicted(found.runs)
+    predicted = found.fit.outputs(found.experiments)
     curves = [("model", colours.EXTENDED, predicted)]
-    return tuple(_series(found.model, found.runs, found.noise, curves))
+    return tuple(_series(found.model, found.experiments, found.noise, curves))
 
 
 def _series(
     model: Model,
-    runs: Sequence[Run],
+    experiments: Sequence[Experiment],
     noise: Mapping[str, float],
     curves: Sequence[tuple[str, str, Sequence[FloatArray]]],
 ) -> Iterator[Series]:
-    outputs = model.structure.outputs
-    shares = [noise_share(runs, k) if o.name in noise else 1.0 for k, o in enumerate(outputs)]
-    for i, run in enumerate(runs):
-        moving = varied(run)
-        inputs = model.structure.inputs
-        against = "" if moving is None else in_brackets(inputs[moving].name, inputs[moving].unit)
-        for k, o in enumerate(outputs):
-            if o.name not in noise or np.isfinite(run.outputs[:, k]).sum() < _FEWEST:
+    channels = [(j, c) for j, c in enumerate(experiments[0].channels) if c.column in noise]
+    units = {i.name: i.unit for i in model.structure.inputs}
+    for i, e in enumerate(experiments):
+        record, moving = e.record, varied(model, e)
+        along = None if moving is None else record.column(moving)
+        for j, channel in channels:
+            if np.isfinite(e.measured(j)).sum() < _FEWEST:
                 continue
+            name = channel.column
+            place = model.output_names.index(name)
             yield Series(
-                name=run.name if len(noise) == 1 else f"{o.name} of {run.name}",
-                time=run.time,
-                voltage=np.zeros(len(run.time)) if moving is None else run.inputs[:, moving],
-                measured=run.outputs[:, k],
-                curves=tuple(Curve(name, c, y[i][:, k]) for name, c, y in curves),
-                held_out=run.judged(k),
-                noise=noise[o.name] * float(run.noise[k]) / shares[k],
+                name=record.name if len(noise) == 1 else f"{name} of {record.name}",
+                time=record.time - record.time[0],
+                voltage=np.zeros(record.n) if along is None else along,
+                measured=e.measured(j),
+                curves=tuple(Curve(told, c, y[i][:, place]) for told, c, y in curves),
+                held_out=e.at(j, e.held_out),
+                noise=noise[name] * e.share(j) / noise_share(experiments, j),
                 counts=False,
-                quantity=o.name,
-                unit=o.unit or "1",
-                against=against,
+                quantity=name,
+                unit=channel.unit or "1",
+                against="" if moving is None else in_brackets(moving, units[moving]),
             )
 
 

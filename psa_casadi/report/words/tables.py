@@ -34,7 +34,6 @@ from psa_casadi.units import convert
 
 if TYPE_CHECKING:
     from psa_casadi.any_model.result import OdeDiagnosis
-    from psa_casadi.any_model.runs import Run
     from psa_casadi.export.check.check import CheckReport
 
 
@@ -184,11 +183,11 @@ def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:
     return _table(("start", "cost", f"rms [{scale.unit}]", "led to"), rows)
 
 
-def record_table(experiments: "Sequence[Experiment] | Sequence[Run]", origin: str) -> Table:
+def record_table(experiments: "Sequence[Experiment]", origin: str) -> Table:
     """Return the records with their size, how they were used, and their SHA-256."""
     rows = []
     for e in experiments:
-        given = e.record if isinstance(e, Experiment) else e.signals
+        given = e.record
         counts = (str(int(part.sum())) for part in (e.used, e.held_out))
         rows.append((given.name, origin, number(given.duration), *counts, given.sha256))
     return _table(

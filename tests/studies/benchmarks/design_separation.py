@@ -22,6 +22,7 @@ from psa_casadi.design.experiment.experiment import (
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.design.experiment.search import GRID
 from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.pack import STACK
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import levelled
 from psa_casadi.diagnosis.search.hypothesis import examine, hypothesis
@@ -142,7 +143,7 @@ def likely_rival(record: Record, effect: str) -> str:
     table = [e for e in EFFECTS.values() if not e.inputs and set(e.needs) <= there]
     plain = hypothesis((), base, experiments)
     assert plain is not None
-    task = Task(experiments, tuple(table))
+    task = Task(experiments, tuple(table), STACK)
     evidence = levelled(examine(plain, task).estimated(), task.alike(base))
     others = {n: p for n, p in evidence.items() if n != effect}
     return max(others, key=lambda n: others[n])

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.pack import STACK
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
@@ -38,7 +39,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     base = fit_base(starting_model([record], None), experiments, progress=progress)
     table = tuple(e for e in EFFECTS.values() if not e.inputs or record.temperature is not None)
     table = tuple(e for e in table if set(e.needs) <= {c.name for c in base.model.components})
-    found = best_first(base, Task(experiments, table, progress=progress))
+    found = best_first(base, Task(experiments, table, STACK, progress=progress))
     d = diagnose([record], progress=progress)
     rows = [(_named(h), f"{found.scale.score(h):.0f}", "yes" if h.names in found.worthy else "no")
             for h in _best(found)]  # fmt: skip

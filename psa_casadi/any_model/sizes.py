@@ -1,0 +1,112 @@
+"""The sizes of a model's signals in its records."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import numpy.typing as npt
+
+from psa_casadi.component import Component
+from psa_casadi.errors import PsaError
+from psa_casadi.model.compose import Model, Structure
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.stepper import run
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Steps between two samples, and mean ones of a record, beyond which a model is given up.
+_STEPS, _MEAN_STEPS = 3000, 200
+
+
+def states_of(model: Model, e: Experiment, start: Mapping[str, float], rtol: float) -> FloatArray:
+    """Return all states (n, nx) of one experiment. Raises PsaError."""
+    t, u = e.record.time - e.record.time[0], record_inputs(model, e.record, e.record.n)
+    x0 = begun(model, t, u, start).x
+    return run(
+        model, t, u, x0, rtol=rtol, hold=e.record.hold,
+        steps_limit=_STEPS, steps_most=_MEAN_STEPS * e.record.n,
+    ).x  # fmt: skip
+
+
+#: Tolerance of the first look at a model whose states' sizes are not known.
+_LOOK_RTOL = 1e-9
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """The largest magnitudes of inputs, states, rates and outputs by name, and two times [s]."""
+
+    inputs: Mapping[str, float]
+    states: Mapping[str, float]
+    rates: Mapping[str, float]
+    outputs: Mapping[str, float]
+    sample: float
+    duration: float
+
+
+def sizes_of(
+    model: Model,
+    experiments: Sequence[Experiment],
+    starts: Sequence[Mapping[str, float]] | None = None,
+) -> Sizes:
+    """Return the sizes of a model's signals in experiments. Raises PsaError."""
+    given = starts or [{} for _ in experiments]
+    pairs = zip(experiments, given, strict=True)
+    tables = [states_of(model, e, s, _LOOK_RTOL) for e, s in pairs]
+    inputs = [record_inputs(model, e.record, e.record.n) for e in experiments]
+    f, p = _rates(model.structure), model.parameter_vector()
+    rates, outputs = [], []
+    for e, u, x in zip(experiments, inputs, tables, strict=True):
+        time = e.record.time - e.record.time[0]
+        found = f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x)))
+        rates.append(np.array(found[0]).T)
+        outputs.append(np.array(found[1]).T)
+
+    def largest(names: Sequence[str], parts: Sequence[FloatArray]) -> dict[str, float]:
+        whole = np.max(np.abs(np.vstack(parts)), axis=0, initial=0.0)
+        return {n: float(v) if v > 0 else 1.0 for n, v in zip(names, whole, strict=True)}
+
+    return Sizes(
+        inputs=largest(model.input_names, inputs),
+        states=largest(model.state_names, tables),
+        rates=largest(model.state_names, rates),
+        outputs=largest(model.output_names, outputs),
+        sample=float(np.median(np.concatenate([np.diff(e.record.time) for e in experiments]))),
+        duration=max(e.record.duration for e in experiments),
+    )
+
+
+def sized(model: Model, experiments: Sequence[Experiment]) -> Model:
+    """Return a model whose states of the plain size 1 have the size that they show in experiments.
+
+    Where it cannot be simulated at its values, it stays as it is.
+    """
+    if not any(s.nominal == 1.0 for c in model.components for s in c.states):
+        return model
+    try:
+        found = sizes_of(model, experiments)
+    except PsaError:
+        return model
+    return model.with_components(
+        resized(c, tuple(found.states[s.name] for s in c.states)) for c in model.components
+    )
+
+
+@cache
+def resized(component: Component, sizes: tuple[float, ...]) -> Component:
+    """Return a component with other usual sizes of states that declare none; once for all."""
+    states = tuple(
+        replace(s, nominal=float(f"{size:.2g}")) if s.nominal == 1.0 else s
+        for s, size in zip(component.states, sizes, strict=True)
+    )
+    return replace(component, states=states)
+
+
+@cache
+def _rates(structure: Structure) -> ca.Function:
+    arguments = [structure.time, structure.x, structure.u, structure.p]
+    return ca.Function("rates", arguments, [structure.xdot, structure.y])
