@@ -25,11 +25,11 @@ from psa_casadi.any_model.runs import runs_of, told_of_columns
 from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import diagnose as stacks
-from psa_casadi.diagnosis.pack import Pack
+from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.task import Method, Task
+from psa_casadi.diagnosis.task import Method
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
 from psa_casadi.identification.fitting.fit import Fit

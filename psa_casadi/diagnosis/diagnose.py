@@ -11,12 +11,12 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
 from psa_casadi.diagnosis.judgement import told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
-from psa_casadi.diagnosis.pack import STACK
+from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupted, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
-from psa_casadi.diagnosis.task import Method, Task, Thresholds, Tried
+from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import NAMING, conclude
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit

@@ -1,7 +1,7 @@
 """What a search asks of the kind of device: any model, or a stack."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +10,7 @@ from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
 from psa_casadi.diagnosis.noise import knowable_of, known_colour
 from psa_casadi.diagnosis.screening import independent, without
-from psa_casadi.diagnosis.task import Thresholds, same_curves, shows_ringing
+from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import relevelled_all
@@ -206,6 +206,38 @@ class StackPack(Pack):
 
 #: The stack of a diagnosis of records that come without a model of one's own.
 STACK = StackPack()
+
+
+@dataclass(frozen=True)
+class Task:
+    """The records, the effects to search, what knows the device, the method, and who is told.
+
+    `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
+    interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made.
+    """
+
+    experiments: tuple[Experiment, ...]
+    table: tuple[Component, ...]
+    pack: Pack
+    method: Method = field(default_factory=Method)
+    progress: Callable[[str], None] = lambda _: None
+    keep: Callable[[Fit], None] = lambda _: None
+    watch: Callable[[Tried], None] = lambda _: None
+    hidden: float = 0.0
+
+    @property
+    def limits(self) -> Thresholds:
+        """The constants that decide."""
+        return self.method.thresholds
+
+    @property
+    def fast(self) -> bool:
+        """Whether the device may ring within a record's band."""
+        return self.pack.fast(self.experiments)
+
+    def alike(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
+        """Groups of effects that these records cannot tell apart but by forms nobody knows."""
+        return self.pack.alike(self.experiments, self.table, fit)
 
 
 def _rings_at(fit: Fit, frequency: float) -> bool:

@@ -4,16 +4,13 @@ What a search does with its time (how many fits, from how many starts) stands wh
 these here decide what is said. `python -m tests.studies ablation` doubles and halves each.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 from psa_casadi.component import Component
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment, fitted
-
-if TYPE_CHECKING:
-    from psa_casadi.diagnosis.pack import Pack
 
 
 @dataclass(frozen=True)
@@ -153,38 +150,6 @@ class Tried:
     holdout_rms_m: float
     base_rms_m: float
     noise_rms_m: float
-
-
-@dataclass(frozen=True)
-class Task:
-    """The records, the effects to search, what knows the device, the method, and who is told.
-
-    `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
-    interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made.
-    """
-
-    experiments: tuple[Experiment, ...]
-    table: tuple[Component, ...]
-    pack: "Pack"
-    method: Method = field(default_factory=Method)
-    progress: Callable[[str], None] = lambda _: None
-    keep: Callable[[Fit], None] = lambda _: None
-    watch: Callable[[Tried], None] = lambda _: None
-    hidden: float = 0.0
-
-    @property
-    def limits(self) -> Thresholds:
-        """The constants that decide."""
-        return self.method.thresholds
-
-    @property
-    def fast(self) -> bool:
-        """Whether the device may ring within a record's band."""
-        return self.pack.fast(self.experiments)
-
-    def alike(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
-        """Groups of effects that these records cannot tell apart but by forms nobody knows."""
-        return self.pack.alike(self.experiments, self.table, fit)
 
 
 def same_curves(

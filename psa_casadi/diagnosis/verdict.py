@@ -35,6 +35,7 @@ from psa_casadi.diagnosis.judgement import (
 )
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
+from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.patch import patch_of, with_patch
 from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
@@ -51,7 +52,7 @@ from psa_casadi.diagnosis.result import (
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step, contenders
-from psa_casadi.diagnosis.task import Task, Thresholds, same_curves
+from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of

@@ -93,9 +93,10 @@ def quick_rtol(sigma: Sequence[float], experiments: Sequence[Experiment]) -> flo
     """
     shares = []
     for s, e in zip(sigma, experiments, strict=True):
-        y, v = measured(e.record)[e.used], e.record.voltage
+        y, v = e.measured(0)[e.at(0)], e.record.column("voltage")
         if y.size:
-            stretch = float(np.max(np.abs(v))) / max(float(np.ptp(v)), 1e-300)
+            along = np.arange(2.0) if v is None else v
+            stretch = float(np.max(np.abs(along))) / max(float(np.ptp(along)), 1e-300)
             shares.append(s / max(float(np.ptp(y * max(1.0, stretch))), 1e-300))
     return float(np.clip(_OF_NOISE * min(shares, default=1.0), FIT_RTOL, _QUICK_RTOL))
 

@@ -9,9 +9,8 @@ from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.components import BASE
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.pack import STACK
+from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.search.steps import one_of_each
-from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import fit

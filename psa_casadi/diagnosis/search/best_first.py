@@ -19,6 +19,7 @@ from psa_casadi.diagnosis.base_fit import (
     rings,
 )
 from psa_casadi.diagnosis.colour import noise_rms
+from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.search.fits import (
     afresh,
     any_afresh,
@@ -35,7 +36,6 @@ from psa_casadi.diagnosis.search.moves import (
     one_mode,
     with_modes,
 )
-from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side

@@ -15,6 +15,7 @@ from psa_casadi.identification.refitting import quick_rtol, refit, weighted
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.start import is_stack
 
 #: Evaluations of a quick fit from a direction; with what it held, free again.
 QUICK, _FREED = 8, 3
@@ -319,7 +320,8 @@ def without(
         try:
             start = model.with_values({n: share * model.values[n] for n in gains})
             parts = weighted(whole.fit, experiments)
-            found = refit(replace(whole.fit, model=start), parts, names, least=least)
+            sigma = None if is_stack(start) else whole.fit.sigma
+            found = refit(replace(whole.fit, model=start), parts, names, sigma=sigma, least=least)
         except PsaError:
             continue
         return hypothesis(causes, found, experiments, final=True)

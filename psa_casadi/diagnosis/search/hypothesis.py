@@ -23,10 +23,10 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, residual_colour, rms
 from psa_casadi.diagnosis.held_out import held_out_gain
-from psa_casadi.diagnosis.pack import Pack
+from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
 from psa_casadi.diagnosis.screening import Score, Screening, estimated, evidence, screen
-from psa_casadi.diagnosis.task import LIMITS, Task, Thresholds
+from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment

@@ -7,6 +7,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
+from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
@@ -19,7 +20,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     root_of,
     scale_of,
 )
-from psa_casadi.diagnosis.task import State, Task, Tried
+from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.simulation.side_by_side import side_by_side
 

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies
 from psa_casadi.diagnosis.search.fits import (
     Start,
@@ -22,7 +23,6 @@ from psa_casadi.diagnosis.search.fits import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, Known, nearly
-from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit

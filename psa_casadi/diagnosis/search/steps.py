@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Omnibus
-from psa_casadi.diagnosis.pack import STACK
+from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.screening import (
     Screening,
@@ -27,7 +27,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     scale_of,
 )
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.task import Task, Thresholds, same_curves
+from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import as_read

@@ -22,12 +22,11 @@ from psa_casadi.design.experiment.experiment import (
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.design.experiment.search import GRID
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.pack import STACK
+from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import levelled
 from psa_casadi.diagnosis.search.hypothesis import examine, hypothesis
 from psa_casadi.diagnosis.search.steps import one_of_each
-from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.search import CORE, fit_base

@@ -8,12 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.pack import STACK
+from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.task import Task
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
