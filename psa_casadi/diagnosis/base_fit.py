@@ -273,9 +273,9 @@ _QUICK, _FIRST, _BEST = 8, 4, 2
 _HOPEFUL = 2.0
 #: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
 _AGAIN = 1.5
-#: Sampling rates [Hz] at which a stack's resonances may show though they lie above the band; the
+#: Sampling rate [Hz] from which a stack's resonances may show though they lie above the band; the
 #: decrease of the whitened sum of squares from which ringing is seen, and resonances at most.
-_NEAR_BAND, SEEN, _RESONANCES = (300.0, 10_000.0), 40.0, 2
+_SHOWS, SEEN, _RESONANCES = 300.0, 40.0, 2
 
 
 @stage("base fit again")
@@ -400,7 +400,7 @@ def _with_ringing(
     elsewhere, too.
     """
     rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
-    if not _NEAR_BAND[0] < rate < _NEAR_BAND[1]:
+    if rate <= _SHOWS:
         return None
     tone = ringing(fit, experiments)
     if tone is None or tone.decrease < seen:
