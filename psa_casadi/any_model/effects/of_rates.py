@@ -22,6 +22,9 @@ from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magn
 from psa_casadi.units import rate_unit
 from psa_casadi.variables import Parameter, State
 
+#: Ordinary sizes at which a memory is looked for: of one that acts in full the derivative at 0 tells
+#: little.
+_IN_FULL = (0.0, 2.0, -2.0)
 #: A rate below this share of its size has no direction.
 _STILL = 1e-3
 #: Stiffest stop, over the largest rate at one range beyond it; width of its corner over the range.
@@ -221,6 +224,7 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
         ),
         states=(State("state", "1", "memory of the way", 0.5, memory=True, settles=False),),
         probe={"loss": (0.3, 1.0, 4.0, 16.0)},
+        finite_step=_IN_FULL,
         reads=reads,
     )  # fmt: skip
 

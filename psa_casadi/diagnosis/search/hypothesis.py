@@ -225,7 +225,8 @@ class View:
         """Return the best directions of one effect, from which its fits start.
 
         Of an effect that has two forms, between which no fit moves, each form gets a start; a
-        further start differs from the best one in as many trial values as it can.
+        further start differs from the best one in as many trial values as it can. One that is
+        looked for with both signs of its gain begins at each of these steps, too.
         """
         own = [s for s in self.screening.scores if s.direction.effect.name == name]
         near = [s for s in own if s.decrease >= 0.3 * own[0].decrease]
@@ -247,7 +248,8 @@ class View:
             new = score.direction.values not in known or score.direction.finite
             if new and score not in starts and len(starts) < _STARTS:
                 starts.append(score)
-        return starts
+        both = min(own[0].direction.effect.finite_step, default=0.0) < 0.0
+        return starts + [s for s in own if both and s.direction.finite and s not in starts]
 
     @property
     def promise(self) -> float:
