@@ -187,10 +187,8 @@ def traced(
     rtol: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return one output (stop,) and its derivatives (stop, k) by parameters or initial states."""
-    steps = _steps(model, run, x0, run.stop, rtol, unknowns=unknowns, s0=s0, output=output)
-    none = np.zeros((run.stop, 0))
-    slopes = none if steps.sensitivity is None else steps.sensitivity
-    return steps.y[:, model.output_names.index(output)], slopes
+    steps = _steps(model, run, x0, run.stop, rtol, unknowns=unknowns, s0=s0, outputs=(output,))
+    return steps.y[:, model.output_names.index(output)], steps.sensitivity[:, 0]
 
 
 def shown_by(

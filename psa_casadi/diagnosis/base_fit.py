@@ -231,7 +231,7 @@ def _difference(fit: Fit, number: int, experiment: Experiment) -> FloatArray:
         temperature=_between(record, time, record.temperature),
     )
     straight, smooth = (
-        trace_record(fit.model, r, start, (), stop=r.n, way=fit.way, by_start=False).output
+        trace_record(fit.model, r, start, (), stop=r.n, way=fit.way, by_start=False).y[:, 0]
         for r in (record, finer)
     )
     return np.asarray((smooth[::2] - straight) * 4.0 / 3.0)

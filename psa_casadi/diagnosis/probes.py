@@ -289,9 +289,9 @@ def _changes(
             return np.zeros((0, len(moved)))
         found = trace_record(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
-            stop=e.stop, way=Way(rtol, rtol), by_start=False, output=output,
+            stop=e.stop, way=Way(rtol, rtol), by_start=False, outputs=(output,),
         )  # fmt: skip
-        own = found.output[:, None] if step else found.sensitivity * sizes
+        own = found.y if step else found.sensitivity[:, 0] * sizes
         return own[e.used[: e.stop]]
 
     def in_column(f: Further, k: int) -> FloatArray:

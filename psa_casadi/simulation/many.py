@@ -187,7 +187,7 @@ def _on_cores(model: Model, task: Task, p: FloatArray, reduce: _Reduce | None) -
         way = Way(task.tolerance, task.tolerance, stepped=True)
         try:
             x0 = start_on(one, task.t, task.u).x
-            row = trace(one, task.t, task.u, x0, way=way, output=task.output).output
+            row = trace(one, task.t, task.u, x0, way=way, outputs=(task.output,)).y[:, 0]
         except SimulationError:
             row = np.full(n, np.nan)
         return kept(row[None], which)

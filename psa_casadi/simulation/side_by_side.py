@@ -104,4 +104,4 @@ def compiled(models: Iterable[Model]) -> None:
 
 def _compile(model: Model) -> None:
     with suppress(PsaError, MachineError):
-        why_not(model.structure, output_of(model) or "")
+        why_not(model.structure, (output_of(model) or "",))

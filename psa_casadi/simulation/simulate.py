@@ -58,9 +58,9 @@ class Way:
 
 @dataclass(frozen=True)
 class Traced:
-    """One output (n,), its derivatives (n, k), and the way that was taken."""
+    """Outputs (n, m), their derivatives (n, m, k), and the way that was taken."""
 
-    output: FloatArray
+    y: FloatArray
     sensitivity: FloatArray
     way: str
 
@@ -77,13 +77,14 @@ def trace(
     x0: FloatArray,
     *,
     way: Way,
-    output: str,
+    outputs: Sequence[str],
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
+    hold: str = "linear",
     steps_limit: int = 0,
     steps_most: int = 0,
 ) -> Traced:
-    """Return one output of a run and its derivatives by `unknowns` (see `run`).
+    """Return outputs of a run and their derivatives by `unknowns`, with `s0` and `hold` of `run`.
 
     `steps_limit` bounds the stepper's work between two samples, `steps_most` that of the run.
     Raises SimulationError where both ways fail.
@@ -92,17 +93,17 @@ def trace(
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
-                unknowns=unknowns, s0=s0, output=output,
+                hold=hold, unknowns=unknowns, s0=s0, outputs=outputs,
             )  # fmt: skip
             return Traced(found.shown, found.sensitivity, EXACT)
         except NotExact:
             pass
     steps = run(
-        model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, steps_most=steps_most,
-        unknowns=unknowns, s0=s0, output=output,
+        model, t, u, x0, rtol=way.step_rtol, hold=hold, steps_limit=steps_limit,
+        steps_most=steps_most, unknowns=unknowns, s0=s0, outputs=outputs,
     )  # fmt: skip
-    slopes = np.zeros((len(t), 0)) if steps.sensitivity is None else steps.sensitivity
-    return Traced(steps.y[:, model.output_names.index(output)], slopes, STEPPER)
+    rows = [model.output_names.index(n) for n in outputs]
+    return Traced(steps.y[:, rows], steps.sensitivity, STEPPER)
 
 
 def accurate(
@@ -119,7 +120,7 @@ def accurate(
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
-                output=output, everything=before is not None,
+                outputs=(output,), everything=before is not None,
             )  # fmt: skip
         except NotExact:
             break
@@ -128,7 +129,8 @@ def accurate(
             size = max(float(np.ptp(found.shown)), STILL * nominal)
             if np.max(np.abs(found.shown - before)) <= AGREE * rtol * size:
                 z = np.empty((len(t), 0))
-                return Steps(found.x, z, found.y, None, found.steps, found.rejected, 0), EXACT
+                cost = found.steps, found.rejected, 0
+                return Steps(found.x, z, found.y, found.sensitivity, *cost), EXACT
         before = found.shown
     step_rtol = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
     return run(model, t, u, x0, rtol=step_rtol, hold=hold), STEPPER

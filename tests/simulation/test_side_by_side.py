@@ -49,8 +49,8 @@ def test_a_failure_ahead_is_left_to_who_needs_the_model(
 ) -> None:
     tried = []
 
-    def why_not(structure: Structure, output: str) -> None:
-        tried.append(output)
+    def why_not(structure: Structure, outputs: tuple[str, ...]) -> None:
+        tried.append(outputs)
         raise MachineError("no compiler")
 
     monkeypatch.setattr(module, "why_not", why_not)

@@ -135,8 +135,8 @@ def _sought(
         except PsaError:
             return None
         by_start, by_offset = unknowns.place_slopes(there, k)
-        slopes = (run.sensitivity @ by_start + by_offset)[known][:, columns] / level
-        missed = (run.output[known] + unknowns.offset(there, k) - y) / level
+        slopes = (run.sensitivity[:, 0] @ by_start + by_offset)[known][:, columns] / level
+        missed = (run.y[known, 0] + unknowns.offset(there, k) - y) / level
         return np.concatenate([missed, own * prior]), np.vstack([slopes, np.diag(prior)])
 
     free = np.full(len(columns), np.inf)

@@ -216,8 +216,8 @@ def predicted_further(
         for factor, output in zip(fitted.factors, COLUMNS[fitted.column].outputs, strict=True):
             total += factor * trace_record(
                 current, e.record, start, (),
-                stop=e.record.n, way=way, by_start=False, output=output,
-            ).output  # fmt: skip
+                stop=e.record.n, way=way, by_start=False, outputs=(output,),
+            ).y[:, 0]  # fmt: skip
         found[k] = total + np.mean((given - total)[e.known])
     return found
 

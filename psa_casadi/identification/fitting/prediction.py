@@ -64,7 +64,8 @@ def predict_record(
     """
     found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
     count = len(wanted)
-    return found.output, found.sensitivity[:, :count], found.sensitivity[:, count:]
+    slopes = found.sensitivity[:, 0]
+    return found.y[:, 0], slopes[:, :count], slopes[:, count:]
 
 
 def record_start(model: Model, record: Record, start: Mapping[str, float]) -> FloatArray:
@@ -87,11 +88,11 @@ def trace_record(
     stop: int,
     way: Way,
     by_start: bool = True,
-    output: str = OUTPUT,
+    outputs: Sequence[str] = (OUTPUT,),
 ) -> Traced:
-    """Return one output (n,) and its derivatives by `wanted` and `start` (n, k + m).
+    """Return outputs (n, r) and their derivatives by `wanted` and `start` (n, r, k + m).
 
-    By `wanted` (n, k) alone if those `by_start` are not asked for.
+    By `wanted` (n, r, k) alone if those `by_start` are not asked for.
     """
     names = model.state_names
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
@@ -116,7 +117,7 @@ def trace_record(
         u,
         x0,
         way=way,
-        output=output,
+        outputs=outputs,
         unknowns=unknowns,
         s0=s0,
         steps_limit=_STEPS,
@@ -173,12 +174,14 @@ def traced_by_theta(
     """
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
-    found = trace_record(current, record, start, unknowns.names, stop=stop, way=way, output=output)
+    found = trace_record(
+        current, record, start, unknowns.names, stop=stop, way=way, outputs=(output,)
+    )
     count = len(unknowns.names)
     start_slopes = unknowns.place_slopes(theta, index)[0]
     by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
     by_theta[:count, :count] = slopes
-    return found.output, found.sensitivity @ by_theta, found.way
+    return found.y[:, 0], found.sensitivity[:, 0] @ by_theta, found.way
 
 
 def predict(
@@ -205,7 +208,7 @@ def predict(
             return Prediction(np.zeros(0), np.zeros((0, unknowns.size)), "")
         if not differentiated:
             found = trace_record(current, record, start, (), stop=stop, way=way, by_start=False)
-            x, jacobian, way_taken = found.output, found.sensitivity, found.way
+            x, jacobian, way_taken = found.y[:, 0], found.sensitivity[:, 0], found.way
         else:
             x, jacobian, way_taken = traced_by_theta(
                 model, record, unknowns, theta, index, stop=stop, way=way, slopes=slopes
@@ -249,7 +252,7 @@ def simulated(
             )
             for w in (way, way.finer)
         )
-        gap = (plain.output - finer.output)[used]
+        gap = (plain.y[:, 0] - finer.y[:, 0])[used]
         error = float(np.sqrt(np.mean(gap**2))) if gap.size else 0.0
         return Simulated(plain.way, error if plain.way == finer.way else float("inf"))
 

@@ -161,8 +161,8 @@ def tried(rtols: Sequence[float], repeats: int, trial: Trial) -> list[Reached]:
         doubt = _error(stepped(_CHECK), truth)
     except PsaError:
         return []
-    fit = trace(model, t, u, x0, way=Way(FIT_RTOL, FIT_RTOL), output=_OUTPUT)
-    fitted = fit.way, _error(fit.output, truth)
+    fit = trace(model, t, u, x0, way=Way(FIT_RTOL, FIT_RTOL), outputs=(_OUTPUT,))
+    fitted = fit.way, _error(fit.y[:, 0], truth)
     found = []
     for rtol in rtols:
         ours = theirs = inf
