@@ -129,10 +129,10 @@ static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
         ex_shown_chain(0, out + EX_NSHOWN, state->s + b * EX_NX, NONE, state->unit + b * EX_NP, own);
         for (int i = 0; i < EX_NSHOWN; ++i) memcpy(dy[i] + b * COLUMNS, own + i, sizeof *own);
     }
+    double *to = run->dy + sample * EX_NSHOWN * run->count;
     for (int i = 0; i < EX_NSHOWN; ++i) {
-        const long at = sample * EX_NSHOWN + i;
-        sum += run->shown[at] = out[i];
-        for (int c = 0; c < run->count; ++c) sum += run->dy[at * run->count + c] = dy[i][state->place[c]];
+        sum += run->shown[sample * EX_NSHOWN + i] = out[i];
+        for (int c = 0; c < run->count; ++c) sum += *to++ = dy[i][state->place[c]];
     }
     return !isfinite(sum);
 #else
