@@ -87,9 +87,9 @@ def why_not(structure: Structure, outputs: tuple[str, ...]) -> str | None:
 
 
 def _unfit(structure: Structure, outputs: tuple[str, ...]) -> str | None:
-    known = [o.name for o in structure.outputs]
-    for missing in (n for n in outputs if n not in known):
-        return f"it has no output {missing}"
+    missing = set(outputs) - {o.name for o in structure.outputs}
+    if missing or not outputs:
+        return f"it has no output {', '.join(sorted(missing))}"
     return "it calls an FMU, which has no formula" if structure.foreign else None
 
 
