@@ -97,7 +97,7 @@ def write_all(sources: Path) -> list[Work]:
         split = split_of(model.structure)
         if isinstance(split, str):
             raise PsaError(f"The model does not split: {split}.")
-        text = {"exact_model.h": generate(split, "measured_displacement")}
+        text = {"exact_model.h": generate(split, ("measured_displacement",))}
         exact = write(sources / f"exact{k}", text, (p.name for p in SOURCE.glob("exact*")))
         for lanes in LANES:
             flags = (*EXACT_FLAGS, f"-DPSA_LANES={lanes}")

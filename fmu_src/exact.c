@@ -114,22 +114,26 @@ static int write_sample(psa_state *state, long sample, const psa_pace *pace) {
     if (!run->shown) return 0;
     if (run->count == 0) {
         ex_shown(state->t, state->x, v, REAL(0.0), state->k, out);
-        for (int lane = 0; lane < sets; ++lane) {
-            run->shown[sample * sets + lane] = pace->dead[lane] ? NAN : LANE(out[0], lane);
-            if (PSA_LANES == 1 && !isfinite(LANE(out[0], lane))) return 1;
-        }
+        for (int i = 0; i < EX_NSHOWN; ++i)
+            for (int lane = 0; lane < sets; ++lane) {
+                run->shown[(sample * EX_NSHOWN + i) * sets + lane] = pace->dead[lane] ? NAN : LANE(out[i], lane);
+                if (PSA_LANES == 1 && !isfinite(LANE(out[i], lane))) return 1;
+            }
         return 0;
     }
 #if PSA_LANES == 1
-    double dy[MOST_UNKNOWNS + COLUMNS];
+    double dy[EX_NSHOWN][MOST_UNKNOWNS + COLUMNS], sum = 0.0; /* not finite where one of them is not */
     ex_shown_slopes(state->t, state->x, v, 0.0, state->k, out);
     for (int b = 0; b < state->blocks; ++b) {
-        column own;
-        ex_shown_chain(0, out + 1, state->s + b * EX_NX, NONE, state->unit + b * EX_NP, &own);
-        memcpy(dy + b * COLUMNS, &own, sizeof own);
+        column own[EX_NSHOWN];
+        ex_shown_chain(0, out + EX_NSHOWN, state->s + b * EX_NX, NONE, state->unit + b * EX_NP, own);
+        for (int i = 0; i < EX_NSHOWN; ++i) memcpy(dy[i] + b * COLUMNS, own + i, sizeof *own);
     }
-    double sum = run->shown[sample] = out[0]; /* not finite where one of them is not */
-    for (int c = 0; c < run->count; ++c) sum += run->dy[sample * run->count + c] = dy[state->place[c]];
+    double *to = run->dy + sample * EX_NSHOWN * run->count;
+    for (int i = 0; i < EX_NSHOWN; ++i) {
+        sum += run->shown[sample * EX_NSHOWN + i] = out[i];
+        for (int c = 0; c < run->count; ++c) sum += *to++ = dy[i][state->place[c]];
+    }
     return !isfinite(sum);
 #else
     return 0;

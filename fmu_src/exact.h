@@ -27,12 +27,12 @@ typedef struct {
     long steps_limit;      /* tried steps of one set */
     double *x;             /* [samples][nx][sets] or NULL */
     double *y;             /* [samples][ny][sets] or NULL */
-    double *shown;         /* [samples][sets] or NULL: the output whose sensitivity the model has; nan from where
-                              one of several sets cannot be integrated */
+    double *shown;         /* [samples][shown][sets] or NULL: outputs whose sensitivities the model has; nan from
+                              where one of several sets cannot be integrated */
     int count;             /* unknowns of the sensitivities; 0 where there is more than one set */
     const int *which;      /* [count] parameter index, -1: initial value */
     const double *s0;      /* [nx][count] d x0 / d theta */
-    double *dy;            /* [samples][count] */
+    double *dy;            /* [samples][shown][count] */
     const volatile int *stop; /* NULL, or 0 until another thread ends the run */
     /* results */
     long steps, rejected, forced; /* forced: steps of the finest level that missed the tolerance */

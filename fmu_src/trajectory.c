@@ -35,11 +35,16 @@ static int write_sample(psa_trajectory *run, psa_workshop *at, long sample) {
     if (run->count > 0) {
         double *const jac = at->by_state, *const param = at->by_parameter;
         if (psa_model_output_sensitivity(solver->t, solver->x, u, p, jac, param, w)) return 1;
-        for (int c = 0; c < run->count; ++c) {
-            double sum = run->which[c] >= 0 ? param[run->output + run->which[c] * PSA_NY] : 0.0;
-            for (int i = 0; i < PSA_NX; ++i)
-                sum += jac[run->output + i * PSA_NY] * at->sens.s[i * run->count + c];
-            run->dy[sample * run->count + c] = sum;
+        const int count = run->count;
+        const double *const s = at->sens.s;
+        double *dy = run->dy + sample * run->shown * count;
+        for (int j = 0; j < run->shown; ++j) {
+            const int row = run->outputs[j];
+            for (int c = 0; c < count; ++c) {
+                double sum = run->which[c] >= 0 ? param[row + run->which[c] * PSA_NY] : 0.0;
+                for (int i = 0; i < PSA_NX; ++i) sum += jac[row + i * PSA_NY] * s[i * count + c];
+                *dy++ = sum;
+            }
         }
     }
 #endif

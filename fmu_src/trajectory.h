@@ -29,8 +29,9 @@ typedef struct {
     int count;              /* unknowns of the sensitivities, 0: none; with sampled states always 0 */
     const int *which;       /* [count] parameter index, -1: initial value */
     const double *s0;       /* [PSA_NX][count] d x0 / d theta */
-    int output;             /* output whose sensitivity is wanted */
-    double *dy;             /* [samples][count] */
+    int shown;              /* outputs whose sensitivities are wanted */
+    const int *outputs;     /* [shown] their indices */
+    double *dy;             /* [samples][shown][count] */
     double *work;           /* (PSA_STAGES + 3) * PSA_NX * count */
     const volatile int *stop; /* NULL, or 0 until another thread ends the run */
     /* results */

@@ -119,7 +119,7 @@ def module_texts(structure: Structure) -> Mapping[str, str]:
     exact = {}
     if shown is not None and not isinstance(split, str):
         with suppress(Unprintable):  # then it takes no exact steps
-            exact["exact_model.h"] = generate(split, shown)
+            exact["exact_model.h"] = generate(split, (shown,))
     by_input = ca.Function(
         "psa_by_input", c_arguments(s), [ca.densify(ca.jacobian(c_slopes(s), s.u))], {"cse": True}
     )

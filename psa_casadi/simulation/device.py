@@ -27,7 +27,7 @@ def kernel_text(structure: Structure, output: str) -> str:
 
     Raises NotExact where the model is not for exact steps.
     """
-    given = {"exact_model.h": model_text(structure, output)}
+    given = {"exact_model.h": model_text(structure, (output,))}
     folder = sources_directory()
     seen: set[str] = set()
 

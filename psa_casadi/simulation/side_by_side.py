@@ -19,6 +19,7 @@ from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.run import why_not
 from psa_casadi.simulation.simulate import output_of
+from psa_casadi.simulation.stepper import make_ready
 
 #: Environment variable with the number of threads; without it there is one for each core.
 VARIABLE = "PSA_CASADI_THREADS"
@@ -74,7 +75,7 @@ def one_thread_of_algebra() -> Iterator[None]:
 def compiled_ahead(
     models: Iterable[Model], first: Iterable[Callable[[], object]] = ()
 ) -> Iterator[None]:
-    """Compile models for exact steps beside what runs inside, after the work that comes `first`.
+    """Compile models beside what runs inside, after the work that comes `first` (see `compiled`).
 
     At the end, what has begun is finished and the rest is left out. What fails is tried again by
     whoever needs it, and fails there.
@@ -98,10 +99,16 @@ def _in_context(context: Context, work: Callable[[], object]) -> Callable[[], ob
 
 
 def compiled(models: Iterable[Model]) -> None:
-    """Compile models for exact steps on all cores; what fails is left to whoever needs it."""
+    """Compile models on all cores: exact steps of what they show, or else the stepper.
+
+    That is the displacement, of models that have none every output. What fails is left to whoever
+    needs it.
+    """
     side_by_side(_compile, models)
 
 
 def _compile(model: Model) -> None:
+    shown = output_of(model)
     with suppress(PsaError, MachineError):
-        why_not(model.structure, output_of(model) or "")
+        if why_not(model.structure, model.output_names if shown is None else (shown,)):
+            make_ready(model)

@@ -84,29 +84,26 @@ def trace(
     steps_limit: int = 0,
     steps_most: int = 0,
 ) -> Traced:
-    """SHIM."""
-    ys, ss, ways = [], [], ""
-    for output in outputs:
-        y = None
-        if not way.stepped:
-            try:
-                found = run_exact(
-                    model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
-                    unknowns=unknowns, s0=s0, output=output, hold=hold,
-                )  # fmt: skip
-                y, sl, ways = found.shown, found.sensitivity, EXACT
-            except NotExact:
-                pass
-        if y is None:
-            steps = run(
-                model, t, u, x0, rtol=way.step_rtol, steps_limit=steps_limit, steps_most=steps_most,
-                unknowns=unknowns, s0=s0, output=output, hold=hold,
+    """Return outputs of a run and their derivatives by `unknowns`, with `s0` and `hold` of `run`.
+
+    `steps_limit` bounds the stepper's work between two samples, `steps_most` that of the run.
+    Raises SimulationError where both ways fail.
+    """
+    if not way.stepped:
+        try:
+            found = run_exact(
+                model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
+                hold=hold, unknowns=unknowns, s0=s0, outputs=outputs,
             )  # fmt: skip
-            sl = np.zeros((len(t), 0)) if steps.sensitivity is None else steps.sensitivity
-            y, ways = steps.y[:, model.output_names.index(output)], STEPPER
-        ys.append(y)
-        ss.append(sl)
-    return Traced(np.stack(ys, 1), np.stack(ss, 1), ways)
+            return Traced(found.shown, found.sensitivity, EXACT)
+        except NotExact:
+            pass
+    steps = run(
+        model, t, u, x0, rtol=way.step_rtol, hold=hold, steps_limit=steps_limit,
+        steps_most=steps_most, unknowns=unknowns, s0=s0, outputs=outputs,
+    )  # fmt: skip
+    rows = [model.output_names.index(n) for n in outputs]
+    return Traced(steps.y[:, rows], steps.sensitivity, STEPPER)
 
 
 def accurate(
@@ -123,7 +120,7 @@ def accurate(
         try:
             found = run_exact(
                 model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
-                output=output, everything=before is not None,
+                outputs=(output,), everything=before is not None,
             )  # fmt: skip
         except NotExact:
             break
@@ -132,7 +129,8 @@ def accurate(
             size = max(float(np.ptp(found.shown)), STILL * nominal)
             if np.max(np.abs(found.shown - before)) <= AGREE * rtol * size:
                 z = np.empty((len(t), 0))
-                return Steps(found.x, z, found.y, None, found.steps, found.rejected, 0), EXACT
+                cost = found.steps, found.rejected, 0
+                return Steps(found.x, z, found.y, found.sensitivity, *cost), EXACT
         before = found.shown
     step_rtol = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
     return run(model, t, u, x0, rtol=step_rtol, hold=hold), STEPPER

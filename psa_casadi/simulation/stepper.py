@@ -52,8 +52,8 @@ class _Run(ctypes.Structure):
         ("rtol", ctypes.c_double), ("max_step", ctypes.c_double), ("steps_limit", ctypes.c_long),
         ("steps_most", ctypes.c_long),
         ("x", _POINTER), ("z", _POINTER), ("y", _POINTER),
-        ("count", ctypes.c_int), ("which", _POINTER), ("s0", _POINTER), ("output", ctypes.c_int),
-        ("dy", _POINTER), ("work", _POINTER), ("stop", _POINTER),
+        ("count", ctypes.c_int), ("which", _POINTER), ("s0", _POINTER), ("shown", ctypes.c_int),
+        ("outputs", _POINTER), ("dy", _POINTER), ("work", _POINTER), ("stop", _POINTER),
         ("steps", ctypes.c_long), ("rejected", ctypes.c_long),
         ("evaluations", ctypes.c_long), ("t_failed", ctypes.c_double), ("culprit", ctypes.c_int),
     ]  # fmt: skip
@@ -61,15 +61,16 @@ class _Run(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Steps:
-    """What a run returned: states (n, nx), outputs (n, ny), sensitivities (n, k), and its cost.
+    """What a run returned: states (n, nx), outputs (n, ny), and its cost.
 
-    `z` are the sampled states (n, nz), at an instant those after it.
+    `z` are the sampled states (n, nz), at an instant those after it. `sensitivity` (n, m, k) are
+    the derivatives of m outputs by k unknowns.
     """
 
     x: FloatArray
     z: FloatArray
     y: FloatArray
-    sensitivity: FloatArray | None
+    sensitivity: FloatArray
     steps: int
     rejected: int
     evaluations: int
@@ -108,16 +109,16 @@ def run(
     steps_most: int = 0,
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
-    output: str = "measured_displacement",
+    outputs: Sequence[str] | None = None,
     values: Mapping[str, float] | None = None,
     z0: FloatArray | None = None,
 ) -> Steps:
     """Integrate a model over the times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
 
-    `unknowns` names the parameters of the sensitivities d output / d unknown; an integer k stands
-    for the initial value of state k. `s0` (nx, k) is d x0 / d unknown, zero by default except for
-    the initial values themselves. `steps_limit` bounds the work between two samples,
-    `steps_most` that of the whole run; 0 is none.
+    `unknowns` names the parameters of the sensitivities d output / d unknown of the `outputs`, all
+    by default; an integer k stands for the initial value of state k. `s0` (nx, k) is
+    d x0 / d unknown, zero by default except for the initial values themselves. `steps_limit` bounds
+    the work between two samples, `steps_most` that of the whole run; 0 is none.
 
     Sampled states start at `z0` (nz,), their declared starts by default. Steps end at their
     instants, also between the times; one at t[0] is taken before the first output, one at another
@@ -131,13 +132,16 @@ def run(
     if z0 is None:
         z0 = np.array([q.start for q in s.sampled])
     if s0 is None:
-        s0 = np.array([[float(q == k) for q in unknowns] for k in range(nx)]).reshape(nx, count)
+        s0 = unit_columns(nx, unknowns)
+    asked = model.output_names if outputs is None else outputs
+    rows = [model.output_names.index(name) for name in asked]
     arrays: dict[str, npt.NDArray[Any]] = {
         "t": doubles(t), "u": doubles(u), "x0": doubles(x0), "z0": doubles(z0), "s0": doubles(s0),
         "p": np.array([own[name] for name in model.parameter_names]),
         "nominal": model.state_nominals() if nx else np.ones(1), "x": np.empty((n, max(1, nx))),
         "z": np.empty((n, len(s.sampled))), "y": np.empty((n, len(s.outputs))),
-        "which": which_of(model, unknowns), "dy": np.empty((n, count)),
+        "which": which_of(model, unknowns), "outputs": np.array(rows, np.int32),
+        "dy": np.empty((n, len(rows), count)),
         "work": np.empty((_STAGES + 3) * nx * max(count, 1)),
     }  # fmt: skip
     _check(model, arrays, hold)
@@ -146,7 +150,7 @@ def run(
     request = _Run(
         samples=n, zero_order_hold=int(hold == "zero"), rtol=rtol, max_step=max_step,
         steps_limit=steps_limit, steps_most=steps_most, count=count, stop=flag_address(),
-        output=model.output_names.index(output) if count else 0,
+        shown=len(rows),
         **{name: array.ctypes.data for name, array in arrays.items()},
     )  # fmt: skip
     status = _library(model.structure).psa_run(ctypes.byref(request))
@@ -161,13 +165,19 @@ def run(
             f" {_REASONS[status]}. Parameter values far from physical ones are the likely cause;"
             " check them, or loosen the tolerance."
         )
-    found = arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"] if count else None
+    found = arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"]
     return Steps(*found, request.steps, request.rejected, request.evaluations)
 
 
 def doubles(values: npt.ArrayLike) -> FloatArray:
     """Return numbers as C takes them."""
     return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def unit_columns(nx: int, unknowns: Sequence[str | int]) -> FloatArray:
+    """Return d x0 / d unknown (nx, k) where a start does not depend on the parameters."""
+    columns = [[float(q == k) for q in unknowns] for k in range(nx)]
+    return np.array(columns).reshape(nx, len(unknowns))
 
 
 def which_of(model: Model, unknowns: Sequence[str | int]) -> npt.NDArray[np.int32]:

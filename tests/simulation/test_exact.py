@@ -214,7 +214,7 @@ def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
     task = demonstration()
     x0, _ = task.start(task.model)
     rough, fine = (
-        run_exact(task.model, task.time, task.inputs, x0, tolerance=q, output=OUTPUT).shown
+        run_exact(task.model, task.time, task.inputs, x0, tolerance=q, outputs=(OUTPUT,)).shown
         for q in (1e-5, 1e-8)
     )
     assert np.max(np.abs(rough - fine)) <= 1e-5 * np.ptp(fine)
@@ -255,7 +255,7 @@ def test_what_does_not_split_says_why(component: Component, reason: str) -> None
     found = split_of(structure)
     assert isinstance(found, str)
     assert re.search(reason, found)
-    assert why_not(structure, OUTPUT) == found
+    assert why_not(structure, (OUTPUT,)) == found
 
 
 def test_sampled_states_do_not_split() -> None:
@@ -270,7 +270,7 @@ def test_a_function_that_the_c_code_does_not_have_is_told() -> None:
         source="test",
         equations=lambda s: Equations(add={"free_force": ca.asinh(s.u / 10.0)}),
     )
-    reason = why_not(compose((*BASE, bent)).structure, OUTPUT)
+    reason = why_not(compose((*BASE, bent)).structure, (OUTPUT,))
     assert reason is not None
     assert reason.startswith("operation")
 
@@ -298,8 +298,9 @@ def results(name: str) -> list[FloatArray]:
     u = inputs(model, t, composite(400))
     unknowns: list[str | int] = ["k_L", "A", "R_s", "tau", "k_P"]
     found = exact.run_exact(
-        model, t, u, start_on(model, t, u).x, tolerance=1e-7, unknowns=unknowns, everything=True
-    )
+        model, t, u, start_on(model, t, u).x, tolerance=1e-7, unknowns=unknowns,
+        outputs=(OUTPUT,), everything=True,
+    )  # fmt: skip
     return [found.shown, found.sensitivity, found.x, found.y]
 
 
@@ -368,7 +369,7 @@ def _stepped(name: str) -> list[FloatArray]:
     t = times(400, 1e-4)
     u = inputs(model, t, composite(400))
     found = stepper.run(model, t, u, start_on(model, t, u).x, unknowns=["k_L", "A"])
-    return [found.y, np.asarray(found.sensitivity)]
+    return [found.y, found.sensitivity]
 
 
 LAST_PLACE = 2.0**-52

@@ -18,6 +18,7 @@ from psa_casadi.records import write_record
 from psa_casadi.records.excitation import time_grid, triangle
 from psa_casadi.report.words.tables import timings_table
 from psa_casadi.simulation import side_by_side as module
+from psa_casadi.simulation.exact import run as exact
 from psa_casadi.simulation.side_by_side import (
     VARIABLE,
     compiled,
@@ -27,6 +28,8 @@ from psa_casadi.simulation.side_by_side import (
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.stepper import run
 from psa_casadi.simulation.timings import REST, Stage, stage, timed
+from tests.any_model.own_models import motor
+from tests.model.sampled_models import loop
 from tests.model.stack_models import stack
 
 
@@ -49,13 +52,32 @@ def test_a_failure_ahead_is_left_to_who_needs_the_model(
 ) -> None:
     tried = []
 
-    def why_not(structure: Structure, output: str) -> None:
-        tried.append(output)
+    def why_not(structure: Structure, outputs: tuple[str, ...]) -> None:
+        tried.append(outputs)
         raise MachineError("no compiler")
 
     monkeypatch.setattr(module, "why_not", why_not)
     compiled([base, *_with_effects(base, "slow_creep")])
     assert len(tried) == 2
+
+
+def test_models_without_a_displacement_are_compiled_for_all_outputs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where exact steps do not fit, the stepper is."""
+    asked: set[tuple[str, ...]] = set()
+    ready: list[Model] = []
+
+    def why_not(structure: Structure, outputs: tuple[str, ...]) -> str | None:
+        asked.add(outputs)
+        return exact.why_not(structure, outputs)
+
+    monkeypatch.setattr(module, "why_not", why_not)
+    monkeypatch.setattr(module, "make_ready", ready.append)
+    sampled = loop()
+    compiled([motor(), sampled])
+    assert asked == {("w", "i"), sampled.output_names}
+    assert ready == [sampled]
 
 
 def _threads() -> set[int]:

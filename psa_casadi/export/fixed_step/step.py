@@ -29,7 +29,7 @@ from psa_casadi.component import Expression
 from psa_casadi.export.fixed_step.way import Ends, along_the_way, rosenbrock, solved
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
-from psa_casadi.simulation.exact.split import Split, closure, jumps, split_of
+from psa_casadi.simulation.exact.split import Split, closure, jumping, split_of
 from psa_casadi.variables import Input
 
 FloatArray = npt.NDArray[np.float64]
@@ -238,14 +238,13 @@ def step_of(model: Model, step: float) -> StepExpression | str:
     """Return the step of `step` [s] of a model between its sample instants, or why it has none."""
     s = model.structure
     between = _between(s)
-    held = replace(model, structure=between)
-    split = split_of(between)
-    if not isinstance(split, str):
-        found = _Builder(held, split, step).built()
-    elif between.states and jumps(between):
-        return split
-    else:
+    if between.states and jumping(between, between.xdot):
+        return "its equations jump"
+    held, split = replace(model, structure=between), split_of(between)
+    if isinstance(split, str):
         found = whole_step(held, step)
+    else:
+        found = _Builder(held, split, step).built()
     count = s.u.numel()
     still = found.du[count:, 0]
 

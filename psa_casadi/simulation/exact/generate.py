@@ -108,8 +108,8 @@ def of_linear_part(
 _KINDS = {"group": "EX_GROUP", "port": "EX_PORT", "loop": "EX_LOOP"}
 
 
-def generate(split: Split, output: str) -> str:
-    """Return the text of `exact_model.h`; `output` is the one whose sensitivities are computed."""
+def generate(split: Split, outputs: Sequence[str]) -> str:
+    """Return the text of `exact_model.h`; sensitivities are computed of the `outputs`."""
     s = split.structure
     rate = ca.SX.sym("rate")
     printer = Printer({"t": s.time, "x": s.x, "v": s.u, "w": rate, "p": s.p})
@@ -122,12 +122,14 @@ def generate(split: Split, output: str) -> str:
     printer.functions.append(sensitive(printer.functions.pop()))
     group_size, rate_size = _groups(split, printer, rate)
     port_size = _ports(split, printer, tables)
-    shown = s.y[[o.name for o in s.outputs].index(output)]
-    partials, entries = _partials(split, [shown], None)
+    names = [o.name for o in s.outputs]
+    shown = [s.y[names.index(n)] for n in outputs]
+    partials, entries = _partials(split, shown, None)
     printer.function("ex_outputs", [s.y])
-    printer.function("ex_shown", [shown])
-    printer.function("ex_shown_slopes", [shown, *partials])
-    printer.functions.append(chains("ex_shown_chain", [chain("ex_shown_chain_0", entries)]))
+    printer.function("ex_shown", shown)
+    printer.function("ex_shown_slopes", [*shown, *partials])
+    rule = chain("ex_shown_chain_0", entries, len(shown))
+    printer.functions.append(chains("ex_shown_chain", [rule]))
     kept, prepare = printer.kept()
     place = {state: k for k, state in enumerate(split.linear)}
     chords = [k for k, q in enumerate(split.ports) if q.chord >= 0]
@@ -138,8 +140,9 @@ def generate(split: Split, output: str) -> str:
         "EX_NP": len(s.parameters), "EX_NY": len(s.outputs), "EX_NG": len(split.groups),
         "EX_NPORT": len(split.ports), "EX_NCH": len(chords), "EX_NTHETA": len(thetas),
         "EX_NK": kept, "EX_NITEMS": len(split.order), "EX_GROUP_OUT": group_size,
-        "EX_PORT_OUT": port_size, "EX_RATE_OUT": rate_size, "EX_SHOWN_OUT": 1 + len(entries),
-        "EX_NRATED": printer.rated, "EX_CONSTANT": int(not c.is_zero()),
+        "EX_PORT_OUT": port_size, "EX_RATE_OUT": rate_size, "EX_NSHOWN": len(shown),
+        "EX_SHOWN_OUT": len(shown) + len(entries), "EX_NRATED": printer.rated,
+        "EX_CONSTANT": int(not c.is_zero()),
         "EX_NLOOP": sum(kind == "loop" for kind, _ in split.order),
     }  # fmt: skip
     needed, path = _needed(split)

@@ -20,7 +20,7 @@ from psa_casadi.simulation.compiler import fingerprint, generated_library, vecto
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
-from psa_casadi.simulation.stepper import doubles, which_of
+from psa_casadi.simulation.stepper import doubles, unit_columns, which_of
 from psa_casadi.simulation.timings import count_run
 from psa_casadi.units import FloatArray
 
@@ -65,7 +65,7 @@ class _Request(ctypes.Structure):
 
 @dataclass(frozen=True)
 class ExactSteps:
-    """What a run returned: the chosen output `shown` (n,), `sensitivity` (n, k), its derivatives.
+    """What a run returned: asked outputs `shown` (n, m), their derivatives `sensitivity` (n, m, k).
 
     `x` (n, nx) and `y` (n, ny) are all states and outputs, without rows where they were not asked
     for. `forced` steps missed the tolerance at the finest length.
@@ -80,47 +80,48 @@ class ExactSteps:
     forced: int
 
 
-def why_not(structure: Structure, output: str) -> str | None:
-    """Return why a model's output cannot be had by exact steps; None if it can."""
-    found = _unfit(structure, output) or _compiled(structure, output, 1)
+def why_not(structure: Structure, outputs: tuple[str, ...]) -> str | None:
+    """Return why outputs of a model cannot be had by exact steps; None if they can."""
+    found = _unfit(structure, outputs) or _compiled(structure, outputs, 1)
     return found if isinstance(found, str) else None
 
 
-def _unfit(structure: Structure, output: str) -> str | None:
-    if output not in (o.name for o in structure.outputs):
-        return f"it has no output {output}"
+def _unfit(structure: Structure, outputs: tuple[str, ...]) -> str | None:
+    missing = set(outputs) - {o.name for o in structure.outputs}
+    if missing or not outputs:
+        return f"it has no output {', '.join(sorted(missing))}"
     return "it calls an FMU, which has no formula" if structure.foreign else None
 
 
-def model_text(structure: Structure, output: str) -> str:
+def model_text(structure: Structure, outputs: tuple[str, ...]) -> str:
     """Return a model's generated C (`exact_model.h`); raises NotExact where there is none."""
-    split = _unfit(structure, output) or split_of(structure)
+    split = _unfit(structure, outputs) or split_of(structure)
     if isinstance(split, str):
         raise NotExact(split)
     try:
-        return generate(split, output)
+        return generate(split, outputs)
     except Unprintable as reason:
         raise NotExact(str(reason)) from reason
 
 
 @cache
-def _compiled(structure: Structure, output: str, lanes: int) -> Path | str:
+def _compiled(structure: Structure, outputs: tuple[str, ...], lanes: int) -> Path | str:
     """Return the model's library, or why there is none; the text is made where it is not cached."""
     optimise = _OPTIMISE if lanes == 1 else _OPTIMISE_LANES
     flags = (*_FLAGS, *optimise, *vector_flags(), f"-DPSA_LANES={lanes}")
     sources = sorted(Path(__file__).parent.glob("*.py"))  # another generator: other libraries
-    named = repr((fingerprint(structure), output, [q.read_text("utf-8") for q in sources]))
+    named = repr((fingerprint(structure), outputs, [q.read_text("utf-8") for q in sources]))
     try:
         return generated_library(
-            named, lambda: {"exact_model.h": model_text(structure, output)}, ("exact.c",), flags
+            named, lambda: {"exact_model.h": model_text(structure, outputs)}, ("exact.c",), flags
         )
     except NotExact as reason:
         return str(reason)
 
 
 @cache
-def _library(structure: Structure, output: str, lanes: int) -> ctypes.CDLL:
-    library = ctypes.CDLL(str(_compiled(structure, output, lanes)))
+def _library(structure: Structure, outputs: tuple[str, ...], lanes: int) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(_compiled(structure, outputs, lanes)))
     library.psa_run_exact.argtypes = [ctypes.POINTER(_Request)]
     library.psa_run_exact.restype = ctypes.c_int
     return library
@@ -158,21 +159,23 @@ def run_exact(
     hold: str = "linear",
     unknowns: Sequence[str | int] = (),
     s0: FloatArray | None = None,
-    output: str = "measured_displacement",
+    outputs: Sequence[str],
     everything: bool = False,
 ) -> ExactSteps:
-    """Integrate a model over times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
+    """Integrate a model over times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,), for `outputs`.
 
     `tolerance` bounds the estimated error of a step, over the states' `error_sizes`; every sample
     is divided by 2^coarsest at least. `unknowns` and `s0` are those of the stepper's `run`;
     `everything` asks for all states and outputs. Raises NotExact where this way is not possible,
     where it fails, or where it needs so many steps that the stepper is no slower.
     """
-    n, nx, count = len(t), len(model.state_names), len(unknowns)
+    n, nx, m, count = len(t), len(model.state_names), len(outputs), len(unknowns)
     arrays: dict[str, npt.NDArray[Any]] = {
         "p": model.parameter_vector(), "x0": doubles(x0),
-        "nominal": model.error_sizes(), "shown": np.empty(n), "which": which_of(model, unknowns),
-        "s0": doubles(np.zeros((nx, count)) if s0 is None else s0), "dy": np.empty((n, count)),
+        "nominal": model.error_sizes(), "shown": np.empty((n, m)),
+        "which": which_of(model, unknowns),
+        "s0": doubles(unit_columns(nx, unknowns) if s0 is None else s0),
+        "dy": np.empty((n, m, count)),
     }  # fmt: skip
     rows = n if everything else 0
     x, y = np.empty((rows, nx)), np.empty((rows, len(model.output_names)))
@@ -180,7 +183,7 @@ def run_exact(
         arrays |= {"x": x, "y": y}
     most = int(MOST * max(1.0, AT / tolerance) ** 0.5 * n) << coarsest
     cost = _run(
-        model.structure, output, (t, u, hold), arrays,
+        model.structure, tuple(outputs), (t, u, hold), arrays,
         count=count, tolerance=tolerance, coarsest=coarsest, steps_limit=most,
     )  # fmt: skip
     return ExactSteps(arrays["shown"], arrays["dy"], x, y, *cost)
@@ -206,7 +209,7 @@ def run_sets(
     shown = np.empty((len(t), p.shape[1]))
     arrays = {"p": doubles(p), "x0": doubles(x0), "nominal": doubles(nominal), "shown": shown}
     _run(
-        structure, output, (t, u, hold), arrays, lanes=LANES, sets=p.shape[1],
+        structure, (output,), (t, u, hold), arrays, lanes=LANES, sets=p.shape[1],
         tolerance=tolerance, steps_limit=MOST_IN_LANES * len(t),
     )  # fmt: skip
     return shown
@@ -214,7 +217,7 @@ def run_sets(
 
 def _run(
     structure: Structure,
-    output: str,
+    outputs: tuple[str, ...],
     record: tuple[FloatArray, FloatArray, str],
     arrays: Mapping[str, npt.NDArray[Any]],
     *,
@@ -225,7 +228,7 @@ def _run(
     **how: Any,
 ) -> tuple[int, int, int]:
     """Run a model over times, inputs and hold; return steps, rejected and forced ones."""
-    reason = why_not(structure, output)
+    reason = why_not(structure, outputs)
     if reason:
         raise NotExact(reason)
     t, u, hold = record
@@ -238,7 +241,7 @@ def _run(
         count=count, coarsest=coarsest, finest=max(FINEST, coarsest), stop=flag_address(), **how,
         **{name: array.ctypes.data for name, array in given.items()},
     )  # fmt: skip
-    status = _library(structure, output, lanes).psa_run_exact(ctypes.byref(request))
+    status = _library(structure, outputs, lanes).psa_run_exact(ctypes.byref(request))
     if status == _STOPPED:
         raise KeyboardInterrupt
     if status:

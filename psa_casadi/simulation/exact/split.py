@@ -179,6 +179,8 @@ _JUMPS = frozenset(
     getattr(ca, f"OP_{name}")
     for name in ("LT", "LE", "EQ", "NE", "NOT", "AND", "OR", "SIGN", "FLOOR", "CEIL", "FMOD")
 )
+#: Place of the inputs among the arguments of the equations, behind time and states.
+_INPUT = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +218,7 @@ def _split(s: Structure) -> Split:
         raise NoSplit("it has sampled states")
     if not s.states:
         raise NoSplit("it has no states")
-    if jumps(s):
+    if any(argument < _INPUT for argument, _ in jumping(s, s.xdot)):
         raise NoSplit("its equations jump")
     depends = dependence(s.xdot, s.x)  # [k, j]: x_k' depends on x_j
     reach = closure(depends)
@@ -240,13 +242,24 @@ def _split(s: Structure) -> Split:
     return Split(s, linear, groups, ports, order_of(s, groups, ports, reach), matrices)
 
 
-def jumps(s: Structure) -> bool:
-    """Whether derivatives have operations that jump: their slopes do not tell what they depend on.
+def jumping(s: Structure, of: Expression) -> set[tuple[int, int]]:
+    """Return what operations that jump read: the argument of the equations, and its element.
 
-    Of equations without sampled states.
+    Slopes do not tell that anything depends on these. Of equations without sampled states.
     """
-    equations = ca.Function("f", s.arguments, [s.xdot])
-    return any(equations.instruction_id(k) in _JUMPS for k in range(equations.n_instructions()))
+    equations = ca.Function("f", s.arguments, [of])
+    reads: dict[int, set[tuple[int, int]]] = {}
+    found: set[tuple[int, int]] = set()
+    for k in range(equations.n_instructions()):
+        op, given = equations.instruction_id(k), equations.instruction_input(k)
+        if op == ca.OP_INPUT:
+            read = {(given[0], given[1])}
+        else:
+            read = set() if op == ca.OP_OUTPUT else set().union(*(reads[q] for q in given))
+        found |= read if op in _JUMPS else set()
+        for slot in equations.instruction_output(k) if op != ca.OP_OUTPUT else ():
+            reads[slot] = read
+    return found
 
 
 def _linear_part(
@@ -265,7 +278,10 @@ def _linear_part(
         # where the row is affine in a variable, this is taken out by setting it to 0, so that
         # nothing cancels in numbers
         slopes, of_row = ca.jacobian(xdot[k], given), coefficients[k, :].T
-        bent = [j for j in range(given.numel()) if ca.depends_on(slopes[j], everything)]
+        turns = {len(rows) + j for argument, j in jumping(s, xdot[k]) if argument == _INPUT}
+        bent = [
+            j for j in range(given.numel()) if j in turns or ca.depends_on(slopes[j], everything)
+        ]
         straight = [j for j in range(given.numel()) if j not in bent]
         rest = ca.substitute(xdot[k], given[straight], ca.SX.zeros(len(straight)))
         if ca.depends_on(rest, everything):

@@ -165,10 +165,12 @@ def _work(
     unknowns = () if s0 is None else FREE
     if way == EXACT:
         found = run_exact(
-            model, t, u, x0, tolerance=tolerance, unknowns=unknowns, s0=s0, output=_OUTPUT
+            model, t, u, x0, tolerance=tolerance, unknowns=unknowns, s0=s0, outputs=(_OUTPUT,)
         )
-        return found.shown, found.steps
-    steps = run_stepper(model, t, u, x0, rtol=tolerance, unknowns=unknowns, s0=s0, output=_OUTPUT)
+        return found.shown[:, 0], found.steps
+    steps = run_stepper(
+        model, t, u, x0, rtol=tolerance, unknowns=unknowns, s0=s0, outputs=(_OUTPUT,)
+    )
     return steps.y[:, model.output_names.index(_OUTPUT)], steps.steps
 
 
@@ -252,14 +254,16 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
         np.array([getattr(m, of)() for m in models]).T
         for of in ("parameter_vector", "state_nominals")
     )
-    how: Any = {"tolerance": tolerance, "output": _OUTPUT}
+    how: Any = {"tolerance": tolerance}
 
     def together() -> FloatArray:
         x0 = np.array(starts).T
-        return run_sets(task.model.structure, t, u, p=p, x0=x0, nominal=nominal, **how)
+        return run_sets(
+            task.model.structure, t, u, p=p, x0=x0, nominal=nominal, output=_OUTPUT, **how
+        )
 
     def by_itself(k: int) -> FloatArray:
-        return run_exact(models[k], t, u, starts[k], **how).shown
+        return run_exact(models[k], t, u, starts[k], outputs=(_OUTPUT,), **how).shown[:, 0]
 
     singles = [partial(by_itself, k) for k in range(LANES)]
     if not np.array_equal(together().T, np.array([one() for one in singles])):
