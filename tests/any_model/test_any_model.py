@@ -50,7 +50,7 @@ def test_a_clean_model_of_two_outputs_is_identified_with_its_errors(tmp_path: Pa
     assert found.model.provenance.identified_from[0][0] == "drive"
     found.report(tmp_path / "fit.html")
     page = Page((tmp_path / "fit.html").read_text("utf-8"))
-    assert "w by 0.301 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
+    assert "w by 0.300 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
     assert "R 1.200 1.199 to 1.200 Ohm fit" in page.text
     assert page.loaded == []
 
