@@ -422,13 +422,18 @@ class SampledParameter:
 
 @dataclass(frozen=True)
 class SampledRecord:
-    """A record: SHA-256 of its file, samples used, how many count as one, residual rms [m]."""
+    """A record: SHA-256 of its file, samples used, how many count as one, residual rms.
+
+    That of its `output`, in the `unit`: m for a displacement, whatever the name of the field.
+    """
 
     name: str
     sha256: str
     samples: int
     samples_as_one: float
     rms_m: float
+    output: str = "displacement"
+    unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -452,9 +457,13 @@ def posterior_file(found: Posterior) -> dict[str, Any]:
     """Return what `--json` writes of a posterior."""
     task = found.task
     records = tuple(
-        SampledRecord(e.record.name, e.record.sha256, int(e.used.sum()), float(worth), float(rms))
-        for e, worth, rms in zip(task.experiments, task.inflation, task.levels, strict=True)
-    )
+        SampledRecord(
+            e.record.name, e.record.sha256, int(e.at(b.channel).sum()), b.alike, b.level,
+            task.channel(b).column, task.channel(b).unit,
+        )
+        for b in task.density.blocks
+        for e in (task.experiments[b.record],)
+    )  # fmt: skip
     parameters = {
         f.name: SampledParameter(
             f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),

@@ -84,7 +84,9 @@ def evidence(task: Task) -> Evidence:
     constant -= float(np.sum(np.log(known * np.sqrt(2.0 * np.pi))))
     constant -= float(np.sum(np.log(norm.cdf(high) - norm.cdf(low))))  # cut at the bounds
     counts = sum(b.count for b in blocks)
-    level = counts * float(np.log(task.levels[0]))  # residuals are weighted by a fit's own
+    level = counts * float(
+        np.log(task.density.blocks[0].level)
+    )  # residuals are weighted by a fit's own
     constant -= level
     bridge, error = bridge_sampled(density, flat)
     peak, _ = density(np.zeros(density.size))
@@ -224,7 +226,7 @@ def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replic
     ranks = [int((draws[::THIN, k] < truth[k]).sum()) for k in kept]
     shares = [float((draws[:, k] < truth[k]).mean()) for k in kept]
     inside = [tuple(abs(s - 0.5) <= 0.5 * level for level in LEVELS) for s in shares]
-    return Replica(tuple(ranks), tuple(inside), chains.divergences, task.inflation[0])
+    return Replica(tuple(ranks), tuple(inside), chains.divergences, task.density.blocks[0].alike)
 
 
 def _ranks(found: Sequence[Replica], names: Sequence[str]) -> TitledTable:
