@@ -4,6 +4,7 @@ They are recognised from the record alone and masked; nothing is put in their pl
 can do (ring after a step, follow a jump of the voltage, turn sharply) is not suspect.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import high_frequency_noise, last_place_of, quantum_of, runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
@@ -211,81 +213,82 @@ _ROWS = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Suspects:
-    """Samples of a record that should not count: `mask` (n,) is True for them.
+    """Samples of an output that should not count: `mask` (n,) is True for them.
 
-    `counts` holds the number of samples by kind; `quantum` the sensor's step, in `unit` as the
-    record is ("m" or "counts"), None where it shows none. `ends` are the values at which the sensor
-    was saturated.
+    `counts` holds the number of samples by kind; `quantum` the sensor's step, in the output's
+    `unit`, None where it shows none. `ends` are the values at which the sensor was saturated.
+    `names` are what notes call the output, the input that moves it, and what that moves.
     """
 
     mask: BoolArray
     counts: dict[Kind, int]
     quantum: float | None
-    unit: Literal["m", "counts"] = "m"
+    unit: str
     ends: tuple[FlatEnd, ...] = ()
+    names: tuple[str, str, str] = ("the displacement", "the voltage", "the stack")
 
-    def sentences(self, name: str) -> tuple[str, ...]:
-        """Return what was found in the record of that name, one sentence for each kind."""
-        said = [
-            f"{name}: {count} sample{'s' * (count > 1)} {_WHAT[kind]}; masked, so that they count"
-            " for nothing."
-            for kind, count in self.counts.items()
-            if count and kind != "saturated"
-        ]
-        said += self.saturation(name)
+    def notes(self, where: str) -> tuple[Note, ...]:
+        """Return what was found in the column `where`, one note for each kind."""
+        counts = {kind: n for kind, n in self.counts.items() if n and kind != "saturated"}
+        said = [note("masked", where=where, count=n, kind=kind) for kind, n in counts.items()]
+        said += self.saturation(where)
         if self.quantum is not None:
-            scale, unit = (1e9, "nm") if self.unit == "m" else (1.0, self.unit)
-            step = f"{scale * self.quantum:.3g} {unit}"
-            said.append(f"{name}: the displacement is quantised in steps of {step}.")
+            step = (self.quantum, self.unit)
+            said.append(note("quantised", where=where, output=self.names[0], step=step))
         return tuple(said)
 
-    def saturation(self, name: str) -> tuple[str, ...]:
-        """Say at which values the sensor was saturated, one sentence for each."""
-        scale, unit = (1e6, "um") if self.unit == "m" else (1.0, self.unit)
+    def saturation(self, where: str) -> tuple[Note, ...]:
+        """Return at which values the sensor was saturated, one note for each."""
+        _, drive, moved = self.names
         return tuple(
-            f"{name}: {int(end.where.sum())} samples ({100.0 * float(end.where.mean()):.0f} %)"
-            f" stay at {scale * end.value:.6g} {unit}, the {'largest' if end.upper else 'smallest'}"
-            " value, while the voltage moves the stack: the sensor is saturated there; masked, so"
-            " that they count for nothing."
+            note(
+                "flat_end", where=where, count=int(end.where.sum()), value=(end.value, self.unit),
+                share=float(end.where.mean()), upper=end.upper, drive=drive, moved=moved,
+            )
             for end in self.ends
-        )
-
-
-_WHAT: dict[Kind, str] = {
-    "outlier": "stand out as spikes of at most three samples that return at once",
-    "drop-out": "belong to drop-outs, where the sensor jumps to one value and back",
-    "stuck": "repeat the last one to the last digit, as a stuck sensor does",
-}
+        )  # fmt: skip
 
 
 def suspects(record: Record) -> Suspects:
-    """Return the samples of a record that the sensor, not the stack, has made.
+    """Return the samples of a stack's displacement that the sensor, not the stack, has made.
 
-    A record without displacement has none. Work and memory grow with the number of samples.
+    A record without displacement has none.
     """
-    mask = np.zeros(record.n, dtype=np.bool_)
+    y, load, unit = record.displacement, record.load_force, record.displacement_unit
+    y = np.full(record.n, np.nan) if y is None else y
+    return suspects_of(y, record.voltage, () if load is None else (load,), unit)
+
+
+def suspects_of(
+    output: FloatArray, drive: FloatArray, others: Sequence[FloatArray], unit: str
+) -> Suspects:
+    """Return the samples of an output (n,), nan where there is none, that its sensor has made.
+
+    `drive` (n,) is the input that moves it; after a sudden change of one of the `others` no fast
+    motion is suspect. Work and memory grow with the number of samples.
+    """
+    mask = np.zeros(output.size, dtype=np.bool_)
     counts: dict[Kind, int] = {"outlier": 0, "drop-out": 0, "stuck": 0, "saturated": 0}
-    valid = np.flatnonzero(record.mask)
-    if record.displacement is None or valid.size < 2 * BLOCK:
-        return Suspects(mask, counts, None)
-    y, voltage = record.displacement[valid], record.voltage[valid]
-    if float(np.ptp(y)) <= 0:
-        return Suspects(mask, counts, None)
+    valid = np.flatnonzero(np.isfinite(output))
+    if valid.size < 2 * BLOCK or float(np.ptp(output[valid])) <= 0:
+        return Suspects(mask, counts, None, unit)
+    y, moving = output[valid], drive[valid]
     quantum = quantum_of(y)
-    stuck, dropped = equal_runs(y, voltage, quantum)
-    again = missed_a_move(y, voltage, quantum) | repeated_in_noise(y, voltage, quantum)
+    stuck, dropped = equal_runs(y, moving, quantum)
+    again = missed_a_move(y, moving, quantum) | repeated_in_noise(y, moving, quantum)
     stuck |= again & ~dropped
-    ends = flat_ends(y, voltage) if quantum is None else ()
+    ends = flat_ends(y, moving) if quantum is None else ()
     flat = np.any([np.zeros(valid.size, dtype=np.bool_), *(e.where for e in ends)], axis=0)
     stuck, dropped = stuck & ~flat, dropped & ~flat
     rest = ~(stuck | dropped)
     outlying = np.zeros(valid.size, dtype=np.bool_)
-    outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
+    explained = _explained(float(np.ptp(y)), drive, others)[valid[rest]]
+    outlying[rest] = _outliers(y[rest], explained, quantum)
     kinds = (outlying & ~flat, dropped, stuck, flat)
     for kind, found in zip(counts, kinds, strict=True):
         counts[kind] = int(found.sum())
         mask[valid[found]] = True
-    return Suspects(mask, counts, quantum, record.displacement_unit, ends)
+    return Suspects(mask, counts, quantum, unit, ends)
 
 
 def cleaned(record: Record) -> Record:
@@ -300,14 +303,15 @@ def masked(record: Record, found: Suspects) -> Record:
     return replace(record, displacement=np.where(found.mask, np.nan, record.displacement))
 
 
-def _outliers(
-    record: Record, valid: NDArray[np.int64], y: FloatArray, quantum: float | None
-) -> BoolArray:
-    """Return which of the valid samples are spikes: Hampel's rule with the scale around them."""
+def _outliers(y: FloatArray, explained: FloatArray, quantum: float | None) -> BoolArray:
+    """Return which samples are spikes: Hampel's rule with the scale around them.
+
+    Each may leave its surroundings as far as is `explained` (n,).
+    """
     away = _away_from_surroundings(y)
     scale = np.maximum(_scale(away), 0.5 * (quantum or 0.0))
     allowed = np.maximum(LIMIT * scale, SMALLEST * float(np.ptp(y)))
-    allowed = np.maximum(allowed, _explained(record)[valid])
+    allowed = np.maximum(allowed, explained)
     found = np.abs(away) > allowed
     for start, stop in runs_of(found):
         sign = np.sign(away[start])
@@ -346,17 +350,18 @@ def _scale(away: FloatArray) -> FloatArray:
     return np.repeat(each, [b.size for b in blocks])
 
 
-def _explained(record: Record) -> FloatArray:
-    """Return how far the displacement may leave its surroundings after a sudden change, (n,).
+def _explained(span: float, drive: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
+    """Return how far an output may leave its surroundings after a sudden change, (n,).
 
-    Four times what the usual slope makes of a bend of the voltage that stands out from the bends
-    around it; without limit after a sudden change of the load force.
+    Four times what the usual slope, the output's `span` over the drive's, makes of a bend of the
+    drive that stands out from the bends around it; without limit after a sudden change of another
+    input.
     """
-    y, reach = record.displacement, float(np.ptp(record.voltage))
-    slope = float(np.nanmax(y) - np.nanmin(y)) / reach if y is not None and reach > 0 else 0.0
-    limits = 4.0 * slope * _sudden(record.voltage)
-    if record.load_force is not None:
-        limits[_sudden(record.load_force) > 0] = np.inf
+    reach = float(np.ptp(drive))
+    slope = span / reach if reach > 0 else 0.0
+    limits = 4.0 * slope * _sudden(drive)
+    for other in others:
+        limits[_sudden(other) > 0] = np.inf
     limits[0] = max(limits[0], slope * reach)  # a record may begin while the stack still moves
     fading = [
         share * scipy.ndimage.maximum_filter1d(
