@@ -17,13 +17,13 @@ from psa_casadi.any_model.fit import (
     refuse_unfit,
 )
 from psa_casadi.any_model.predict import shown_by, sized
-from psa_casadi.any_model.runs import Run, noise_share, runs_of, told_of_columns
+from psa_casadi.any_model.runs import Run, given_to, noise_share, runs_of, told_of_columns
 from psa_casadi.diagnosis.colour import Colour, noise_rms, uncertain
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise import first_order_noise
-from psa_casadi.records.signals import Hold, signals_given
+from psa_casadi.records.signals import Hold
 from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Parameter, Provenance
@@ -190,7 +190,7 @@ def identify_ode(
     be simulated at its values.
     """
     refuse_unfit(model)
-    runs = runs_of(model, signals_given(records, hold), judged=False)
+    runs = runs_of(model, given_to(model, records, hold), judged=False)
     fit, runs, costs = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts,
         zeros=known_zeros(model, zeros), known_start=known_start,

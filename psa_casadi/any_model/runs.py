@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +11,12 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
+from psa_casadi.records.read.reading import signals_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.signals import Signals, stairs, unit_hint
+from psa_casadi.records.signals import Hold, Signals, stairs
 from psa_casadi.records.split import divided, whole
+from psa_casadi.records.suspects import Suspects, suspects_of
+from psa_casadi.units import convert, parse_unit
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -25,7 +29,8 @@ class Run:
     `time` (n,) [s] counts from the first sample; `inputs` (n, nu) and `outputs` (n, ny) are in the
     order of the model's, in its units, nan where an output was not measured; `used` and `held_out`
     (n,) are the samples that are fitted and those that judge. `noise` (ny,) is the noise of its
-    outputs over what is usual in all experiments, 1 where nothing else is known.
+    outputs over what is usual in all experiments, 1 where nothing else is known. `suspects` are the
+    samples of each output that its sensor has made; they are masked.
     """
 
     signals: Signals
@@ -35,6 +40,7 @@ class Run:
     used: BoolArray
     held_out: BoolArray
     noise: FloatArray
+    suspects: tuple[Suspects, ...] = ()
 
     @property
     def name(self) -> str:
@@ -90,6 +96,11 @@ def counted(runs: Sequence[Run], output: int) -> list[BoolArray]:
     return judged if any(j.any() for j in judged) else [r.fitted(output) for r in runs]
 
 
+def given_to(model: Model, records: Any, hold: Hold | None, first: int = 1) -> list[Signals]:
+    """Return the records that a user gave to a model (`signals_given`). Raises InputError."""
+    return signals_given(records, model.input_names, model.output_names, hold=hold, first=first)
+
+
 def runs_of(
     model: Model,
     given: Sequence[Signals],
@@ -100,13 +111,16 @@ def runs_of(
     """Return the experiments of a model; some samples of them are held out if they are `judged`.
 
     Those of `holdout`, but for the tenth that finds their state; without such a record a quarter of
-    every one in blocks, as `split` chooses them along the input that moves most.
+    every one in blocks, as `split` chooses them along the input that moves most. Columns are
+    converted to the model's units; samples that an output's sensor has made are masked.
 
-    Raises InputError for inputs that are missing or have gaps, and where no output was measured.
+    Raises InputError for inputs that are missing or have gaps, for units that measure something
+    else, and where no output was measured.
     """
     problems = Problems()
     fitted = {s.sha256: s.name for s in given}
-    for s in (*given, *holdout):
+    parts = [[_in_units(model, s, problems) for s in part] for part in (given, holdout)]
+    for s in (s for part in parts for s in part):
         _check(model, s, problems)
     for s in [s for s in holdout if s.sha256 in fitted]:
         problems.add(
@@ -114,15 +128,43 @@ def runs_of(
             " fitted; held-out samples must be others."
         )
     problems.raise_if_any()
-    shadows = [[_shadow(model, s) for s in part] for part in (given, holdout)]
+    runs = [[_run(model, s) for s in part] for part in parts]
+    shadows = [[_shadow(run) for run in part] for part in runs]
     experiments = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
-    both = zip((*given, *holdout), experiments, strict=True)
-    runs = []
-    for s, e in both:
-        inputs = np.column_stack([np.empty((s.n, 0)), *(s.columns[n] for n in model.input_names)])
-        outputs, noise = _outputs(model, s), np.ones(len(model.output_names))
-        runs.append(Run(s, s.time - s.time[0], inputs, outputs, e.used, e.held_out, noise))
-    return tuple(runs)
+    both = zip((r for part in runs for r in part), experiments, strict=True)
+    return tuple(replace(r, used=e.used, held_out=e.held_out) for r, e in both)
+
+
+def _run(model: Model, s: Signals) -> Run:
+    """Return an experiment of which no sample is used yet."""
+    inputs = np.column_stack([np.empty((s.n, 0)), *(s.columns[n] for n in model.input_names)])
+    missing, none = np.full(s.n, np.nan), np.zeros(s.n, dtype=np.bool_)
+    outputs = np.column_stack([s.columns.get(n, missing) for n in model.output_names])
+    found = tuple(_suspects(model, inputs, outputs, j) for j in range(outputs.shape[1]))
+    for j, own in enumerate(found):
+        outputs[own.mask, j] = np.nan
+    noise = np.ones(len(model.output_names))
+    return Run(s, s.time - s.time[0], inputs, outputs, none, none, noise, found)
+
+
+#: An output that moves in such a way that more of its samples would be masked has no such sensor.
+_MOST_MASKED = 0.5
+
+
+def _suspects(model: Model, inputs: FloatArray, outputs: FloatArray, j: int) -> Suspects:
+    """Return the samples of an output that its sensor has made, against the input most like it."""
+    y, output = outputs[:, j], model.structure.outputs[j]
+    there = np.isfinite(y)
+    centred = y[there] - np.mean(y[there]) if there.any() else y[there]
+    alike = [abs(float(centred @ u)) / (float(np.std(u)) or np.inf) for u in inputs[there].T]
+    drive = int(np.argmax(alike)) if alike else None
+    others = [u for k, u in enumerate(inputs.T) if k != drive]
+    still = np.zeros(len(y))
+    found = suspects_of(y, still if drive is None else inputs[:, drive], others, output.unit)
+    if found.mask.sum() > _MOST_MASKED * there.sum():
+        found = suspects_of(np.full(len(y), np.nan), still, (), output.unit)
+    mover = "" if drive is None else model.input_names[drive]
+    return replace(found, names=(output.name, mover, output.name))
 
 
 def varied(run: Run) -> int | None:
@@ -132,14 +174,52 @@ def varied(run: Run) -> int | None:
 
 
 def told_of_columns(model: Model, runs: Sequence[Run]) -> tuple[Note, ...]:
-    """Return which inputs look held between samples and are read as lines, which outputs lack."""
+    """Return which inputs look held between samples and are read as lines, which outputs lack.
+
+    And what units were not stated, and which samples are masked.
+    """
     lines = [r.signals for r in runs if r.signals.hold == "linear"]
     held = {n: tuple(s.name for s in lines if n in stairs(s, (n,))) for n in model.input_names}
     absent = [n for n in model.output_names if not any(n in r.signals.columns for r in runs)]
+    stated = {n: unit for n, unit in _units(model).items() if unit != "1"}
+    units, masked = list[Note](), list[Note]()
+    for r in runs:
+        read = r.signals.units
+        bare = tuple(n for n in stated if read.get(n) == "")
+        units += [note("no_unit", record=r.name, names=bare)] if bare else []
+        free = tuple(n for n in _units(model) if n not in stated and read.get(n, "1") != "1")
+        units += [note("unit_kept", record=r.name, names=free)] if free else []
+        for own in r.suspects:
+            masked += own.notes(f"{own.names[0]} of {r.name}")
     return (
         *(note("stairs", input=n, records=records) for n, records in held.items() if records),
         *(note("no_column", output=n) for n in absent),
+        *units,
+        *masked,
     )
+
+
+def _units(model: Model) -> dict[str, str]:
+    inputs, outputs = model.structure.inputs, model.structure.outputs
+    return {**{v.name: v.unit for v in inputs}, **{v.name: v.unit for v in outputs}}
+
+
+def _in_units(model: Model, s: Signals, problems: Problems) -> Signals:
+    """Return the same samples in the units of a model; where it states none, in their own."""
+    columns, units, where = dict(s.columns), dict(s.units), s.source or s.name
+    for name, own in _units(model).items():
+        unit = s.units.get(name)
+        if not unit or name not in columns:
+            continue
+        try:
+            if own != "1" or parse_unit(unit).dimension == parse_unit(own).dimension:
+                columns[name], units[name] = convert(columns[name], unit, own), own
+        except InputError as error:
+            problems.add(
+                f"{where}: column '{name}': {error} The model has it in '{own}': name the column"
+                f" '{name} [UNIT]' with a unit of that kind, or correct the model's."
+            )
+    return replace(s, columns=columns, units=units)
 
 
 def _check(model: Model, s: Signals, problems: Problems) -> None:
@@ -147,7 +227,7 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
         if name not in s.columns:
             problems.add(
                 f"signals '{s.name}' lack the input '{name}' of the model '{model.name}'; they have"
-                f" {sorted(s.columns)}. Name the column so.{unit_hint(s.columns)}"
+                f" {sorted(s.columns)}. Name the column so."
             )
         elif not np.isfinite(s.columns[name]).all():
             problems.add(
@@ -158,23 +238,18 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
     if not any(np.isfinite(s.columns[n]).sum() >= 8 for n in there):
         problems.add(
             f"signals '{s.name}' have no output of the model '{model.name}' with eight samples or"
-            f" more; the model's are {model.output_names}.{unit_hint(s.columns)}"
+            f" more; the model's are {model.output_names}."
         )
 
 
-def _outputs(model: Model, s: Signals) -> FloatArray:
-    missing = np.full(s.n, np.nan)
-    return np.column_stack([s.columns.get(n, missing) for n in model.output_names])
-
-
-def _shadow(model: Model, s: Signals) -> Record:
+def _shadow(run: Run) -> Record:
     """Return the record of one input and of what was measured, along which samples are held out."""
-    moving = max(model.input_names, key=lambda n: _moves(s.columns[n]), default=None)
-    there = np.isfinite(_outputs(model, s)).any(axis=1)
+    spans = [_moves(column) for column in run.inputs.T]
+    there = np.isfinite(run.outputs).any(axis=1)
     return Record(
-        name=s.name,
-        time=s.time,
-        voltage=np.zeros(s.n) if moving is None else s.columns[moving],
+        name=run.name,
+        time=run.signals.time,
+        voltage=run.inputs[:, int(np.argmax(spans))] if spans else np.zeros(run.signals.n),
         displacement=np.where(there, 0.0, np.nan),
     )
 
