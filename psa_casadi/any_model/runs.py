@@ -16,7 +16,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Hold, Signals, stairs
 from psa_casadi.records.split import divided, whole
 from psa_casadi.records.suspects import Suspects, suspects_of
-from psa_casadi.units import convert, parse_unit
+from psa_casadi.units import convert, parse_unit, si_unit
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -137,34 +137,22 @@ def runs_of(
 
 def _run(model: Model, s: Signals) -> Run:
     """Return an experiment of which no sample is used yet."""
-    inputs = np.column_stack([np.empty((s.n, 0)), *(s.columns[n] for n in model.input_names)])
+    inputs = {n: s.columns[n] for n in model.input_names}
     missing, none = np.full(s.n, np.nan), np.zeros(s.n, dtype=np.bool_)
-    outputs = np.column_stack([s.columns.get(n, missing) for n in model.output_names])
-    found = tuple(_suspects(model, inputs, outputs, j) for j in range(outputs.shape[1]))
-    for j, own in enumerate(found):
-        outputs[own.mask, j] = np.nan
-    noise = np.ones(len(model.output_names))
-    return Run(s, s.time - s.time[0], inputs, outputs, none, none, noise, found)
-
-
-#: An output that moves in such a way that more of its samples would be masked has no such sensor.
-_MOST_MASKED = 0.5
-
-
-def _suspects(model: Model, inputs: FloatArray, outputs: FloatArray, j: int) -> Suspects:
-    """Return the samples of an output that its sensor has made, against the input most like it."""
-    y, output = outputs[:, j], model.structure.outputs[j]
-    there = np.isfinite(y)
-    centred = y[there] - np.mean(y[there]) if there.any() else y[there]
-    alike = [abs(float(centred @ u)) / (float(np.std(u)) or np.inf) for u in inputs[there].T]
-    drive = int(np.argmax(alike)) if alike else None
-    others = [u for k, u in enumerate(inputs.T) if k != drive]
-    still = np.zeros(len(y))
-    found = suspects_of(y, still if drive is None else inputs[:, drive], others, output.unit)
-    if found.mask.sum() > _MOST_MASKED * there.sum():
-        found = suspects_of(np.full(len(y), np.nan), still, (), output.unit)
-    mover = "" if drive is None else model.input_names[drive]
-    return replace(found, names=(output.name, mover, output.name))
+    outputs = {o.name: s.columns.get(o.name, missing) for o in model.structure.outputs}
+    found = tuple(
+        suspects_of(o.name, outputs[o.name], o.unit, inputs) for o in model.structure.outputs
+    )
+    return Run(
+        signals=s,
+        time=s.time - s.time[0],
+        inputs=np.column_stack([np.empty((s.n, 0)), *inputs.values()]),
+        outputs=np.column_stack([np.where(f.mask, np.nan, outputs[f.names[0]]) for f in found]),
+        used=none,
+        held_out=none,
+        noise=np.ones(len(found)),
+        suspects=found,
+    )
 
 
 def varied(run: Run) -> int | None:
@@ -181,14 +169,11 @@ def told_of_columns(model: Model, runs: Sequence[Run]) -> tuple[Note, ...]:
     lines = [r.signals for r in runs if r.signals.hold == "linear"]
     held = {n: tuple(s.name for s in lines if n in stairs(s, (n,))) for n in model.input_names}
     absent = [n for n in model.output_names if not any(n in r.signals.columns for r in runs)]
-    stated = {n: unit for n, unit in _units(model).items() if unit != "1"}
+    stated = [n for n, unit in _units(model).items() if unit != "1"]
     units, masked = list[Note](), list[Note]()
     for r in runs:
-        read = r.signals.units
-        bare = tuple(n for n in stated if read.get(n) == "")
+        bare = tuple(n for n in stated if r.signals.units.get(n) == "")
         units += [note("no_unit", record=r.name, names=bare)] if bare else []
-        free = tuple(n for n in _units(model) if n not in stated and read.get(n, "1") != "1")
-        units += [note("unit_kept", record=r.name, names=free)] if free else []
         for own in r.suspects:
             masked += own.notes(f"{own.names[0]} of {r.name}")
     return (
@@ -205,21 +190,31 @@ def _units(model: Model) -> dict[str, str]:
 
 
 def _in_units(model: Model, s: Signals, problems: Problems) -> Signals:
-    """Return the same samples in the units of a model; where it states none, in their own."""
+    """Return the same samples in the units of a model; where that states none, in SI units."""
     columns, units, where = dict(s.columns), dict(s.units), s.source or s.name
     for name, own in _units(model).items():
         unit = s.units.get(name)
         if not unit or name not in columns:
             continue
         try:
-            if own != "1" or parse_unit(unit).dimension == parse_unit(own).dimension:
+            read = parse_unit(unit)
+            if own != "1" or read.dimension == parse_unit(own).dimension:
                 columns[name], units[name] = convert(columns[name], unit, own), own
+            elif read.ratio != 1 or read.offset:
+                problems.add(
+                    f"{where}: column '{name}' is in '{unit}', of which the model '{model.name}'"
+                    f" states no unit; declare it, as psa.{_kind(model, name)}('{name}',"
+                    f" '{si_unit(unit)}', ''), or give the column without a unit, in the model's."
+                )
         except InputError as error:
             problems.add(
-                f"{where}: column '{name}': {error} The model has it in '{own}': name the column"
-                f" '{name} [UNIT]' with a unit of that kind, or correct the model's."
+                f"{where}: column '{name}': {error} The model '{model.name}' has it in '{own}'."
             )
     return replace(s, columns=columns, units=units)
+
+
+def _kind(model: Model, name: str) -> str:
+    return "Input" if name in model.input_names else "Output"
 
 
 def _check(model: Model, s: Signals, problems: Problems) -> None:

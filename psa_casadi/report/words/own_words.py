@@ -248,9 +248,6 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     ),
     "no_column": "No record has a column '{output}'; that output is not compared.",
     "no_unit": "{record} states no unit of {names: and }; the model's are taken.",
-    "unit_kept": (
-        "The model states no unit of {names: and }; the numbers of {record} are taken as they are."
-    ),
     # the fit
     "own_interrupted": "The search was interrupted; these are the best values so far.",
     "cut_off": "The fit was cut off before it converged; its values are not final.",
