@@ -22,6 +22,8 @@ _REACH, _INPUTS = 4, 1
 #: Rounds in which the function is fitted without what it does not explain; rows for each
 #: coefficient, and standard deviations that are left out of the fit.
 _ROUNDS, _ROWS, _UNUSUAL = 8, 20, 4.0
+#: Times the usual move of an input that make a jump: what follows it belongs to the function.
+_JUMP = 10.0
 #: What spikes may leave of the residual around them, over the largest: a kink leaves more.
 _LEFT = 0.1
 
@@ -35,6 +37,8 @@ def spikes_in(
     `limit` standard deviations of the residual around it and by `smallest`, in the output's unit.
     """
     found = np.zeros(y.size, dtype=np.bool_)
+    if np.isfinite(y).sum() < _ROWS:
+        return found
     moving = inputs[:, np.ptp(inputs, axis=0) > 0.0]
     sides = [j for j in range(-_REACH, _REACH + 1) if j]
     near = [y, *(moving[:, k] for k in range(moving.shape[1]))]
@@ -45,13 +49,17 @@ def spikes_in(
     good = np.isfinite(table).all(axis=1) & np.isfinite(y)
     good[:_REACH] = good[-_REACH:] = False
     used, unit = good, float(np.nanstd(y)) or 1.0
+    moves = np.abs(np.diff(moving, axis=0, prepend=moving[:1]))
+    jumps = _grown((moves > _JUMP * np.median(moves, axis=0)).any(axis=1))
     for _ in range(_ROUNDS):
         if used.sum() < _ROWS * table.shape[1]:
             return found
         weights = np.linalg.lstsq(table[used], near[0][used], rcond=1e-10)[0]
         left = np.where(good, near[0] - np.where(good[:, None], table, 0.0) @ weights, 0.0)
-        usual = 1.4826 * float(np.median(np.abs(left[good])))
         size = np.abs(left)
+        usual = np.full(y.size, 1.4826 * float(np.median(size[good])))
+        if (good & jumps).any():
+            usual[jumps] = max(usual[0], 1.4826 * float(np.median(size[good & jumps])))
         peak = (size > _UNUSUAL * usual) & (
             size >= scipy.ndimage.maximum_filter1d(size, 2 * _REACH + 1)
         )
@@ -64,7 +72,7 @@ def spikes_in(
     pattern = np.ones(2 * _REACH + 1)
     pattern[[_REACH - j for j in sides]] = -weights[: len(sides)]
     for start, stop in runs_of(_grown(good & (size > allowed))):
-        place = _pursued(left[start:stop], pattern, allowed[start:stop], limit)
+        place = _pursued(left[start:stop], pattern, allowed[start:stop], limit, longest)
         found[start + np.array(place, dtype=np.intp)] = True
     for start, stop in runs_of(found):
         if stop - start > longest:
@@ -76,16 +84,29 @@ def _grown(found: BoolArray) -> BoolArray:
     return scipy.ndimage.maximum_filter1d(found, 2 * _REACH + 1)
 
 
-def _pursued(left: FloatArray, pattern: FloatArray, allowed: FloatArray, limit: float) -> list[int]:
-    """Return the places of the fewest spikes that explain a residual (m,); none where none do."""
+def _pursued(
+    left: FloatArray, pattern: FloatArray, allowed: FloatArray, limit: float, longest: int
+) -> list[int]:
+    """Return the places of the fewest spikes that explain a residual (m,); none where none do.
+
+    They are added one by one; else it is one spike of several samples that leaves only noise.
+    """
     n = left.size
     each = np.array([np.convolve(np.eye(n)[k], pattern, mode="same") for k in range(n)]).T
-    sizes, rest, places = np.linalg.norm(each, axis=0), left, list[int]()
-    while len(places) <= n // _REACH:
-        places.append(int(np.argmax(np.abs(each.T @ rest) / sizes)))
+    sizes = np.linalg.norm(each, axis=0)
+
+    def tried(places: list[int], share: float) -> tuple[bool, FloatArray]:
         found = np.linalg.lstsq(each[:, places], left, rcond=None)[0]
         rest = left - each[:, places] @ found
-        least = np.maximum(_UNUSUAL * allowed / limit, _LEFT * float(np.max(np.abs(found))))
-        if np.all(np.abs(rest) <= least):
-            return places if np.all(np.abs(found) > allowed[places]) else []
-    return []
+        most = np.maximum(_UNUSUAL * allowed / limit, share * float(np.max(np.abs(found))))
+        large = bool(np.all(np.abs(found) > allowed[places]))
+        return large and bool(np.all(np.abs(rest) <= most)), rest
+
+    places, rest = list[int](), left
+    while len(places) <= n // _REACH:
+        places.append(int(np.argmax(np.abs(each.T @ rest) / sizes)))
+        is_all, rest = tried(places, _LEFT)
+        if is_all:
+            return places
+    runs = [[*range(k, k + m)] for m in range(2, longest + 1) for k in range(n - m + 1)]
+    return next((run for run in runs if tried(run, 0.0)[0]), [])

@@ -298,7 +298,9 @@ def suspects_of(name: str, output: FloatArray, unit: str, inputs: Columns) -> Su
         return spikes_in(known, table, LIMIT, smallest, SPIKE)[places]
 
     moving = inputs.get(drive, np.zeros(output.size))
-    found = _suspects(output, moving, unit, outliers, equal=_is_noisy(output[there]))
+    found = _suspects(
+        output, moving, unit, outliers, equal=there.any() and _is_noisy(output[there])
+    )
     if 2 * found.mask.sum() > there.sum():
         found = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)
     return replace(found, names=(name, drive, name))
