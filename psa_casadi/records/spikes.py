@@ -50,7 +50,8 @@ def spikes_in(
     good[:_REACH] = good[-_REACH:] = False
     used, unit = good, float(np.nanstd(y)) or 1.0
     moves = np.abs(np.diff(moving, axis=0, prepend=moving[:1]))
-    jumps = _grown((moves > _JUMP * np.median(moves, axis=0)).any(axis=1))
+    sudden = np.any(moves > _JUMP * np.median(moves, axis=0), axis=1)
+    jumps = _grown(np.asarray(sudden, dtype=np.bool_))
     for _ in range(_ROUNDS):
         if used.sum() < _ROWS * table.shape[1]:
             return found

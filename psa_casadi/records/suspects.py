@@ -299,7 +299,7 @@ def suspects_of(name: str, output: FloatArray, unit: str, inputs: Columns) -> Su
 
     moving = inputs.get(drive, np.zeros(output.size))
     found = _suspects(
-        output, moving, unit, outliers, equal=there.any() and _is_noisy(output[there])
+        output, moving, unit, outliers, equal=bool(there.any()) and _is_noisy(output[there])
     )
     if 2 * found.mask.sum() > there.sum():
         found = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)

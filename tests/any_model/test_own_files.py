@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from tests.any_model import own_plants as plants
 from tests.any_model.own_models import cylinder, motor, oscillator
 
 N = 400
-T = np.arange(N) * 2e-3
+T = np.arange(N, dtype=np.float64) * 2e-3
 RNG = np.random.default_rng(5)
 VALVE, FLOW, SPEED, WARM = (np.cumsum(RNG.standard_normal((4, N)), axis=1) + 3.0).round(6)
 
@@ -167,7 +168,7 @@ def test_a_stacks_record_drives_any_model_and_signals_a_stack() -> None:
     units = {"voltage": "V", "displacement": "um"}
     told = psa.Signals(name="s", time=T, columns=columns, units=units)
     (again,) = psa.records.records_given(told)
-    np.testing.assert_allclose(again.displacement, 1e-6 * SPEED, rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(again.displacement), 1e-6 * SPEED, rtol=1e-12)
 
 
 def _refused(given: Any, model: psa.Model | None = None) -> str:
@@ -221,17 +222,15 @@ def test_columns_are_named_where_the_header_does_not(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     rows = np.column_stack([T, VALVE, FLOW, SPEED])
     np.savetxt(path, rows, "%.17g", ",", header="a,b,c,CH 4", comments="")
-    names = {"inputs": ("valve", "flow"), "outputs": ("Speed", "oil_temp")}
+    read = partial(psa.read_signals, inputs=("valve", "flow"), outputs=("Speed", "oil_temp"))
     said = "time=a:s,valve=b:1,flow=3:m3/s,speed=CH 4:2rpm"
-    (signals,) = psa.read_signals(path, columns=said, **names)
+    (signals,) = read(path, columns=said)
     assert (signals.units["flow"], signals.units["Speed"]) == ("m3/s", "rpm")
     np.testing.assert_allclose(signals.columns["Speed"], 2.0 * SPEED, rtol=1e-12)
-    (again,) = psa.read_signals(
-        [path], columns="valve=b,flow=c,Speed=CH 4", sample_time=0.1, **names
-    )
+    (again,) = read([path], columns="valve=b,flow=c,Speed=CH 4", sample_time=0.1)
     assert again.time[-1] == pytest.approx(0.1 * (N - 1))
     with pytest.raises(psa.InputError, match=r"'sped' is no column of a record; is 'Speed' meant"):
-        psa.read_signals(path, columns="sped=CH 4", **names)
+        read(path, columns="sped=CH 4")
 
 
 def _spoilt(record: psa.Signals, outputs: tuple[str, ...], seed: int) -> dict[str, Any]:

@@ -201,7 +201,7 @@ class Frame(Protocol):
 
 TableLike = Frame | Mapping[str, npt.ArrayLike]
 #: What stands for one record wherever records are asked for.
-OneRecord = Record | AnyPath | TableLike
+OneRecord = Signals | AnyPath | TableLike
 #: What stands for the records of one device.
 Records = OneRecord | Iterable[OneRecord]
 
