@@ -203,11 +203,13 @@ def test_what_cannot_be_meant_is_refused_with_what_to_type(
 def test_all_mistakes_of_all_records_are_told_at_once(tmp_path: Path) -> None:
     bad = tmp_path / "bad.csv"
     bad.write_text("time [s],valve,flow,speed\n" + "0,1,2,x\n" * 20)
-    said = _refused([bad, tmp_path / "none.csv", 5, {"time": T, "valve": VALVE, "flow": FLOW}])
+    said = _refused([bad, tmp_path / "none.csv", 5, {"time": T, "valve": VALVE}])
     assert "bad.csv: line 2, column 'Speed': found 'x', expected a number" in said
     assert "none.csv: there is no such file" in said
     assert "int is no record; give the path of a file, a data frame" in said
-    assert "record 4: column names: the column 'Speed' or 'oil_temp' is missing (found: " in said
+    assert "record 4: column names: the column 'flow' is missing (found: time, valve)" in said
+    said = _refused({"time": T, "valve": VALVE, "flow": FLOW})
+    assert "no output of the model 'pump' with eight samples or more; the model's are" in said
 
 
 def test_a_unit_that_is_not_stated_is_told() -> None:

@@ -56,9 +56,6 @@ class ByName:
             check_unit(COLUMNS["time"], found["time"].unit, where, problems)
         for name in [n for n in required if n not in found and n not in wanted]:
             self._ask(name)
-        outputs = [n for n in names if n not in required]
-        if not self.open and not set(outputs) & {*found, *wanted}:
-            self._ask(*outputs)
         if self.open and table.headless:
             example = ",".join(self.names)
             told = f"{table.where}: found '{table.headless[:60]}', expected a header"
@@ -120,22 +117,19 @@ class ByName:
                 return Field(index, meant.unit or "s")
         return None
 
-    def _ask(self, *names: str) -> None:
-        """Ask for a column of which one must be there, and suggest what it may be."""
+    def _ask(self, name: str) -> None:
+        """Ask for a column that is missing, and suggest what it may be."""
         free = set(self._cells()) - {f.index for f in self.fields.values()}
         labels = {k: self.table.labels[k] for k in sorted(free) if self.table.labels[k]}
         keys = {_key(label): k for k, label in labels.items()}
-        for name in names:
-            near = [keys[n] for n in difflib.get_close_matches(_key(name), keys, 1, 0.6)]
-            if name == "time":
-                near = [k for k in labels if rises(self.table, k)]
-            if near:
-                unit = stated_unit(self._text(near[0])) or self._usual(name)
-                self.sources[name] = Source(labels[near[0]], unit or None)
-                break
-        listed = " or ".join(f"'{name}'" for name in names)
-        what = f"{self.table.where}: the column {listed} is missing (found: {self._listed({})})"
-        cure = f"add it to the header as {listed}, with its unit behind it in brackets"
+        near = [keys[n] for n in difflib.get_close_matches(_key(name), keys, 1, 0.6)]
+        if name == "time":
+            near = [k for k in labels if rises(self.table, k)]
+        if near:
+            unit = stated_unit(self._text(near[0])) or self._usual(name)
+            self.sources[name] = Source(labels[near[0]], unit or None)
+        what = f"{self.table.where}: the column '{name}' is missing (found: {self._listed({})})"
+        cure = f"add it to the header as '{name}', with its unit behind it in brackets"
         self.open.append(Question(what, ASK_COLUMN, "" if self.table.sizes else cure))
 
     def _cells(self) -> list[int]:
