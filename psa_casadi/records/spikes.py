@@ -3,7 +3,8 @@
 A sample of a sampled motion is nearly a fixed linear function of its neighbours and of the inputs
 around it; its coefficients are fitted to the record. A spike of size a at sample m adds a to the
 residual there and -a times the coefficients beside it; of each group of large residuals the few
-spikes are sought, one by one, that leave nothing of it (orthogonal matching pursuit).
+spikes are sought, one by one, that leave nothing of it (orthogonal matching pursuit). What an
+input's jump leaves of the residual is usual behind jumps, and no spike.
 
 Source: Pati, Rezaiifar and Krishnaprasad, "Orthogonal matching pursuit", Asilomar 1993.
 """
@@ -22,8 +23,9 @@ _REACH, _INPUTS = 4, 1
 #: Rounds in which the function is fitted without what it does not explain; rows for each
 #: coefficient, and standard deviations that are left out of the fit.
 _ROUNDS, _ROWS, _UNUSUAL = 8, 20, 4.0
-#: Times the usual move of an input that make a jump: what follows it belongs to the function.
-_JUMP = 10.0
+#: Times the usual move of an input that make a jump, samples after it that may belong to it, and
+#: times the usual residual of a jump that a spike among them must exceed.
+_JUMP, _AFTER, _OF_JUMPS = 10.0, 16, 8.0
 #: What spikes may leave of the residual around them, over the largest: a kink leaves more.
 _LEFT = 0.1
 
@@ -51,7 +53,9 @@ def spikes_in(
     used, unit = good, float(np.nanstd(y)) or 1.0
     moves = np.abs(np.diff(moving, axis=0, prepend=moving[:1]))
     sudden = np.any(moves > _JUMP * np.median(moves, axis=0), axis=1)
-    jumps = _grown(np.asarray(sudden, dtype=np.bool_))
+    jumps = scipy.ndimage.maximum_filter1d(
+        np.asarray(sudden, dtype=np.bool_), _REACH + _AFTER + 1, origin=(_AFTER - _REACH) // 2
+    )
     for _ in range(_ROUNDS):
         if used.sum() < _ROWS * table.shape[1]:
             return found
@@ -70,6 +74,8 @@ def spikes_in(
     places = np.flatnonzero(used)
     scale = np.interp(np.arange(y.size), places, local_scale(size[used]))
     allowed = np.maximum(limit * scale, smallest / unit)
+    if peaks := [float(np.max(size[start:stop])) for start, stop in runs_of(jumps)]:
+        allowed[jumps] = np.maximum(allowed[jumps], _OF_JUMPS * np.median(peaks))
     pattern = np.ones(2 * _REACH + 1)
     pattern[[_REACH - j for j in sides]] = -weights[: len(sides)]
     for start, stop in runs_of(_grown(good & (size > allowed))):
