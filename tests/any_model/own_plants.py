@@ -63,9 +63,7 @@ def bouc_wen(seed: int, noise: float = 8e-6) -> Signals:
     return Signals(name="multisine", time=t, columns={"force": u, "position": measured})
 
 
-def motor(
-    seed: int, friction: float = 0.012, noise: float = 1.0, inertia: float = 3e-5
-) -> Signals:
+def motor(seed: int, friction: float = 0.012, noise: float = 1.0, inertia: float = 3e-5) -> Signals:
     """A DC motor with dry friction [N.m] at its shaft: voltage, speed [rad/s] and current [A].
 
     `noise` is over that of ordinary sensors, `inertia` in kg.m2.
