@@ -18,10 +18,6 @@ from numpy.typing import NDArray
 import psa_casadi as psa
 from psa_casadi.any_model.identify import identify_ode
 from psa_casadi.component import OnDemand
-from psa_casadi.components import COMPONENTS
-from psa_casadi.effects import EFFECTS
-from psa_casadi.model.parts import PARTS, part_model
-from psa_casadi.model.stacks import STACKS
 from tests.any_model.own_models import oscillator
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
@@ -40,7 +36,7 @@ def driven(model: psa.Model) -> list[FloatArray]:
 
 
 def stack() -> psa.Model:
-    model = psa.stack_model("P-885.51").with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.05})
+    model = psa.stack_model("P-885.51").with_effect(psa.EFFECTS["slow_creep"], {"creep_gain": 0.05})
     return psa.settled_at(model, 20.0, (60.0,))
 
 
@@ -176,13 +172,15 @@ def test_a_pickle_answers_as_its_original(name: str) -> None:
 
 
 def test_components_of_this_package_stay_themselves() -> None:
-    for component in (*COMPONENTS.values(), *EFFECTS.values()):
+    for component in (*psa.COMPONENTS.values(), *psa.EFFECTS.values()):
         assert pickle.loads(pickle.dumps(component)) is component
-    for name in STACKS:
+    for name in psa.STACKS:
         model = psa.stack_model(name)
         assert pickle.loads(pickle.dumps(model)).structure is model.structure
-    for name in PARTS:
-        assert pickle.loads(pickle.dumps(part_model(name))).values == part_model(name).values
+    for name in psa.PARTS:
+        assert (
+            pickle.loads(pickle.dumps(psa.part_model(name))).values == psa.part_model(name).values
+        )
 
 
 def test_errors_keep_their_sentences() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.model.parts import PARTS
 
 
 def test_dir_has_every_public_name_and_all_are_there() -> None:
@@ -80,6 +79,6 @@ def test_a_models_words_make_a_model_again() -> None:
 
 
 def test_sampled_states_have_no_such_words() -> None:
-    name = next(n for n in PARTS if psa.system.part_model(n).sampled_names)
+    name = next(n for n in psa.PARTS if psa.system.part_model(n).sampled_names)
     with pytest.raises(psa.InputError, match="sample instants only"):
         psa.system.part_model(name).casadi()

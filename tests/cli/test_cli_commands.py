@@ -10,48 +10,16 @@ import pytest
 from psa_casadi.cli.screen import show_table
 from psa_casadi.diagnosis import diagnose
 from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport, CheckRow
 from psa_casadi.identification import identify
 from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import sine, time_grid, write_record
 from psa_casadi.report.documents.junit import check_cases, junit_text
 from psa_casadi.report.page import playground
 from psa_casadi.report.words.tables import Table, effects_table
 from tests.cli.test_cli import psa
 from tests.records.record_files import HEADER, ROWS, write
 from tests.report.report_cases import diagnosis, identification
-
-
-@pytest.fixture
-def planned(tmp_path: Path) -> Path:
-    path, time = tmp_path / "planned.csv", time_grid(0.1, 1e-3)
-    write_record(path, {"time [s]": time, "voltage [V]": sine(time, 0.0, 80.0, 20.0)})
-    return path
-
-
-def test_a_wrong_choice_of_model_is_one_sentence(planned: Path, tmp_path: Path) -> None:
-    fmu = tmp_path / "x.fmu"
-    commands = (
-        ("simulate", "--input", planned, "-o", tmp_path / "y.csv"),
-        ("export", "fmu", "-o", fmu),
-    )
-    for command in commands:
-        for choice, expected in (
-            ((), "No model is given; add --model MODEL.json, or --stack NAME"),
-            (("--stack", "p885"), "did you mean P-885.51?"),
-            (("--stack", "xyzzy"), "there are PTBS200, WYDS0808020"),
-            (("--stack", "demo", "--model", tmp_path / "m.json"), "are both given"),
-        ):
-            result = psa(*command, *choice)
-            assert result.exit_code == 2
-            assert expected in result.stderr
-            assert len(result.stderr.splitlines()) == 1
-    assert psa("stacks", "xyzzy").exit_code == 2
-    assert list(tmp_path.iterdir()) == [planned]
-    with pytest.raises(InputError, match="no stack named"):
-        stack_model("PTBS2")
 
 
 @pytest.mark.parametrize("way", [["--model"], []], ids=["option", "file alone"])
@@ -203,57 +171,3 @@ def test_the_checks_of_an_fmu_are_tests() -> None:
         "agreement": 'found 0.00300, allowed 1.00e-4: at "0.1 s" & <\ufffd>',
         "states": "found not finite, allowed 0: the check stopped",
     }
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("compare", "absent.json", "b.json"), "absent.json: cannot be read (there is no such"),
-        (
-            ("simulate", "--model", "bytes", "--input", "x"),
-            "bytes: cannot be read (it is no text in",
-        ),
-        (("export", "c", "--step", "10us", "--stack", "demo", "-o", "bytes"), "there is a file of"),
-        (("examples", "ci", "-o", "bytes"), "bytes: cannot be created, there is a file of that"),
-        (("datasets", "micromanipulator", "-o", "bytes"), "bytes: cannot be created"),
-        (("check", "bytes", "--timeout", "inf"), "'--timeout'"),
-        (
-            ("design", "experiment", "--stack", "demo", "--duration", "1", "--samples", "0"),
-            "0 samples hold no experiment",
-        ),
-        (
-            ("design", "mechanism", "--stack", "demo", "--damping", "0.5", "--max-force", "inf"),
-            "The largest force is inf N; give a positive one",
-        ),
-        (
-            (
-                "design",
-                "mechanism",
-                "--stack",
-                "PTBS200",
-                "--poles",
-                "fast",
-                "-o",
-                "no/mount.json",
-                "--max-stroke-loss",
-                "much",
-            ),
-            "3 problems with what was given",
-        ),
-        (("identify", "good.csv", "-o", "good.csv"), "would overwrite an input"),
-    ],
-)
-def test_what_cannot_be_used_is_told_in_words(
-    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "bytes").write_bytes(bytes(range(256)))
-    write(tmp_path / "good.csv", HEADER, *ROWS)
-    output = () if "-o" in words or words[0] == "check" else ("-o", "out")
-    before = sorted(tmp_path.rglob("*"))
-    result = psa(*words, *output)
-    assert result.exit_code == 2, result.output
-    assert result.stdout == ""
-    assert said in " ".join(result.stderr.split())
-    assert not re.search("Errno|Traceback", result.stderr)
-    assert sorted(tmp_path.rglob("*")) == before

@@ -10,12 +10,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.datasets import DATASETS
-from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
-from psa_casadi.model.parts import PARTS
-from psa_casadi.model.stacks import STACKS
 
 
 def commands(own: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -54,12 +52,12 @@ def test_the_help_shows_its_texts_whole_in_80_columns(path: tuple[str, ...]) -> 
 @pytest.mark.parametrize(
     ("line", "names"),
     [
-        ("psa stacks ", STACKS),
+        ("psa stacks ", psa.STACKS),
         ("psa simulate --stack P", ["P-885.51", "PTBS200"]),
         ("psa effects slow", ["slow_creep"]),
-        ("psa diagnose a.csv --leave-out ", EFFECTS),
+        ("psa diagnose a.csv --leave-out ", psa.EFFECTS),
         ("psa design experiment --separate sensor_r", ["sensor_ripple"]),
-        ("psa export fmu --part ", PARTS),
+        ("psa export fmu --part ", psa.PARTS),
         (
             "psa datasets steering_mirror_",
             [n for n in DATASETS if n.startswith("steering_mirror_")],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.design.experiment.criteria import (
     Criterion,
@@ -26,11 +27,6 @@ from psa_casadi.design.experiment.experiment import (
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, draw, excess, rest_of
 from psa_casadi.design.experiment.search import Effort
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.units import FloatArray
 
@@ -44,26 +40,26 @@ BRIEF = Effort(draws=2, starts=1, steps=3)
 def rivals(share: float = 0.2, bent: str = "sensor_nonlinearity") -> list[Rival]:
     """A bent sensor (or another effect) and creep, each of a share of its ordinary size."""
     found = []
-    for effect in (EFFECTS[n] for n in (bent, "slow_creep")):
-        model = stack_model(STACK).with_effect(effect)
+    for effect in (psa.EFFECTS[n] for n in (bent, "slow_creep")):
+        model = psa.stack_model(STACK).with_effect(effect)
         size = share * model.parameter(effect.gain or "").typical(model.values)
         found.append(rival_of_effect(model.with_values({effect.gain or "": size}), effect, FREE))
     return found
 
 
-def planned(kind: Kind, limits: Limits = LIMITS, seed: int = 3) -> Record:
+def planned(kind: Kind, limits: Limits = LIMITS, seed: int = 3) -> psa.Record:
     wave = draw(kind, limits, limits.steepest(None), np.random.default_rng(seed))
     time = limits.grid()
-    return Record(name=kind, time=time, voltage=wave.voltage(wave.start, time))
+    return psa.Record(name=kind, time=time, voltage=wave.voltage(wave.start, time))
 
 
 def test_all_that_is_wrong_with_limits_is_said_at_once() -> None:
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(psa.InputError) as caught:
         Limits(5.0, 5.0, -1.0, 3, rate=0.0)
     assert len(caught.value.problems) == 4
-    with pytest.raises(InputError, match="no whole cycle"):
+    with pytest.raises(psa.InputError, match="no whole cycle"):
         Limits(0.0, 100.0, 1.0, 100, bandwidth=0.5)
-    with pytest.raises(InputError, match="cannot be shown"):
+    with pytest.raises(psa.InputError, match="cannot be shown"):
         Limits(0.0, 100.0, 1.0, 100, bandwidth=80.0)
 
 
@@ -77,12 +73,12 @@ def test_voltages_keep_every_limit(kind: Kind, seed: int) -> None:
     rng = np.random.default_rng(seed)
     wave, time = draw(kind, limits, steepest, rng), limits.grid()
     voltage = wave.voltage(wave.start, time)
-    assert excess(Record(name=kind, time=time, voltage=voltage), limits, capacitance) == ()
+    assert excess(psa.Record(name=kind, time=time, voltage=voltage), limits, capacitance) == ()
     np.testing.assert_allclose(voltage[time <= rest_of(limits)], limits.low, atol=1e-9)
     assert np.ptp(voltage) > 0.1 * limits.span
     assert np.all(wave.slack(wave.start) >= -1e-9)
     quiet = Limits(-20.0, 100.0, 2.0, 1000, rate=1e2)
-    assert excess(Record(name=kind, time=time, voltage=voltage), quiet, None) != ()
+    assert excess(psa.Record(name=kind, time=time, voltage=voltage), quiet, None) != ()
     tones = np.abs(np.fft.rfft((voltage - voltage.mean()) * np.hanning(len(time)))) ** 2
     above = np.fft.rfftfreq(len(time), time[1]) > 4.0 * limits.band
     assert tones[above].sum() < 0.02 * tones.sum()
@@ -111,8 +107,8 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
         way[len(way) // 2 :] = 0.0
     p = np.clip(wave.start, wave.lower + 0.02, wave.upper - 0.02)
 
-    def at(share: float) -> Record:
-        return Record(name=kind, time=time, voltage=wave.voltage(p + share * way, time))
+    def at(share: float) -> psa.Record:
+        return psa.Record(name=kind, time=time, voltage=wave.voltage(p + share * way, time))
 
     frozen = criterion.at(at(0.0)).frozen
     told = (frozen(at(step)) - frozen(at(-step))) / (2.0 * step)
@@ -123,7 +119,7 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
 def test_standard_errors_are_those_of_the_papers_equations_in_plain_numpy() -> None:
     """Differences of the independent reference give the same covariance as exact sensitivities."""
     names, limits = ("k_L", "A", "delta"), Limits(0.0, 100.0, 1.0, 60)
-    model, record = stack_model(STACK), planned("triangles", limits)
+    model, record = psa.stack_model(STACK), planned("triangles", limits)
     rival = rival_of_model("base", model, names)
     criterion = Information(rival, names, "D", NOISE.on_grid(limits, limits.samples))
     told = criterion.standard_errors(record)
@@ -136,7 +132,7 @@ def test_standard_errors_are_those_of_the_papers_equations_in_plain_numpy() -> N
     np.testing.assert_allclose([told[n] for n in names], seen[: len(names)], rtol=0.02)
 
 
-def _slope(model: Model, record: Record, name: str, step: float) -> FloatArray:
+def _slope(model: psa.Model, record: psa.Record, name: str, step: float) -> FloatArray:
     def at(change: float) -> FloatArray:
         values = {**model.values}
         force = 0.0
@@ -190,7 +186,7 @@ def test_naming_is_as_sure_as_the_evidence_says() -> None:
 
 
 def test_coloured_noise_tells_less_of_slow_voltages() -> None:
-    rival = rival_of_model("base", stack_model(STACK), FREE)
+    rival = rival_of_model("base", psa.stack_model(STACK), FREE)
     record = planned("triangles")
     errors = []
     for correlation in (0.0, 0.8):
@@ -210,7 +206,7 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
     assert "plays" not in " ".join(sentences(told, None))
     assert "3 runs, each from rest" in " ".join(sentences(replace(told, plays=3), None))
     assert "look alike" in " ".join(sentences(replace(told, plays=None), None))
-    rival = rival_of_model("base", stack_model(STACK), FREE)
+    rival = rival_of_model("base", psa.stack_model(STACK), FREE)
     sharp = informative_experiment(rival, NOISE, limits, optimality="A", kinds=kinds, effort=BRIEF)
     assert excess(sharp.record, limits, None) == ()
     assert min(sharp.factor.values()) > 1.1
@@ -241,6 +237,6 @@ def test_the_usual_voltages_slow_down_where_the_rate_asks() -> None:
 
 
 def test_a_parameter_that_is_not_free_is_named() -> None:
-    rival = rival_of_model("base", stack_model(STACK), FREE)
-    with pytest.raises(InputError, match="stiffnes"):
+    rival = rival_of_model("base", psa.stack_model(STACK), FREE)
+    with pytest.raises(psa.InputError, match="stiffnes"):
         Information(rival, ("stiffnes",), "D", NOISE.on_grid(LIMITS, 200))

@@ -4,18 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.errors import InputError
 from psa_casadi.examples.linearisation_trial import DriftingStack, ageing, driven, off_values
-from psa_casadi.model.parts import part_model
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.online import (
-    AdaptiveFeedForward,
-    FeedForward,
-    HysteresisObserver,
-    identifier_for,
-    stack_values,
-)
 from psa_casadi.units import FloatArray
 from tests.tiers import slow
 
@@ -26,7 +17,7 @@ LAST = slice(-1600, None)
 
 def test_the_plant_is_the_reference() -> None:
     """The stack that is stepped sample by sample is the paper's model in plain SciPy."""
-    values = stack_model(STACK).values
+    values = psa.stack_model(STACK).values
     time = np.arange(0.0, 0.1, PERIOD)
     voltage = 60.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * time))
     expected = reference.simulate(
@@ -40,7 +31,7 @@ def test_the_plant_is_the_reference() -> None:
 
 
 def test_observer_gives_the_force_of_equation_8() -> None:
-    model = stack_model(STACK)
+    model = psa.stack_model(STACK)
     p = model.values
     time = np.arange(0.0, 0.3, PERIOD)
 
@@ -57,13 +48,13 @@ def test_observer_gives_the_force_of_equation_8() -> None:
 
     expected = solve_ivp(rate, (0.0, time[-1]), [0.0], t_eval=time, rtol=1e-9, atol=1e-9,
                          max_step=1e-3).y[0]  # fmt: skip
-    observer = HysteresisObserver(stack_values(model, PERIOD, at_electrodes=True))
+    observer = psa.HysteresisObserver(psa.stack_values(model, PERIOD, at_electrodes=True))
     found = np.array([observer.step(voltage(t)) for t in time.tolist()])
     assert np.abs(found - expected).max() < 1e-3 * float(np.ptp(expected))
 
 
 def test_feed_forward_makes_the_plant_linear() -> None:
-    model, time = stack_model(STACK), np.arange(0.0, 1.0, PERIOD)
+    model, time = psa.stack_model(STACK), np.arange(0.0, 1.0, PERIOD)
     plain = driven(model, "none", model, time).nonlinearity()
     linear = driven(model, "feed-forward", model, time).nonlinearity()
     assert plain > 0.08
@@ -72,7 +63,7 @@ def test_feed_forward_makes_the_plant_linear() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_values_off_by_ten_percent_are_learnt(seed: int) -> None:
-    model, time = stack_model(STACK), np.arange(0.0, 2.0, PERIOD)
+    model, time = psa.stack_model(STACK), np.arange(0.0, 2.0, PERIOD)
     known = off_values(model, 0.1, seed)
     fixed = driven(model, "feed-forward", known, time).nonlinearity(LAST)
     tracked = driven(model, "tracked", known, time)
@@ -86,7 +77,7 @@ def test_values_off_by_ten_percent_are_learnt(seed: int) -> None:
 
 @slow
 def test_an_ageing_stack_is_followed() -> None:
-    model, time = stack_model(STACK), np.arange(0.0, 6.0, PERIOD)
+    model, time = psa.stack_model(STACK), np.arange(0.0, 6.0, PERIOD)
     drift = ageing(model, 6.0)
     figures = [
         driven(model, control, model, time, drift=drift).nonlinearity(slice(-2000, None))
@@ -97,26 +88,26 @@ def test_an_ageing_stack_is_followed() -> None:
 
 
 def test_what_is_no_stack_is_refused() -> None:
-    with pytest.raises(InputError, match="no stack"):
-        stack_values(part_model("flexure_stage"), PERIOD)
-    model = stack_model(STACK)
-    with pytest.raises(InputError, match="does not exceed gamma"):
-        stack_values(model.with_values({"gamma": model.values["beta"]}), PERIOD)
-    with pytest.raises(InputError, match="noise"):
-        identifier_for(model, PERIOD, noise=0.0)
+    with pytest.raises(psa.InputError, match="no stack"):
+        psa.stack_values(psa.part_model("flexure_stage"), PERIOD)
+    model = psa.stack_model(STACK)
+    with pytest.raises(psa.InputError, match="does not exceed gamma"):
+        psa.stack_values(model.with_values({"gamma": model.values["beta"]}), PERIOD)
+    with pytest.raises(psa.InputError, match="noise"):
+        psa.identifier_for(model, PERIOD, noise=0.0)
 
 
 def test_a_wanted_motion_in_metres_is_where_the_stack_goes() -> None:
     """The independent plant follows a slow raster in metres but for its lag and its creep."""
-    model, period = stack_model(STACK).with_values({"delta": 0.0}), 2e-3
-    values = stack_values(model, period)
+    model, period = psa.stack_model(STACK).with_values({"delta": 0.0}), 2e-3
+    values = psa.stack_values(model, period)
     time = np.arange(0.0, 4.0, period)
     wanted = 4e-6 * (1.0 - np.cos(np.pi * time)) * (1.0 - 0.15 * time)
-    for forward in (FeedForward(values), AdaptiveFeedForward(
-        identifier_for(model, period, noise=NOISE).values)):  # fmt: skip
+    for forward in (psa.FeedForward(values), psa.AdaptiveFeedForward(
+        psa.identifier_for(model, period, noise=NOISE).values)):  # fmt: skip
         plant, x, missed = DriftingStack(model.values, period), 0.0, []
         for w in wanted.tolist():
-            u = forward.step(w) if isinstance(forward, FeedForward) else forward.step(w, x)
+            u = forward.step(w) if isinstance(forward, psa.FeedForward) else forward.step(w, x)
             x = plant.step(u)
             missed.append(x - w)
         slope = float(np.abs(np.gradient(wanted, period)).max())
@@ -124,24 +115,24 @@ def test_a_wanted_motion_in_metres_is_where_the_stack_goes() -> None:
 
 
 def test_volts_are_no_motion() -> None:
-    model = stack_model(STACK)
-    forward = FeedForward(stack_values(model, PERIOD))
+    model = psa.stack_model(STACK)
+    forward = psa.FeedForward(psa.stack_values(model, PERIOD))
     before = forward.step(2e-6)
     for wrong in (50.0, float("nan"), float("inf"), -1e-3):
-        with pytest.raises(InputError, match=r"step_voltage"):
+        with pytest.raises(psa.InputError, match=r"step_voltage"):
             forward.step(wrong)
     assert forward.kept["u_last"] == before
-    adaptive = AdaptiveFeedForward(identifier_for(model, PERIOD, noise=NOISE).values)
-    with pytest.raises(InputError, match=r"stroke is \d+(\.\d+)? um"):
+    adaptive = psa.AdaptiveFeedForward(psa.identifier_for(model, PERIOD, noise=NOISE).values)
+    with pytest.raises(psa.InputError, match=r"stroke is \d+(\.\d+)? um"):
         adaptive.step(20.0, 0.0)
 
 
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize("name", psa.STACKS)
 @pytest.mark.parametrize(("samples", "limit"), [(1, 0.035), (10, 0.0025)])
 def test_jumps_across_the_range_are_followed(name: str, samples: int, limit: float) -> None:
     """Equation (8), solved finely along each jump, is what the voltage is corrected for."""
-    p = (model := stack_model(name).with_values({"delta": 0.0})).values
-    forward = FeedForward(stack_values(model, PERIOD, at_electrodes=True))
+    p = (model := psa.stack_model(name).with_values({"delta": 0.0})).values
+    forward = psa.FeedForward(psa.stack_values(model, PERIOD, at_electrodes=True))
     per_volt = p["k_L"] * (1.0 / p["k_P"] + 1.0 / p["k_B"])
     turns = p["u_rated"] * np.array([0.0, 1.0, 0.0, 0.8, 0.8, -0.2, 1.0, 1.0, 0.5, 0.5])
     force, last, missed = 0.0, 0.0, []

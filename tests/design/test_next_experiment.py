@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.cli import diagnose as command
 from psa_casadi.cli import diagnosis_files as files
 from psa_casadi.design.experiment import experiment
@@ -15,11 +16,6 @@ from psa_casadi.design.experiment.experiment import Separated, resolving_experim
 from psa_casadi.design.experiment.limits import excess
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.records import Record, read_record
-from psa_casadi.report.words.text import story
 from tests.studies.plants.again import play_again
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
@@ -34,24 +30,24 @@ SAMPLES = 2000
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    first: Record
-    ambiguous: Diagnosis
+    first: psa.Record
+    ambiguous: psa.Diagnosis
     design: Separated
-    named: Diagnosis
+    named: psa.Diagnosis
 
 
 @pytest.fixture(scope="module")
 def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
     folder = tmp_path_factory.mktemp("loop")
-    effects = [EFFECTS[HIDDEN], EFFECTS[RIVAL]]
+    effects = [psa.EFFECTS[HIDDEN], psa.EFFECTS[RIVAL]]
     path = folder / "first.csv"
     truth = make_record(HIDDEN, SEED, path, excitation="triangle", visible=(0.3, 2.0))
-    first = read_record(path).slice(0, SAMPLES)
+    first = psa.read_record(path).slice(0, SAMPLES)
     ambiguous = diagnose([first], effects=effects)
     design = resolving_experiment(ambiguous, effort=Effort(draws=3, starts=1, steps=3))
     played = folder / "next.csv"
     play_again(truth, SEED, played, (design.record.time, design.record.voltage))
-    named = diagnose([first, read_record(played)], effects=effects)
+    named = diagnose([first, psa.read_record(played)], effects=effects)
     return Loop(first, ambiguous, design, named)
 
 
@@ -74,7 +70,7 @@ def test_a_rival_that_is_the_truth_has_a_standard_error_less_of_its_effect(loop:
     _, colour = noise_of_fit(best, d.experiments)
     for contender in d.contenders:
         rival = rival_of_fit(contender.effect, contender.fit, colour)
-        gain = EFFECTS[contender.effect].gain or ""
+        gain = psa.EFFECTS[contender.effect].gain or ""
         model, start = rival.moved(rival.truth)
         fitted = rival.model.values[gain]
         assert 0.2 < model.values[gain] / fitted < 1.0
@@ -105,7 +101,7 @@ def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
     assert d.verdict in ("cause_named", "partly_explained")
     assert d.causes[0].effect == HIDDEN
     assert d.causes[0].cannot_be_told_from == ()
-    with pytest.raises(InputError, match="nothing to tell apart"):
+    with pytest.raises(psa.InputError, match="nothing to tell apart"):
         resolving_experiment(d)
 
 
@@ -121,8 +117,8 @@ def test_the_command_writes_the_record_and_says_so(
     said = json.loads(d.to_json())["next_experiment"]
     assert said["voltage_csv"] == str(path)
     assert set(said["separates"]) == set(said["chance"]) == {HIDDEN, RIVAL}
-    assert str(path) in " ".join(story(d, width=400).split())
-    record = read_record(path, need_displacement=False)
+    assert str(path) in " ".join(psa.story(d, width=400).split())
+    record = psa.read_record(path, need_displacement=False)
     np.testing.assert_array_equal(record.voltage, loop.design.record.voltage)
     assert files.with_next(loop.named, path, lambda _: None) is loop.named
     assert files.with_next(loop.ambiguous, None, lambda _: None) is loop.ambiguous

@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.examples.linearisation_trial import Drive, driven, off_values
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.online import OnlineIdentification, identifier_for
 from tests.design.online_numpy import TRACKED, NumpyIdentification
 from tests.export.modelica_runs import simulated
 from tests.tiers import slow_but
@@ -22,17 +20,17 @@ STACK, PERIOD, NOISE = "P-885.51", 5e-4, 2e-8
 @cache
 def record() -> Drive:
     """Return a plain run of 0.4 s on the plant."""
-    model = stack_model(STACK)
+    model = psa.stack_model(STACK)
     return driven(model, "none", model, np.arange(0.0, 0.4, PERIOD))
 
 
 def test_recursion_is_recursive_least_squares_on_the_prediction() -> None:
     """The streaming object does what matrices and finite differences in NumPy do."""
     values = dict(
-        identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE).values
+        psa.identifier_for(off_values(psa.stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE).values
     )
     d = record()
-    online = OnlineIdentification(values)
+    online = psa.OnlineIdentification(values)
     expected, rows = NumpyIdentification(values), []
     for u, x in zip(d.voltage.tolist(), d.displacement.tolist(), strict=True):
         force = online.step(u, x)
@@ -47,9 +45,9 @@ def test_recursion_is_recursive_least_squares_on_the_prediction() -> None:
 
 
 def test_standstill_teaches_nothing_and_winds_nothing_up() -> None:
-    model = stack_model(STACK)
-    tuned = identifier_for(model, PERIOD, noise=NOISE, memory=0.05)
-    online, d = OnlineIdentification(tuned.values), record()
+    model = psa.stack_model(STACK)
+    tuned = psa.identifier_for(model, PERIOD, noise=NOISE, memory=0.05)
+    online, d = psa.OnlineIdentification(tuned.values), record()
     for u, x in zip(d.voltage.tolist(), d.displacement.tolist(), strict=True):
         online.step(u, x)
     before = online.estimate
@@ -63,11 +61,11 @@ def test_standstill_teaches_nothing_and_winds_nothing_up() -> None:
 
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
-    model = identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
-    d, online = record(), OnlineIdentification(model.values)
+    model = psa.identifier_for(off_values(psa.stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
+    d, online = record(), psa.OnlineIdentification(model.values)
     names = [f"{name}_hat" for name in TRACKED] + ["hysteresis_force"]
     with (
-        Fmu(export_fmu(model, tmp_path / "online.fmu", fmi=fmi)) as fmu,
+        Fmu(psa.export_fmu(model, tmp_path / "online.fmu", fmi=fmi)) as fmu,
         fmu.start(CO_SIMULATION) as instance,
     ):
         for k in range(200):
@@ -82,7 +80,7 @@ def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
 
 def test_modelica_block_gives_what_the_stream_gives() -> None:
     """Another compiler runs the exported block on a drive of its own."""
-    model = identifier_for(off_values(stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
+    model = psa.identifier_for(off_values(psa.stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
     wave = "60*(1 - cos(62.83185307179586*({})))"
     harness = f"""
     model Driven
@@ -93,7 +91,7 @@ def test_modelica_block_gives_what_the_stream_gives() -> None:
     end Driven;
     """
     found = simulated(modelica_text(model) + harness, "Driven", 0.03)
-    online = OnlineIdentification(model.values)
+    online = psa.OnlineIdentification(model.values)
     for t in PERIOD * np.arange(61):
         u, x = (60.0 * (1.0 - np.cos(62.83185307179586 * (t - d))) for d in (0.0, 1e-3))
         force = online.step(float(u), 1.4e-7 * float(x))

@@ -7,16 +7,13 @@ import pytest
 from numpy.polynomial import Legendre
 from numpy.typing import NDArray
 
-from psa_casadi.component import Component
-from psa_casadi.components import SIMPLIFIED
+import psa_casadi as psa
 from psa_casadi.effects.drive import CHARGE_LEAKAGE, DRIVE_LAG, VOLTAGE_SATURATION
 from psa_casadi.effects.environment import MAINS_HUM, TEMPERATURE
 from psa_casadi.effects.sensor import SENSOR_JUMP, SENSOR_NONLINEARITY, SENSOR_RIPPLE
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.model.compose import Model, compose
 from psa_casadi.scales import stroke_scale
 from psa_casadi.simulation.start import start_state
-from psa_casadi.simulation.stepper import run
 from tests.model.stack_models import LINEAR, stack
 
 FloatArray = NDArray[np.float64]
@@ -25,12 +22,12 @@ STACK = "P-885.51"
 ROOM = 293.15
 
 
-def with_effect(effect: Component, **values: float) -> Model:
+def with_effect(effect: psa.Component, **values: float) -> psa.Model:
     return stack(STACK).with_effect(effect, values)
 
 
 def simulated(
-    model: Model,
+    model: psa.Model,
     t: FloatArray,
     voltage: FloatArray,
     *,
@@ -44,12 +41,12 @@ def simulated(
         inputs["temperature"] = temperature
     u = np.column_stack([inputs[name] for name in model.input_names])
     x0 = start_state(model, list(u[0]), None, memory).x
-    steps = run(model, t, u, x0, rtol=rtol)
+    steps = psa.run(model, t, u, x0, rtol=rtol)
     states = dict(zip(model.state_names, steps.x.T, strict=True))
     return states | dict(zip(model.output_names, steps.y.T, strict=True))
 
 
-def stroke(model: Model) -> float:
+def stroke(model: psa.Model) -> float:
     return model.values["k_L"] * model.values["u_rated"] * static_compliance(model.values)
 
 
@@ -206,8 +203,8 @@ def test_hum_is_a_sine_that_keeps_amplitude_and_phase_for_a_thousand_periods() -
 def test_expansion_follows_the_temperature_with_its_lag(single: bool) -> None:
     base = stack(STACK)
     if single:
-        kept = {n: v for n, v in base.values.items() if n in compose(SIMPLIFIED).values}
-        base = compose(SIMPLIFIED, kept)
+        kept = {n: v for n, v in base.values.items() if n in psa.compose(psa.SIMPLIFIED).values}
+        base = psa.compose(psa.SIMPLIFIED, kept)
     lag = 20.0
     model = base.with_effect(TEMPERATURE, {"expansion_gain": 2e-3, "temperature_lag": lag})
     t = np.linspace(0.0, 1000.0, 1001)

@@ -11,8 +11,7 @@ from scipy.signal import lsim
 import psa_casadi as psa
 from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.identification.start.linear_response import Shaken, modes_of
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record, multisine
+from psa_casadi.records import multisine
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.mechanics import structural_mode
 from tests.studies.plants.stack import draw_stack
@@ -72,14 +71,14 @@ def with_two_modes() -> psa.Model:
             f"series_damping_{k}": damping,
             f"series_share_{k}": share,
         }
-    return stack_model("P-885.51").with_effect(MODAL_SERIES[2], values)
+    return psa.stack_model("P-885.51").with_effect(MODAL_SERIES[2], values)
 
 
 def test_its_equations_are_those_of_modal_superposition() -> None:
     model, time = with_two_modes(), np.arange(4000) / 20_000.0
     voltage = multisine(time, 0.0, 80.0, (20.0, 1500.0), seed=3)
     voltage *= np.clip((time - 0.002) / 0.01, 0.0, 1.0)  # it begins at rest
-    base = psa.simulate(stack_model("P-885.51"), time, voltage, rtol=1e-6)
+    base = psa.simulate(psa.stack_model("P-885.51"), time, voltage, rtol=1e-6)
     own = psa.simulate(model, time, voltage, rtol=1e-6)
     k = model.values
     rest = base.states["f_out"] * (1.0 / k["k_P"] + 1.0 / k["k_B"])
@@ -88,7 +87,7 @@ def test_its_equations_are_those_of_modal_superposition() -> None:
     np.testing.assert_allclose(own.displacement - base.displacement, added, atol=2e-3 * size)
 
 
-def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN) -> Record:
+def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN) -> psa.Record:
     """Return a record of a stack in a structure with modes, plain NumPy and SciPy."""
     rng = np.random.default_rng(seed)
     stack, time = draw_stack(rng), np.arange(COUNT) / RATE
@@ -100,7 +99,7 @@ def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN
         for f, z, share in modes
     )
     x = x + 1e-3 * np.ptp(x) * rng.standard_normal(COUNT)
-    return Record(name="shaken", time=time, voltage=command, displacement=x)
+    return psa.Record(name="shaken", time=time, voltage=command, displacement=x)
 
 
 @slow

@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.model.compose import compose
 from psa_casadi.records.split import whole
 from tests.studies.exam.hysteresis import relay_means
 from tests.tiers import slow
 
-_MEMORY = EFFECTS["hysteresis_memory"]
+_MEMORY = psa.EFFECTS["hysteresis_memory"]
 _STROKE, _RATED, _NOISE = 20e-6, 100.0, 20e-9
 
 
@@ -47,14 +44,14 @@ def test_a_gain_is_a_factor_of_the_linear_parameters() -> None:
     assert at["memory_square_0"] == pytest.approx(-1.5)
     declared = next(p.value for p in _MEMORY.parameters if p.name == "memory_play_0")
     assert at["memory_play_0"] == pytest.approx(-3.0 * declared)
-    assert EFFECTS["slow_creep"].at_gain(0.2, {}) == {EFFECTS["slow_creep"].gain: 0.2}
+    assert psa.EFFECTS["slow_creep"].at_gain(0.2, {}) == {psa.EFFECTS["slow_creep"].gain: 0.2}
 
 
 @slow
 def test_a_fit_switches_an_effect_on_that_the_model_has_off() -> None:
     record = _record()
     base = starting_model([record])
-    model = compose([*BASE, _MEMORY], dict(base.values))
+    model = psa.compose([*psa.BASE, _MEMORY], dict(base.values))
     assert model.values["memory_gain"] == 0.0
     found = fit_base(model, [whole(record)])
     assert found.model.values["memory_gain"] == 1.0

@@ -21,7 +21,6 @@ import psa_casadi as psa
 from build_scripts.measured_data import ROOT
 from psa_casadi.component import BALANCES
 from psa_casadi.examples.index import Example, Script, examples
-from psa_casadi.simulation.simulate import settled_at
 from tests.examples.recipe_commands import run_command
 from tests.examples.tool_interfaces import BLOCK_PARAMETERS, DYMOLA, OPENMODELICA, bound, calls_of
 from tests.export.modelica_runs import load
@@ -186,7 +185,7 @@ def test_what_omsimulator_makes_of_them(made: Path) -> None:
     """A stack that is held at 60 V stays there, a closed loop rests."""
     for line in _script("omsimulator", "run_omsimulator.sh").text.splitlines():
         subprocess.run(shlex.split(line), cwd=made, check=True, timeout=120)
-    held = settled_at(psa.stack_model("P-885.51"), 60.0, [120.0, 0.0])
+    held = psa.settled_at(psa.stack_model("P-885.51"), 60.0, [120.0, 0.0])
     expected = psa.simulate(held, [0.0, 1e-3], [60.0, 60.0]).displacement[-1]
     for name in ("held.csv", "held_cs.csv"):
         found = np.genfromtxt(made / name, delimiter=",", names=True)["displacement"]

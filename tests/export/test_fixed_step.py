@@ -14,15 +14,10 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.cli.inputs import step_seconds
-from psa_casadi.component import Component
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
 from psa_casadi.export.fixed_step.export import GOOD, FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
 from psa_casadi.export.fixed_step.probe import VOLTAGES, Probe, played_inputs
 from psa_casadi.files import temporary_folder
-from psa_casadi.model.compose import compose
-from psa_casadi.model.stacks import STACKS
 from psa_casadi.simulation.compiler import (
     compiler_command,
     has_zig,
@@ -30,8 +25,6 @@ from psa_casadi.simulation.compiler import (
     shared_library,
     zig_command,
 )
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.stepper import run
 from tests.model.stack_models import stack
 from tests.simulation.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect
 from tests.tiers import slow
@@ -105,20 +98,20 @@ def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str
 
 
 def test_an_effect_that_does_not_fit_is_named() -> None:
-    model = compose((*BASE, JUMP), stack("P-885.51").values)
+    model = psa.compose((*psa.BASE, JUMP), stack("P-885.51").values)
     with pytest.raises(psa.InputError, match=r"'jump' does not fit.*equations jump"):
         fixed_step(model, name="stack", step=STEP)
 
 
 @pytest.mark.parametrize("component", [KINK, FEEDBACK], ids=lambda c: str(c.name))
 def test_what_kinks_or_feeds_back_to_the_hysteresis_is_stepped_as_a_whole(
-    component: Component,
+    component: psa.Component,
 ) -> None:
-    model = compose((*BASE, component), stack("P-885.51").values).plant()
+    model = psa.compose((*psa.BASE, component), stack("P-885.51").values).plant()
     found = fixed_step(model, name="stack", step=STEP, substeps=8)
     assert all(0.0 < e <= 1e-3 for e in errors(found).values())
     wave = 60.0 * (1.0 - np.cos(np.arange(901) / 70.0))
-    away = simulate(model.without([component.name]), STEP * np.arange(901), wave)
+    away = psa.simulate(model.without([component.name]), STEP * np.arange(901), wave)
     assert error(play(found, wave), away.outputs[OUTPUT][1:]) > 1e-2
 
 
@@ -184,8 +177,8 @@ def limit(name: str) -> float:
 
 
 CASES = [
-    *(("base", name) for name in STACKS),
-    *((name, sorted(STACKS)[k % len(STACKS)]) for k, name in enumerate(EFFECTS)),
+    *(("base", name) for name in psa.STACKS),
+    *((name, sorted(psa.STACKS)[k % len(psa.STACKS)]) for k, name in enumerate(psa.EFFECTS)),
 ]
 
 
@@ -231,7 +224,7 @@ def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
     assert 1.25 * model.values["u_rated"] <= limit < 900.0
     jumps = limit * np.select([share < 0.1, share < 0.5, share < 0.8], [0.0, 1.0, -1.0], 1.0)
     t, u = LONG_STEP * np.arange(401, dtype=np.float64), np.column_stack([jumps, 0.0 * jumps])
-    true = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
+    true = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
     within = play(found, jumps)
     shown = true[1:, model.output_names.index(OUTPUT)]
     assert error(within, shown) <= max(GOOD, found.worst.error)

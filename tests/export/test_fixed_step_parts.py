@@ -13,8 +13,6 @@ from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
 from psa_casadi.export.fixed_step.probe import Probe
 from psa_casadi.files import temporary_folder
-from psa_casadi.model.compose import Model
-from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from tests.export.test_fixed_step import STRICT
 from tests.tiers import slow_but
@@ -26,12 +24,12 @@ ROUNDING = {"double": 1e-9, "single": 1e-5}
 FRAMES = (*STRICT, "-Wframe-larger-than=4096")
 
 
-def code_of(model: Model, precision: str) -> FixedStep:
+def code_of(model: psa.Model, precision: str) -> FixedStep:
     step = model.values[model.structure.period] if model.structure.period else 1e-5
     return fixed_step(model, name="part", step=step, precision=precision)
 
 
-def played(model: Model, precision: str, inputs: FloatArray) -> FloatArray:
+def played(model: psa.Model, precision: str, inputs: FloatArray) -> FloatArray:
     """Return the outputs (n, ny) of the code on inputs (n, nu), one call for each."""
     found = code_of(model, precision)
     return Probe(found.plan, found.texts).play(np.vstack([inputs[:1], inputs]))
@@ -105,11 +103,11 @@ def test_learning_blocks_are_the_python_objects(precision: str) -> None:
     ("name", "precision"),
     slow_but(
         [("hysteresis_compensator", "single"), ("adaptive_feed_forward", "double")],
-        [(name, precision) for name in PARTS for precision in PRECISIONS],
+        [(name, precision) for name in psa.PARTS for precision in PRECISIONS],
     ),
 )
 def test_every_part_is_c_of_small_frames_and_no_loop(name: str, precision: str) -> None:
-    found = code_of(part_model(name), precision)
+    found = code_of(psa.part_model(name), precision)
     assert found.worst.error <= 1e-3
     source = found.texts["part.c"]
     code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
@@ -124,7 +122,7 @@ def test_every_part_is_c_of_small_frames_and_no_loop(name: str, precision: str) 
 
 def test_a_controller_acts_at_every_few_steps_of_its_plant() -> None:
     """A sampled part called four times a period changes its command at the fourth call."""
-    part = part_model("position_controller")
+    part = psa.part_model("position_controller")
     found = fixed_step(part, name="part", step=1.25e-5)
     u = np.column_stack([np.linspace(0.0, 1e-6, 401), np.zeros(401)])
     command = Probe(found.plan, found.texts).play(u)[:, 0]

@@ -8,22 +8,17 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.predict import Sizes
-from psa_casadi.component import Component, Equations
 from psa_casadi.export.check.agreement import has_reference
-from psa_casadi.export.check.check import as_exported, check_fmu
+from psa_casadi.export.check.check import as_exported
 from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.ode_model import ode_model
-from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Input, Parameter, State
 from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import simulated
 from tests.tiers import slow_but
@@ -39,7 +34,7 @@ CHECKED = (
 
 @pytest.mark.parametrize(("name", "fmi"), slow_but(CHECKED[:1], CHECKED))
 def test_check_passes(name: str, fmi: int) -> None:
-    report = check_fmu(exported(name, fmi), model_named(name))
+    report = psa.check_fmu(exported(name, fmi), model_named(name))
     assert report.compared
     assert not report.failures, "\n".join(
         f"{r.name}: {r.figure} {r.remark}" for r in report.failures
@@ -62,26 +57,26 @@ def test_nominal_values_of_parameters_are_within_their_bounds(name: str) -> None
 _X, _U, _P, _T = (ca.SX.sym(name) for name in "xupt")
 
 
-def _ode(name: str, **ode: ca.SX) -> Model:
+def _ode(name: str, **ode: ca.SX) -> psa.Model:
     values = {"p": 2.0} if "p" in ode else {}
-    return ode_model({"x": _X, **ode}, name=name, values=values)
+    return psa.ode_model({"x": _X, **ode}, name=name, values=values)
 
 
 @cache
-def _without_outputs() -> Model:
-    tank = Component(
+def _without_outputs() -> psa.Model:
+    tank = psa.Component(
         name="tank",
         description="a state that follows an input, shown to nobody",
         source="a first-order lag",
-        equations=lambda s: Equations(der={"level": s.rate * (s.inflow - s.level)}),
-        parameters=(Parameter("rate", 2.0, "1/s", (0.0, 10.0), "rate of the lag"),),
-        states=(State("level", "m", "level", 1.0),),
-        inputs=(Input("inflow", "m", "what the level follows", 0.0, 1.0),),
+        equations=lambda s: psa.Equations(der={"level": s.rate * (s.inflow - s.level)}),
+        parameters=(psa.Parameter("rate", 2.0, "1/s", (0.0, 10.0), "rate of the lag"),),
+        states=(psa.State("level", "m", "level", 1.0),),
+        inputs=(psa.Input("inflow", "m", "what the level follows", 0.0, 1.0),),
     )
-    return compose([tank], name="tank")
+    return psa.compose([tank], name="tank")
 
 
-def _seen_late() -> Model:
+def _seen_late() -> psa.Model:
     """A first-order model whose output is seen through a lag."""
     model = _ode("late", u=_U, p=_P, ode=_P * (_U - _X), y=_X)
     ones = dict.fromkeys((*model.state_names, *model.input_names, *model.output_names), 1.0)
@@ -90,7 +85,7 @@ def _seen_late() -> Model:
     return extended(model, [lag]).with_values({f"{lag.name}_time": 0.05})
 
 
-MODELS: dict[str, Callable[[], Model]] = {
+MODELS: dict[str, Callable[[], psa.Model]] = {
     "neither input nor parameter": lambda: _ode("decay", ode=-_X),
     "no input": lambda: _ode("decay", p=_P, ode=-_P * _X),
     "at rest, parameter without effect": lambda: _ode("rest", u=_U, p=_P, ode=-_P * _X),
@@ -114,7 +109,7 @@ IN_TURN = [(n, 2 + k % 2) for k, n in enumerate(MODELS) if (n, 3) not in QUICK]
 @pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize(("name", "fmi"), slow_but(QUICK[:1], [*QUICK, *IN_TURN]))
 def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) -> None:
-    report = check_fmu(export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
+    report = psa.check_fmu(psa.export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
     assert report.passed, report.failures
 
 
@@ -122,7 +117,7 @@ def test_a_sensors_effect_is_left_out_where_the_fmu_leaves_it_out(tmp_path: Path
     """It has no output of its own: its state and parameters tell."""
     whole = _seen_late()
     assert whole.state_names != ("x",)
-    with Archive(export_fmu(whole, tmp_path / "m.fmu")) as archive:
+    with Archive(psa.export_fmu(whole, tmp_path / "m.fmu")) as archive:
         chosen = as_exported(archive, whole)
         assert chosen.state_names == ("x",)
         assert list(wrong_start_values(archive, chosen)) == []
@@ -136,11 +131,11 @@ def test_a_model_without_outputs_runs_everywhere(tmp_path: Path) -> None:
     assert model.structure.y.shape == (0, 1)
     exact = 1.0 - np.exp(-2.0 * end)
     t = np.linspace(0.0, end, 11)
-    steps = run(model, t, np.ones((11, 1)), np.zeros(1), rtol=1e-9)
+    steps = psa.run(model, t, np.ones((11, 1)), np.zeros(1), rtol=1e-9)
     assert steps.x[-1, 0] == pytest.approx(exact, rel=1e-7)
     assert steps.y.shape == (11, 0)
     with (
-        Fmu(export_fmu(model, tmp_path / "m.fmu")) as fmu,
+        Fmu(psa.export_fmu(model, tmp_path / "m.fmu")) as fmu,
         fmu.start(CO_SIMULATION, tolerance=1e-9) as slave,
     ):
         slave.set({"inflow": 1.0})

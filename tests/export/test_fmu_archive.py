@@ -22,24 +22,17 @@ import pytest
 from fmpy.validation import validate_fmu
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.component import Component, Equations
-from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.export.check.check import CheckRow, check_fmu
+import psa_casadi as psa
+from psa_casadi.export.check.check import CheckRow
 from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu import sources
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.description import dependencies
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
-from psa_casadi.variables import Input, Output, Parameter, State
 from tests.export.fmu_models import assert_valid, entries, model_named, rewritten
 from tests.tiers import slow_but
 
@@ -61,21 +54,21 @@ def test_sources_compile_alone_without_warnings(name: str, tmp_path: Path) -> No
 
 def test_impossible_exports_are_refused(tmp_path: Path) -> None:
     model = model_named(STACK)
-    with pytest.raises(InputError, match="cannot name an FMU"):
-        export_fmu(model, tmp_path / "a.fmu", name="P-885.51")
-    with pytest.raises(InputError, match="'amiga' is not known"):
-        export_fmu(model, tmp_path / "a.fmu", platforms=["host", "amiga"])
-    flexure = COMPONENTS["flexure"]
+    with pytest.raises(psa.InputError, match="cannot name an FMU"):
+        psa.export_fmu(model, tmp_path / "a.fmu", name="P-885.51")
+    with pytest.raises(psa.InputError, match="'amiga' is not known"):
+        psa.export_fmu(model, tmp_path / "a.fmu", platforms=["host", "amiga"])
+    flexure = psa.COMPONENTS["flexure"]
     twice = replace(
         flexure,
-        outputs=(Output("x_f", "m", "position"),),
+        outputs=(psa.Output("x_f", "m", "position"),),
         equations=lambda s: replace(flexure.equations(s), out={"x_f": s.x_f}),
     )
-    with pytest.raises(InputError, match="Two variables of 'psa' are named 'x_f'"):
-        variable_table(compose([twice]))
-    gain = Component("gain", "none", "none", lambda s: Equations())
-    with pytest.raises(InputError, match="has no state"):
-        variable_table(compose([gain]))
+    with pytest.raises(psa.InputError, match="Two variables of 'psa' are named 'x_f'"):
+        variable_table(psa.compose([twice]))
+    gain = psa.Component("gain", "none", "none", lambda s: psa.Equations())
+    with pytest.raises(psa.InputError, match="has no state"):
+        variable_table(psa.compose([gain]))
     assert not list(tmp_path.iterdir())
 
 
@@ -108,7 +101,7 @@ TWICE = ("P-885.51", "flexure")
 TRIED = [(name, fmi) for name in TWICE for fmi in (2, 3)]
 TRIED += [
     (name, 2 + k % 2)
-    for k, name in enumerate((*STACKS, "every_effect", "single_mass")) if name not in TWICE
+    for k, name in enumerate((*psa.STACKS, "every_effect", "single_mass")) if name not in TWICE
 ]  # fmt: skip
 
 
@@ -116,7 +109,9 @@ TRIED += [
 @pytest.mark.parametrize(("name", "fmi"), slow_but(TRIED[:4], TRIED))
 def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
     """What is checked are the description and the list of sources."""
-    path = export_fmu(model_named(name), tmp_path / "m.fmu", name="m", fmi=fmi, include_sensor=True)
+    path = psa.export_fmu(
+        model_named(name), tmp_path / "m.fmu", name="m", fmi=fmi, include_sensor=True
+    )
     assert validate_fmu(str(path)) == []
     description = fmpy.read_model_description(str(path))
     assert description.fmiVersion == f"{fmi}.0"
@@ -128,7 +123,7 @@ def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
 def test_entries_are_sorted_and_have_no_date_and_a_binary_for_every_platform(
     fmi: int, tmp_path: Path
 ) -> None:
-    path = export_fmu(model_named("flexure"), tmp_path / "a.fmu", platforms=["all"], fmi=fmi)
+    path = psa.export_fmu(model_named("flexure"), tmp_path / "a.fmu", platforms=["all"], fmi=fmi)
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         assert names == sorted(names)
@@ -137,8 +132,8 @@ def test_entries_are_sorted_and_have_no_date_and_a_binary_for_every_platform(
     assert {n for n in names if n.startswith("binaries/")} == binaries
     known = {"linux64", "linux32", "win64", "win32", "darwin64"}  # all the names that FMI 2 has
     assert (known if fmi == 2 else set(PLATFORMS)) <= {n.split("/")[1] for n in binaries}
-    with pytest.raises(InputError, match="FMI 4 is not known"):
-        export_fmu(model_named("demo"), tmp_path / "c.fmu", fmi=4)
+    with pytest.raises(psa.InputError, match="FMI 4 is not known"):
+        psa.export_fmu(model_named("demo"), tmp_path / "c.fmu", fmi=4)
 
 
 XML = "modelDescription.xml"
@@ -162,11 +157,11 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(sources, "generate_c", generated)
         patch.setattr(sources, "c_code", lambda *args: _as_another_writes(derivatives(*args)))
         patch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
-        return export_fmu(model_named(STACK), tmp_path_factory.mktemp("fmu") / "older.fmu")
+        return psa.export_fmu(model_named(STACK), tmp_path_factory.mktemp("fmu") / "older.fmu")
 
 
 def _reproducible(path: Path) -> CheckRow:
-    return next(row for row in check_fmu(path).rows if row.name == "reproducible")
+    return next(row for row in psa.check_fmu(path).rows if row.name == "reproducible")
 
 
 @pytest.mark.usefixtures("code_runs_here")
@@ -196,15 +191,17 @@ def test_a_change_of_it_is_found(change: str, older: Path, tmp_path: Path) -> No
     assert said in row.remark
 
 
-flexure = compose([COMPONENTS["flexure"]], name="flexure")
-every_effect = compose((*BASE, *EFFECTS.values()), name="every_effect")
+flexure = psa.compose([psa.COMPONENTS["flexure"]], name="flexure")
+every_effect = psa.compose((*psa.BASE, *psa.EFFECTS.values()), name="every_effect")
 
 
 # Terminals
 
 
-@pytest.mark.parametrize("model", [stack_model(STACK), compose(SIMPLIFIED), flexure, every_effect])
-def test_terminals_are_valid_and_their_variables_exist(model: Model) -> None:
+@pytest.mark.parametrize(
+    "model", [psa.stack_model(STACK), psa.compose(psa.SIMPLIFIED), flexure, every_effect]
+)
+def test_terminals_are_valid_and_their_variables_exist(model: psa.Model) -> None:
     text = terminals_and_icons(model)
     assert_valid(text, "schema", "fmi3", "fmi3TerminalsAndIcons.xsd")
     known = {*model.input_names, *model.output_names}
@@ -219,7 +216,7 @@ def test_terminals_are_valid_and_their_variables_exist(model: Model) -> None:
 
 def test_a_stack_and_a_flexure_connect() -> None:
     """Equal names of members, an input on one side for each output on the other; forces opposed."""
-    stack = stack_model(STACK)
+    stack = psa.stack_model(STACK)
     near = next(t for t in terminals_of(stack) if t.name == "mechanical")
     (far,) = terminals_of(flexure)
     ours, theirs = ({m: (v, k) for v, m, k in t.members} for t in (near, far))
@@ -253,8 +250,8 @@ def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
 # Documentation
 
 
-@pytest.mark.parametrize("model", [stack_model(STACK), flexure, every_effect])
-def test_documentation_is_complete(model: Model) -> None:
+@pytest.mark.parametrize("model", [psa.stack_model(STACK), flexure, every_effect])
+def test_documentation_is_complete(model: psa.Model) -> None:
     page = documentation(model)
     said = html.unescape(re.sub(r"<[^>]*>", "\n", page))
     for component in model.components:
@@ -289,17 +286,17 @@ def test_documentation_escapes_what_users_write() -> None:
 
 def test_kinds_of_dependence() -> None:
     """q' = -a q + 2 v + q w: 2 is constant, -a + w depends on w, d/da = -q depends on q."""
-    part = Component(
+    part = psa.Component(
         "part", "part", "part",
-        lambda s: Equations(
+        lambda s: psa.Equations(
             der={"q": -s.a * s.q + 2.0 * s.v + s.q * s.w}, out={"y": s.a * s.v, "z": 3.0 * s.q}
         ),
-        parameters=(Parameter("a", 1.0, "1", (0.0, 2.0), "rate"),),
-        states=(State("q", "m", "position", 1.0),),
-        inputs=(Input("v", "V", "voltage"), Input("w", "1", "share")),
-        outputs=(Output("y", "V", "scaled"), Output("z", "m", "shown")),
+        parameters=(psa.Parameter("a", 1.0, "1", (0.0, 2.0), "rate"),),
+        states=(psa.State("q", "m", "position", 1.0),),
+        inputs=(psa.Input("v", "V", "voltage"), psa.Input("w", "1", "share")),
+        outputs=(psa.Output("y", "V", "scaled"), psa.Output("z", "m", "shown")),
     )  # fmt: skip
-    found = dependencies(compose([part]).structure)
+    found = dependencies(psa.compose([part]).structure)
     state, v, w, a = ("state", 0), ("input", 0), ("input", 1), ("parameter", 0)
     rate = {state: "dependent", v: "constant", w: "dependent", a: "dependent"}
     assert found["derivative", 0] == rate

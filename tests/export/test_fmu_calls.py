@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 from fmpy.fmi3 import FMU3ScheduledExecution
 
-from psa_casadi.components import BASE
+import psa_casadi as psa
 from psa_casadi.export.check.calls import parameter_changes
 from psa_casadi.export.check.structure import directional_error, incomplete_dependencies
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
@@ -30,7 +29,6 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
-from psa_casadi.model.compose import compose
 from tests.export.fmi3_instances import Instance3, Update, loaded, try_step
 from tests.export.fmu_models import exported, model_named, recompiled
 from tests.tiers import slow, slow_but
@@ -529,8 +527,8 @@ def test_a_parameter_out_of_its_bounds_is_refused(fmi: int, interface: int) -> N
 def test_the_check_keeps_the_bounds(tmp_path: Path) -> None:
     """A model whose parameters stand at their bounds passes, whatever the check moves."""
     edges = {"n": 4.0, "G": 1e4, "u_rated": 1e-3, "tau": 1.0}
-    model = compose(BASE, {**model_named(STACK).values, **edges})
-    with Fmu(export_fmu(model, tmp_path / "edges.fmu", fmi=3)) as fmu:
+    model = psa.compose(psa.BASE, {**model_named(STACK).values, **edges})
+    with Fmu(psa.export_fmu(model, tmp_path / "edges.fmu", fmi=3)) as fmu:
         assert [fmu.bounds[n] for n in ("n", "m_B")] == [(1.0, 4.0), (1e-9, 1e3)]
         assert not [*parameter_changes(fmu), *incomplete_dependencies(fmu)]
         assert directional_error(fmu) < 1e-4

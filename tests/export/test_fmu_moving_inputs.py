@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
+import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.export.fmu.reference_run import SHARE, STEPS_PER_PERIOD, reference_inputs
 from psa_casadi.export.importer.fmu import (
@@ -25,8 +26,6 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from tests.export.fmi3_instances import Instance3
 from tests.export.fmu_models import entries, exported, model_named
@@ -56,7 +55,7 @@ def errors(
     jumps = t[1:][np.diff(t) == 0.0]
     t[:-1][np.diff(t) == 0.0] -= 1e-12
     grid = np.unique(np.concatenate([found["time"], t, jumps]))
-    true = simulate(model.plant(), grid, np.interp(grid, t, volts), rtol=1e-9, as_exported=True)
+    true = psa.simulate(model.plant(), grid, np.interp(grid, t, volts), rtol=1e-9, as_exported=True)
     at = np.searchsorted(grid, found["time"])
     return {
         n: float(np.max(np.abs(found[n] - true.outputs[n][at])) / np.ptp(true.outputs[n]))
@@ -165,10 +164,10 @@ def test_a_sine_over_the_whole_range_needs_the_steps_that_the_page_names(
     voltage = 0.5 * rated * (1.0 - np.cos(2 * np.pi * frequency * grid))
     u = np.column_stack([voltage, np.zeros_like(voltage)])
     at_rest, column = np.zeros(len(model.state_names)), model.output_names.index("displacement")
-    truth = run(model, grid, u, at_rest, rtol=1e-8).y[:, column]
+    truth = psa.run(model, grid, u, at_rest, rtol=1e-8).y[:, column]
     for every, limits in ((1, (0.25, 1.0)), (2, (1.0, 2.5))):
         rows = slice(None, None, every)
-        found = run(model, grid[rows], u[rows], at_rest, rtol=1e-8, hold="zero").y[:, column]
+        found = psa.run(model, grid[rows], u[rows], at_rest, rtol=1e-8, hold="zero").y[:, column]
         error = np.abs(found - truth[rows]).max() / np.ptp(truth)
         assert limits[0] * SHARE < error <= limits[1] * SHARE, (every, error)
 

@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from psa_casadi.components import BASE, COMPONENTS
-from psa_casadi.effects import EFFECTS
+import psa_casadi as psa
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.common.parameter_sets import parameter_set
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.reference_run import (
     EXPERIMENTS,
     FOLDER,
@@ -25,8 +23,6 @@ from psa_casadi.export.fmu.reference_run import (
     reference_entries,
 )
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.simulation.stepper import SimulationError
 from tests.export.fmu_models import assert_valid, entries, model_named
 from tests.tiers import slow_but
@@ -34,8 +30,8 @@ from tests.tiers import slow_but
 STACK = "P-885.51"
 Table = Mapping[str, npt.NDArray[np.float64]]
 
-flexure = compose([COMPONENTS["flexure"]], name="flexure")
-every_effect = compose((*BASE, *EFFECTS.values()), name="every_effect")
+flexure = psa.compose([psa.COMPONENTS["flexure"]], name="flexure")
+every_effect = psa.compose((*psa.BASE, *psa.EFFECTS.values()), name="every_effect")
 
 
 def table(content: bytes) -> Table:
@@ -47,8 +43,8 @@ def table(content: bytes) -> Table:
 # Parameter sets
 
 
-@pytest.mark.parametrize("model", [stack_model(STACK), flexure, every_effect])
-def test_parameter_sets_hold_every_value_exactly(model: Model) -> None:
+@pytest.mark.parametrize("model", [psa.stack_model(STACK), flexure, every_effect])
+def test_parameter_sets_hold_every_value_exactly(model: psa.Model) -> None:
     text = parameter_set(model)
     assert_valid(text, "ssp", "schema", "SystemStructureParameterValues.xsd")
     root = ET.fromstring(text)
@@ -127,7 +123,7 @@ def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
         raise SimulationError("no")
 
     monkeypatch.setattr("psa_casadi.export.fmu.reference_run.run", fails)
-    with zipfile.ZipFile(export_fmu(flexure, tmp_path / "m.fmu", fmi=3)) as archive:
+    with zipfile.ZipFile(psa.export_fmu(flexure, tmp_path / "m.fmu", fmi=3)) as archive:
         names = set(archive.namelist())
         page = archive.read("documentation/index.html").decode()
     assert not any(n.startswith("extra/") for n in names)

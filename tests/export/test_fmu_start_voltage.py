@@ -6,13 +6,10 @@ from ctypes import c_bool
 import numpy as np
 import pytest
 
-from psa_casadi.effects import EFFECTS
+import psa_casadi as psa
 from psa_casadi.export.common.variable_table import START_VOLTAGE
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
 from psa_casadi.files import temporary_folder
-from psa_casadi.model.compose import Model
-from psa_casadi.simulation.simulate import settled_at
 from psa_casadi.simulation.start import start_state
 from tests.export.fmu_models import exported, model_named
 from tests.tiers import slow
@@ -21,9 +18,9 @@ STACK = "P-885.51"
 BOTH = pytest.mark.parametrize("fmi", [2, 3])
 
 
-def settled(model: Model, voltage: float) -> dict[str, float]:
+def settled(model: psa.Model, voltage: float) -> dict[str, float]:
     """Return the states of a model that is settled at a voltage."""
-    return {q.name: q.start for q in settled_at(model, voltage).structure.states}
+    return {q.name: q.start for q in psa.settled_at(model, voltage).structure.states}
 
 
 def apart(fmu: Fmu, instance: Instance, expected: dict[str, float]) -> float:
@@ -119,10 +116,10 @@ def test_within_the_initialization_it_counts_at_once_and_can_be_taken_back() -> 
 
 def test_the_exported_start_is_that_of_the_exported_value() -> None:
     """With its history, to the last bit; another value begins without that history."""
-    held = settled_at(model_named(STACK), 60.0, [120.0, 0.0]).plant()
+    held = psa.settled_at(model_named(STACK), 60.0, [120.0, 0.0]).plant()
     starts = {q.name: q.start for q in held.structure.states} | {"voltage": 60.0}
     with temporary_folder() as folder:
-        fmu = Fmu(export_fmu(held, folder / "held.fmu"))
+        fmu = Fmu(psa.export_fmu(held, folder / "held.fmu"))
     with fmu:
         for values in ({}, {START_VOLTAGE: 60.0}):
             with fmu.start(CO_SIMULATION, values=values) as slave:
@@ -145,10 +142,10 @@ def test_a_voltage_without_a_settled_state_is_an_error_soon(voltage: float) -> N
 def test_memories_that_relax_and_bent_effects_settle_as_in_the_model() -> None:
     model = model_named(STACK).plant()
     for effect in ("slow_creep", "charge_leakage", "saturation_of_strain"):
-        model = model.with_effect(EFFECTS[effect])
+        model = model.with_effect(psa.EFFECTS[effect])
     model = model.with_values({"creep_gain": 0.1, "leak_gain": 0.1, "saturation_gain": 0.1})
     with temporary_folder() as folder:
-        fmu = Fmu(export_fmu(model, folder / "bent.fmu"))
+        fmu = Fmu(psa.export_fmu(model, folder / "bent.fmu"))
     with fmu:
         for voltage in (60.0, 100.0):
             with fmu.start(CO_SIMULATION, values={START_VOLTAGE: voltage}) as slave:

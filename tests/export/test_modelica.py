@@ -11,17 +11,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.component import Component, Equations
-from psa_casadi.components import BASE, COMPONENTS
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.export.modelica.package import export_modelica, modelica_text, reciprocal
-from psa_casadi.model.compose import compose
-from psa_casadi.model.ode_model import ode_model
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Input, Output, Parameter, State
+from psa_casadi.export.modelica.package import modelica_text, reciprocal
 from tests.export.modelica_runs import (
     SPANS,
     load,
@@ -57,7 +49,7 @@ def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
 
 
 def test_every_balance_and_state_has_one_equation_and_is_declared_once() -> None:
-    model = compose((*BASE, *EFFECTS.values()))
+    model = psa.compose((*psa.BASE, *psa.EFFECTS.values()))
     text = modelica_text(model, include_sensor=True)
     signal = re.sub(r"//[^\n]*", "", text.split("  model Signal")[1].split("annotation(")[0])
     declared, equations = signal.split("\n  equation\n")
@@ -71,24 +63,24 @@ def test_every_balance_and_state_has_one_equation_and_is_declared_once() -> None
         assert f'parameter Real {parameter.name}(unit="{parameter.unit}"' in declared
 
 
-def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> Component:
-    return Component(
+def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> psa.Component:
+    return psa.Component(
         "decay",
         'a "decay" \\ of <z>',
         "none",
-        lambda s: Equations(
+        lambda s: psa.Equations(
             der={state: -getattr(s, parameter) * getattr(s, state) + s.pull},
             out={output: 2 * getattr(s, state)},
         ),
-        parameters=(Parameter(parameter, 2.0, "1/s", (0.0, float("inf")), "rate"),),
-        states=(State(state, "counts", "z", 1.0, start=1.0),),
-        inputs=(Input("pull", "counts/s", "pull", start=0.5),),
-        outputs=(Output(output, "counts", "twice z"),),
+        parameters=(psa.Parameter(parameter, 2.0, "1/s", (0.0, float("inf")), "rate"),),
+        states=(psa.State(state, "counts", "z", 1.0, start=1.0),),
+        inputs=(psa.Input("pull", "counts/s", "pull", start=0.5),),
+        outputs=(psa.Output(output, "counts", "twice z"),),
     )
 
 
 def test_names_that_modelica_has_taken_are_changed_and_texts_escaped() -> None:
-    text = modelica_text(compose([_decay("model", "output", "der")], name="decay"))
+    text = modelica_text(psa.compose([_decay("model", "output", "der")], name="decay"))
     assert 'parameter Real model_2(unit="1/s", min=0.0) = 2.0 "rate";' in text
     assert "der(der_2) = pull - model_2*der_2;" in text
     assert "output_2 = 2*der_2;" in text
@@ -104,27 +96,31 @@ def test_names_that_modelica_has_taken_are_changed_and_texts_escaped() -> None:
 
 @pytest.mark.parametrize("name", ["2stack", "model", "Piezo-Stack", ""])
 def test_a_name_that_no_package_can_have_is_refused(name: str) -> None:
-    with pytest.raises(InputError, match="cannot name a Modelica package"):
-        modelica_text(stack_model("P-885.51"), name=name)
+    with pytest.raises(psa.InputError, match="cannot name a Modelica package"):
+        modelica_text(psa.stack_model("P-885.51"), name=name)
 
 
 def test_names_that_clash_are_refused() -> None:
-    with pytest.raises(InputError, match="named 'z', which Modelica does not allow"):
-        modelica_text(compose([_decay(output="z")]))
-    with pytest.raises(InputError, match="output 'tip_force' of 'psa' differs from the balance"):
-        modelica_text(compose([*BASE, _decay(output="tip_force")]))
+    with pytest.raises(psa.InputError, match="named 'z', which Modelica does not allow"):
+        modelica_text(psa.compose([_decay(output="z")]))
+    with pytest.raises(
+        psa.InputError, match="output 'tip_force' of 'psa' differs from the balance"
+    ):
+        modelica_text(psa.compose([*psa.BASE, _decay(output="tip_force")]))
 
 
 def test_a_start_that_is_not_finite_is_refused(tmp_path: Path) -> None:
-    endless = Component(
+    endless = psa.Component(
         "endless",
         "no start",
         "none",
-        lambda s: Equations(der={"z": -s.z}),
-        states=(State("z", "1", "z", 1.0, start=float("inf")),),
+        lambda s: psa.Equations(der={"z": -s.z}),
+        states=(psa.State("z", "1", "z", 1.0, start=float("inf")),),
     )
-    with pytest.raises(InputError, match="start of state 'z' is inf, which Modelica cannot write"):
-        export_modelica(compose([endless]), tmp_path / "x.mo")
+    with pytest.raises(
+        psa.InputError, match="start of state 'z' is inf, which Modelica cannot write"
+    ):
+        psa.export_modelica(psa.compose([endless]), tmp_path / "x.mo")
     assert not list(tmp_path.iterdir())
 
 
@@ -132,8 +128,8 @@ def test_a_start_that_is_not_finite_is_refused(tmp_path: Path) -> None:
 def test_the_text_says_whether_the_states_rest_at_the_start(start: float, rests: bool) -> None:
     """x' = x (2 - x) rests at 0 and at 2."""
     x = ca.SX.sym("x")
-    states = [State("x", "1", "a population", 1.0, start=start)]
-    model = ode_model({"x": x, "ode": x * (2.0 - x)}, name="logistic", states=states)
+    states = [psa.State("x", "1", "a population", 1.0, start=start)]
+    model = psa.ode_model({"x": x, "ode": x * (2.0 - x)}, name="logistic", states=states)
     text = modelica_text(model)
     assert ("states start at rest." in text) == rests
     assert ("states start at their start values" in text) != rests
@@ -193,7 +189,7 @@ def _by_hand(p: dict[str, float], text: str, t: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("name", slow_but(["P-885.51"], ["P-885.51", "WYDS0808020"]))
 def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
-    model = stack_model(name)
+    model = psa.stack_model(name)
     text = modelica_text(model)
     span = float(text.split("model Wired")[1].split("StopTime=")[1].split(",")[0])
     got = simulated(STUB + text, _WIRED, span, rtol=1e-10)
@@ -207,7 +203,9 @@ def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    slow_but(["P-885.51", "slow_creep", "every_effect"], [*STACKS, *EFFECTS, "every_effect"]),
+    slow_but(
+        ["P-885.51", "slow_creep", "every_effect"], [*psa.STACKS, *psa.EFFECTS, "every_effect"]
+    ),
 )
 def test_every_wired_example_is_a_balanced_system(name: str) -> None:
     model = load(STUB + text_of(name), _WIRED)
@@ -228,7 +226,7 @@ def test_the_reaction_is_there_whatever_the_gain_of_the_model() -> None:
 
 def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
     """The stage between a spring to the ground and a position that is given."""
-    text = modelica_text(compose([COMPONENTS["flexure"]], name="flexure"), name="Stage")
+    text = modelica_text(psa.compose([psa.COMPONENTS["flexure"]], name="flexure"), name="Stage")
     bench = """
     model Mover
       Modelica.Mechanics.Translational.Interfaces.Flange_b flange_b;
@@ -254,7 +252,7 @@ def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
 
 def test_scaled_forces_give_the_free_stroke_of_the_cascade() -> None:
     """What the documentation of `Acausal` says about its stroke."""
-    model = stack_model("P-885.51")
+    model = psa.stack_model("P-885.51")
     p = model.values
     scale = (p["k_P"] + p["k_B"]) / p["k_B"]
     assert f"{1 / scale:.4g} times that of the cascade" in modelica_text(model)
@@ -263,17 +261,17 @@ def test_scaled_forces_give_the_free_stroke_of_the_cascade() -> None:
     t = np.linspace(0.0, 1.0, 101)
     u = np.column_stack([60.0 * np.minimum(2 * t, 1.0), np.zeros(101)])
     ends = [
-        run(m, t, u, np.zeros(len(m.state_names)), rtol=1e-9).x[-1, m.state_names.index("x")]
+        psa.run(m, t, u, np.zeros(len(m.state_names)), rtol=1e-9).x[-1, m.state_names.index("x")]
         for m in (model, scaled, reciprocal(model))
     ]
     assert ends[1] == pytest.approx(ends[0], rel=1e-6)
     assert ends[2] == pytest.approx(ends[0] / scale, rel=1e-6)
 
 
-NAMES = [*STACKS, *EFFECTS, "every_effect"]
+NAMES = [*psa.STACKS, *psa.EFFECTS, "every_effect"]
 
 
-@pytest.mark.parametrize("name", slow_but([*list(STACKS)[:1], *EFFECTS], NAMES))
+@pytest.mark.parametrize("name", slow_but([*list(psa.STACKS)[:1], *psa.EFFECTS], NAMES))
 def test_right_hand_sides_read_back_are_the_models(name: str) -> None:
     assert right_side_error(model_named(name), text_of(name)) < 1e-12
 

@@ -9,16 +9,13 @@ import pytest
 from hypothesis import assume, given, reject, settings
 from hypothesis import strategies as st
 
-from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.errors import InputError
+import psa_casadi as psa
 from psa_casadi.export.modelica.expression import Graph, Printer
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.compose import compose
-from psa_casadi.variables import State
 from tests.export.modelica_runs import pure_ode, read_back
 from tests.tiers import slow
 
-Build = Callable[[Symbols], Any]
+Build = Callable[[psa.Symbols], Any]
 
 _UNARY = (
     ca.sqrt, ca.exp, ca.log, ca.sin, ca.cos, ca.tan, ca.atan, ca.sinh, ca.cosh, ca.tanh, ca.fabs,
@@ -70,14 +67,14 @@ _EXPRESSIONS = st.recursive(
 
 def _model(first: Build, second: Build) -> Any:
     """Three states whose rates hold the expressions, one of them twice."""
-    states = tuple(State(n, "1", n, 1.0) for n in _NAMES)
-    return compose(
+    states = tuple(psa.State(n, "1", n, 1.0) for n in _NAMES)
+    return psa.compose(
         [
-            Component(
+            psa.Component(
                 "random",
                 "random rates",
                 "none",
-                lambda s: Equations(
+                lambda s: psa.Equations(
                     der={
                         "alpha": first(s),
                         "beta": second(s) + s.alpha,
@@ -102,7 +99,7 @@ def test_expressions_survive_being_written_and_read(first: Build, second: Build,
     model = _model(first, second)
     try:
         text = modelica_text(model)
-    except InputError as error:
+    except psa.InputError as error:
         if "cannot write" not in str(error):  # a constant such as log(-2) is folded to nan
             raise
         reject()
@@ -136,14 +133,14 @@ def test_functions_that_modelica_says_in_other_words(function: Any) -> None:
 )  # fmt: skip
 def test_a_function_that_modelica_lacks_is_refused_by_its_name(function: Any, name: str) -> None:
     model = _model(lambda s: function(s.alpha), lambda s: s.beta)
-    with pytest.raises(InputError, match=f"uses '{name}'"):
+    with pytest.raises(psa.InputError, match=f"uses '{name}'"):
         modelica_text(model)
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
 def test_a_constant_that_is_not_finite_is_refused(value: float) -> None:
     model = _model(lambda s: s.alpha * value, lambda s: s.beta)
-    with pytest.raises(InputError, match=r"constant (-?inf|nan), which Modelica cannot write"):
+    with pytest.raises(psa.InputError, match=r"constant (-?inf|nan), which Modelica cannot write"):
         modelica_text(model)
 
 
@@ -171,7 +168,7 @@ def test_texts(build: Any, text: str) -> None:
 
 
 def test_what_is_used_twice_does_not_make_the_text_grow_exponentially() -> None:
-    def deep(s: Symbols) -> Any:
+    def deep(s: psa.Symbols) -> Any:
         value = s.alpha
         for _ in range(60):
             value = ca.sin(value) * ca.cos(value) + 0.1 * value

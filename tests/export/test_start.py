@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import wrong_start_values
 from psa_casadi.export.check.structure import wrong_start
@@ -18,12 +17,8 @@ from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.masters import Signals, co_simulate
-from psa_casadi.model.model_file import dumps, loads, save_model
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.records import read_record, write_record
-from psa_casadi.simulation.simulate import memory_after, settled_at, simulate
+from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.simulation.start import initial_slope, start_state
-from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.model.stack_models import jacobian, sine, stack
@@ -31,14 +26,14 @@ from tests.tiers import slow
 
 
 @pytest.mark.parametrize(
-    "effects", [(), pytest.param(tuple(EFFECTS), marks=slow)], ids=["base", "all"]
+    "effects", [(), pytest.param(tuple(psa.EFFECTS), marks=slow)], ids=["base", "all"]
 )
-@pytest.mark.parametrize("name", sorted(STACKS))
+@pytest.mark.parametrize("name", sorted(psa.STACKS))
 def test_rest_is_rest(name: str, effects: tuple[str, ...]) -> None:
     model = stack(name)
     gains = {"creep_gain": 0.05, "mode_gain": 0.1, "memory_gain": 0.1, "sensor_delay": 1e-3}
     for effect in effects:
-        model = model.with_effect(EFFECTS[effect])
+        model = model.with_effect(psa.EFFECTS[effect])
     model = model.with_values({k: v for k, v in gains.items() if k in model.values})
     memory = {"f_H": 0.3 * model.values["h_ref"]}
     inputs = [{"voltage": 80.0, "load_force": 50.0}.get(n, 293.15) for n in model.input_names]
@@ -49,7 +44,7 @@ def test_rest_is_rest(name: str, effects: tuple[str, ...]) -> None:
     assert start.x[model.state_names.index("f_H")] == memory["f_H"]
     fastest = np.abs(np.linalg.eigvals(jacobian(stack(name)))).max()
     assert np.all(np.abs(rate.ravel()) < 1e-9 * fastest * size)
-    held = simulate(model, [0.0, 0.1, 2.0], [80.0] * 3, load_force=[50.0] * 3, memory=memory)
+    held = psa.simulate(model, [0.0, 0.1, 2.0], [80.0] * 3, load_force=[50.0] * 3, memory=memory)
     assert np.ptp(held.displacement) < 1e-9 * held.displacement[0]
 
 
@@ -58,7 +53,7 @@ def test_a_memory_that_relaxes_in_a_bent_model_leaves_the_others_at_rest() -> No
     gains = {"saturation_gain": 0.1, "leak_gain": 0.1}
     model = stack("P-885.51")
     for effect in ("saturation_of_strain", "charge_leakage"):
-        model = model.with_effect(EFFECTS[effect])
+        model = model.with_effect(psa.EFFECTS[effect])
     model = model.with_values(gains)
     start = start_state(model, [60.0, 0.0], memory={"leak_voltage": 9.0})
     rate = np.array(model.structure.f(0.0, start.x, [60.0, 0.0], model.parameter_vector())[0])
@@ -68,7 +63,7 @@ def test_a_memory_that_relaxes_in_a_bent_model_leaves_the_others_at_rest() -> No
     assert np.max(shares[fast]) < 1e-2
 
 
-@pytest.mark.parametrize("name", sorted(STACKS))
+@pytest.mark.parametrize("name", sorted(psa.STACKS))
 def test_a_record_that_starts_in_motion_starts_without_a_transient(name: str) -> None:
     """The start on a ramp is the state that a long ramp has led to."""
     model = stack(name)
@@ -77,7 +72,7 @@ def test_a_record_that_starts_in_motion_starts_without_a_transient(name: str) ->
     rate = 0.5 * p["u_rated"] / end
     bend = p["tau"] * abs(p["delta"]) / (p["k_L"] + p["A"])  # delta bends the ramp of the force
     t = np.linspace(0.0, end, 41)
-    led = simulate(model, t, rate * t, from_rest_at_zero=True, rtol=1e-10)
+    led = psa.simulate(model, t, rate * t, from_rest_at_zero=True, rtol=1e-10)
     memory = {"f_H": float(led.states["f_H"][-1])}
     moving = start_state(model, [rate * t[-1], 0.0], [rate, 0.0], memory, t[-1]).x
     still = start_state(model, [rate * t[-1], 0.0], None, memory, t[-1]).x
@@ -88,7 +83,7 @@ def test_a_record_that_starts_in_motion_starts_without_a_transient(name: str) ->
 
 
 def test_start_derivatives_are_differences_of_starts() -> None:
-    model = stack("WYDS0808020").with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.05})
+    model = stack("WYDS0808020").with_effect(psa.EFFECTS["slow_creep"], {"creep_gain": 0.05})
     inputs, rates, memory = [60.0, 20.0], [3e3, 0.0], {"f_H": -30.0, "z_c2": 2e-7}
     start = start_state(model, inputs, rates, memory)
     for k, name in enumerate(model.parameter_names):
@@ -117,11 +112,11 @@ def test_sensitivity_to_a_start_is_the_difference_of_runs() -> None:
     u = np.column_stack([sine(t, 700.0), 0.0 * t])
     start: FloatArray = 0.1 * model.state_nominals()
     unknowns = [model.state_names.index(n) for n in ("f_H", "f_out", "x")]
-    exact = run(model, t, u, start, rtol=1e-8, unknowns=unknowns).sensitivity
+    exact = psa.run(model, t, u, start, rtol=1e-8, unknowns=unknowns).sensitivity
     assert exact is not None
     for column, k in enumerate(unknowns):
         step: FloatArray = 1e-3 * np.eye(len(start))[k] * model.state_nominals()
-        ends = [run(model, t, u, start + sign * step, rtol=1e-8).y[:, -1] for sign in (1, -1)]
+        ends = [psa.run(model, t, u, start + sign * step, rtol=1e-8).y[:, -1] for sign in (1, -1)]
         found = (ends[0] - ends[1]) / (2 * step[k])
         size = np.abs(exact[:, column]).max()
         np.testing.assert_allclose(found, exact[:, column], rtol=0, atol=1e-4 * size)
@@ -135,41 +130,41 @@ def test_initial_slope_sees_motion_and_no_step() -> None:
     assert initial_slope(t, np.array([1.0, 1.1, 1.0, 1.1, 1.0])) == 0.0
 
 
-STACK = stack_model("P-885.51")
+STACK = psa.stack_model("P-885.51")
 
 
 def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
-    creeping = STACK.with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02, "creep_time": 0.1})
-    model = creeping.with_effect(EFFECTS["hysteresis_memory"], {"memory_gain": 0.05})
+    creeping = STACK.with_effect(psa.EFFECTS["slow_creep"], {"creep_gain": 0.02, "creep_time": 0.1})
+    model = creeping.with_effect(psa.EFFECTS["hysteresis_memory"], {"memory_gain": 0.05})
     turns, sweep, rest = [0.0, 100.0, 20.0, 80.0, 50.0], 0.7, 2.0
     corners = np.append(sweep * np.arange(len(turns)), sweep * (len(turns) - 1) + rest)
     t = np.linspace(0.0, 1.0, 501)
     voltage = 50.0 + 30.0 * np.sin(2 * np.pi * t)
     before = np.linspace(0.0, corners[-1], 2401)
     played = np.interp(before, corners, [*turns, turns[-1]])
-    whole = simulate(
+    whole = psa.simulate(
         model, np.append(before, corners[-1] + t[1:]), np.append(played, voltage[1:])
     ).displacement[2400:]
-    memory = memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
+    memory = psa.memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
     # the record begins in motion: the fast states start there, as `start_state` has it
-    found = simulate(model, t, voltage, memory=memory).displacement
+    found = psa.simulate(model, t, voltage, memory=memory).displacement
     assert np.abs(found - whole)[50:].max() < 1e-4 * np.ptp(whole)
 
 
 def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> None:
-    settled = settled_at(STACK, 60.0, [120.0])
+    settled = psa.settled_at(STACK, 60.0, [120.0])
     assert settled.own_starts()["voltage"] == 60.0
-    extended = settled.with_effect(EFFECTS["sensor_lag"], {"sensor_lag_time": 1e-4})
+    extended = settled.with_effect(psa.EFFECTS["sensor_lag"], {"sensor_lag_time": 1e-4})
     assert loads(dumps(extended)).own_starts() == extended.own_starts()
     assert extended.plant().own_starts() == settled.own_starts()
     assert STACK.own_starts() == settled.with_declared_starts().own_starts() == {}
     assert "starts" not in dumps(STACK)
-    with pytest.raises(InputError, match="no state or input 'q'"):
+    with pytest.raises(psa.InputError, match="no state or input 'q'"):
         STACK.with_starts({"q": 1.0})
-    with pytest.raises(InputError, match="finite"):
+    with pytest.raises(psa.InputError, match="finite"):
         STACK.with_starts({"u": np.inf})
     broken = dumps(extended).replace('"voltage": 60.0', '"voltage": "high"')
-    with pytest.raises(InputError, match=r"'starts\.voltage' is 'high'; give a number"):
+    with pytest.raises(psa.InputError, match=r"'starts\.voltage' is 'high'; give a number"):
         loads(broken)
 
 
@@ -179,7 +174,7 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, [*command, "--start-voltage", "60", "--history", "120"])
     assert done.exit_code == 0, done.output
     text = path.read_text()
-    starts = settled_at(STACK, 60.0, [120.0]).own_starts()
+    starts = psa.settled_at(STACK, 60.0, [120.0]).own_starts()
     assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
     assert 'input Real voltage(unit="V", start=60.0' in text
     for history, said in (("120", "--start-voltage"), ("high", "--history is 'high'")):
@@ -197,8 +192,8 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     ],
 )
 def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        memory_after(STACK, turns, at=5.0, **options)
+    with pytest.raises(psa.InputError, match=said):
+        psa.memory_after(STACK, turns, at=5.0, **options)
 
 
 OPTIONS = ["--start-voltage", "60", "--history", "120,0"]
@@ -216,9 +211,9 @@ def _run(*words: str) -> str:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sine about 60 V, the stack as a model file, with and without starts, and its FMU."""
     made = tmp_path_factory.mktemp("starts")
-    write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
-    save_model(STACK, made / "plain.json")
-    save_model(settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
+    psa.write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
+    psa.save_model(STACK, made / "plain.json")
+    psa.save_model(psa.settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
     said = _run(
         "export", "fmu", "--model", str(made / "plain.json"), "-o", str(made / "m.fmu"), *OPTIONS
     )
@@ -230,7 +225,7 @@ def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str
     out = folder / "out.csv"
     files = ["--model", str(folder / model), "--input", str(folder / "v.csv"), "-o", str(out)]
     said = _run("simulate", *files, *options)
-    found = read_record(out).displacement
+    found = psa.read_record(out).displacement
     assert found is not None
     return found, next(line for line in said.splitlines() if line.startswith("start: "))
 
@@ -260,16 +255,16 @@ def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
 
 
 def test_a_history_is_played_from_relaxed_whatever_start_the_model_has() -> None:
-    held = settled_at(STACK, 60.0, [120.0])
-    assert memory_after(held, [100.0], at=30.0) == memory_after(STACK, [100.0], at=30.0)
+    held = psa.settled_at(STACK, 60.0, [120.0])
+    assert psa.memory_after(held, [100.0], at=30.0) == psa.memory_after(STACK, [100.0], at=30.0)
     t, v = TIME[:3], np.full(3, 60.0)
-    one, other = (simulate(m, t, v, as_exported=False).displacement for m in (held, STACK))
+    one, other = (psa.simulate(m, t, v, as_exported=False).displacement for m in (held, STACK))
     assert np.array_equal(one, other)
-    assert abs(simulate(held, t, v).displacement[0] - other[0]) > 1e-7
+    assert abs(psa.simulate(held, t, v).displacement[0] - other[0]) > 1e-7
 
 
 def test_the_check_has_a_row_for_the_start(folder: Path) -> None:
-    plain, settled = STACK.plant(), settled_at(STACK, 60.0, [120.0, 0.0]).plant()
+    plain, settled = STACK.plant(), psa.settled_at(STACK, 60.0, [120.0, 0.0]).plant()
     with Fmu(folder / "m.fmu") as fmu:
         assert list(wrong_start(fmu, truth_of(settled, 2))) == []
         found = list(wrong_start(fmu, truth_of(plain, 2)))
@@ -287,11 +282,11 @@ def test_the_page_states_the_start() -> None:
     page = html.unescape(documentation(STACK))
     assert "It starts relaxed at 0 V" in page
     assert "keep their start values it stays there" in page
-    settled = settled_at(STACK, 60.0, [120.0])
+    settled = psa.settled_at(STACK, 60.0, [120.0])
     page = html.unescape(documentation(settled))
     assert "It starts at 60 V with the start values of the tables" in page
     assert "it stays there" in page
-    at_start = simulate(settled, TIME[:2], [60.0, 60.0]).displacement[0]
+    at_start = psa.simulate(settled, TIME[:2], [60.0, 60.0]).displacement[0]
     assert f"{1e6 * at_start:.6g} um" in page
     moving = settled.with_starts({"voltage": 0.0})
     assert "it moves from there" in html.unescape(documentation(moving))

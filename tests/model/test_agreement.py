@@ -8,12 +8,9 @@ from math import cos, exp, pi, sin
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.model.compose import compose
-from psa_casadi.model.stacks import STACKS
 from psa_casadi.reference import Mechanics
-from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow_but
 
 #: Samples of the stepper's input, linear in between; a sine's error between them is 5e-9 of it.
@@ -66,7 +63,7 @@ DRIVES = (
 
 def stack_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
     """Return a named stack's values; for the single mass, both masses on springs in series."""
-    p = {name: figure.value for name, figure in STACKS[stack].values.items()}
+    p = {name: figure.value for name, figure in psa.STACKS[stack].values.items()}
     if mechanics == "single_mass":
         k = 1 / (1 / p["k_P"] + 1 / p["k_B"])
         p |= {"m": p["m_P"] + p["m_B"], "k": k, "c": p["c_B"]}
@@ -76,12 +73,12 @@ def stack_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
 
 
 #: Every stack with one voltage of its own, and every voltage.
-ONCE = [(s, "cascade", d) for s, d in zip(sorted(STACKS), DRIVES, strict=True)]
+ONCE = [(s, "cascade", d) for s, d in zip(sorted(psa.STACKS), DRIVES, strict=True)]
 ONCE += [("P-885.51", "single_mass", DRIVES[0])]
 #: Any two of stack, mechanics and voltage.
 IN_TURN = [
     (stack, ("cascade", "single_mass")[(k + j) % 2], drive)
-    for (k, stack), (j, drive) in product(enumerate(sorted(STACKS)), enumerate(DRIVES))
+    for (k, stack), (j, drive) in product(enumerate(sorted(psa.STACKS)), enumerate(DRIVES))
 ]
 AGREEMENTS = [*ONCE, *(case for case in IN_TURN if case not in ONCE)]
 
@@ -95,7 +92,7 @@ def test_displacement_agrees_with_the_reference(
     stack: str, mechanics: Mechanics, drive: Drive
 ) -> None:
     p = stack_values(stack, mechanics)
-    model = compose(BASE if mechanics == "cascade" else SIMPLIFIED, p)
+    model = psa.compose(psa.BASE if mechanics == "cascade" else psa.SIMPLIFIED, p)
     size, force = p["u_rated"], FORCE * p["k_L"] * p["u_rated"]
     duration = max(SHORTEST, LAGS * p["tau"])
     t = np.linspace(0.0, duration, SAMPLES)
@@ -107,7 +104,7 @@ def test_displacement_agrees_with_the_reference(
     def load(time: float) -> float:
         return force * sin(7.0 * time / duration) if drive.hold == "linear" else 0.0
 
-    found = simulate(
+    found = psa.simulate(
         model, t, samples, load_force=[load(s) for s in t],
         from_rest_at_zero=True, rtol=1e-8, hold=drive.hold,
     )  # fmt: skip

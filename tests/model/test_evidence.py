@@ -5,19 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psa_casadi.effects import EFFECTS
+import psa_casadi as psa
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.records.split import divided
 from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import Interval
 from tests.model.evidence_models import NOISE, OFFSET, evident_model, noisy_record
 
 
-def evidence_in(model: Model) -> Evidence:
+def evidence_in(model: psa.Model) -> Evidence:
     assert model.evidence is not None
     return model.evidence
 
@@ -56,7 +54,7 @@ def test_a_record_is_played_again_from_what_is_said_of_it() -> None:
     (said,) = evidence_in(model).runs
     x0 = np.array([said.start[n] for n in model.state_names])
     inputs = record_inputs(model, record, record.n)
-    y = run(model, record.time - record.time[0], inputs, x0, rtol=1e-9).y
+    y = psa.run(model, record.time - record.time[0], inputs, x0, rtol=1e-9).y
     found = y[:, model.output_names.index("measured_displacement")] + said.offset_m
     error = np.concatenate([(measured(record) - found)[a:b] for a, b in said.held_out])
     assert np.sqrt(np.mean(error**2)) == pytest.approx(said.held_out_m, rel=1e-4)
@@ -76,14 +74,14 @@ def test_other_values_or_physics_have_no_evidence() -> None:
     same = model.with_values({"k_L": model.values["k_L"]})
     assert same.evidence is model.evidence
     assert model.with_values({"k_L": 1.01 * model.values["k_L"]}).evidence is None
-    assert model.with_effect(EFFECTS["slow_creep"]).evidence is None
+    assert model.with_effect(psa.EFFECTS["slow_creep"]).evidence is None
     assert model.without(["creep_lag"]).evidence is None
     assert model.with_starts({"u": 1.0}).evidence is model.evidence
 
 
 def test_a_plant_keeps_it_with_the_covariance_of_its_own_parameters() -> None:
     model = evident_model()
-    drift = EFFECTS["offset_drift"]
+    drift = psa.EFFECTS["offset_drift"]
     gain = drift.gain or ""
     told = evidence_in(model)
     names = ("k_L", gain)

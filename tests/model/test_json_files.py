@@ -9,18 +9,16 @@ from typing import Any
 
 import pytest
 
-from psa_casadi.errors import InputError
-from psa_casadi.model.compose import Model
+import psa_casadi as psa
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.strict_json import MOST_BYTES, json_text, parse_json, read_json
 from psa_casadi.variables import Interval, Provenance
 from tests.model.evidence_models import evident_model
 from tests.mutations import sentences
 from tests.studies.fuzz.damage import damaged_bytes
 
-MODEL = stack_model("demo")
+MODEL = psa.stack_model("demo")
 
 
 def _short() -> Evidence | None:
@@ -207,7 +205,7 @@ def test_many_mistakes_are_listed_up_to_twenty() -> None:
         assert problems[-1].startswith("... and ")
 
 
-UNWRITABLE: dict[str, Callable[[Model], Model]] = {
+UNWRITABLE: dict[str, Callable[[psa.Model], psa.Model]] = {
     "U+0000": lambda m: replace(m, description="a\0b"),
     "U+D800": lambda m: replace(m, name="\ud800"),
     "U+001B": lambda m: replace(m, provenance=replace(m.provenance, notes=("\x1b[2J",))),
@@ -219,7 +217,7 @@ UNWRITABLE: dict[str, Callable[[Model], Model]] = {
 
 @pytest.mark.parametrize("expected", UNWRITABLE)
 def test_a_model_that_could_not_be_read_again_is_not_saved(expected: str) -> None:
-    with pytest.raises(InputError, match=r"cannot be saved as MODEL\.json") as caught:
+    with pytest.raises(psa.InputError, match=r"cannot be saved as MODEL\.json") as caught:
         dumps(UNWRITABLE[expected](SAVED))
     assert expected in str(caught.value)
 

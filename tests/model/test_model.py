@@ -6,73 +6,69 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.model.compose import compose
+import psa_casadi as psa
 from psa_casadi.model.model_file import loads
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Output, Parameter, State
 from tests.tiers import slow_but
 
-CREEP, DRIFT = EFFECTS["slow_creep"], EFFECTS["offset_drift"]
-SETS = {"base": BASE, "simplified": SIMPLIFIED, "all": (*BASE, *EFFECTS.values())}
+CREEP, DRIFT = psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]
+SETS = {"base": psa.BASE, "simplified": psa.SIMPLIFIED, "all": (*psa.BASE, *psa.EFFECTS.values())}
 
 
-def component(equations: Callable[[Symbols], Equations], **declared: Any) -> Component:
-    return Component("extra", "for a test", "none", equations, **declared)
+def component(equations: Callable[[psa.Symbols], psa.Equations], **declared: Any) -> psa.Component:
+    return psa.Component("extra", "for a test", "none", equations, **declared)
 
 
 def message(build: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(psa.InputError) as caught:
         build()
     return str(caught.value)
 
 
-def gain_of(name: str, value: float = 0.0) -> Parameter:
-    return Parameter(name, value, "1", (0.0, 1.0), "a gain")
+def gain_of(name: str, value: float = 0.0) -> psa.Parameter:
+    return psa.Parameter(name, value, "1", (0.0, 1.0), "a gain")
 
 
 def test_a_loop_of_balances_is_named() -> None:
-    loop = component(lambda s: Equations(add={"drive_voltage": 0.1 * s.stack_current}))
-    text = message(lambda: compose((*BASE, loop)))
+    loop = component(lambda s: psa.Equations(add={"drive_voltage": 0.1 * s.stack_current}))
+    text = message(lambda: psa.compose((*psa.BASE, loop)))
     loop_names = text.split(":")[1].split(";")[0].strip().split(" -> ")
     assert loop_names[0] == loop_names[-1]
     assert set(loop_names) == {"drive_voltage", "drive_current", "stack_current"}
-    own = component(lambda s: Equations(add={"tip_force": 2 * s.tip_force}))
-    assert "tip_force -> tip_force;" in message(lambda: compose((*BASE, own)))
+    own = component(lambda s: psa.Equations(add={"tip_force": 2 * s.tip_force}))
+    assert "tip_force -> tip_force;" in message(lambda: psa.compose((*psa.BASE, own)))
 
 
 def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
-    state = State("z", "m", "a state", 1.0)
+    state = psa.State("z", "m", "a state", 1.0)
     bare = component(
-        lambda _: Equations(), states=(state,), outputs=(Output("w", "m", "an output"),)
+        lambda _: psa.Equations(), states=(state,), outputs=(psa.Output("w", "m", "an output"),)
     )
-    text = message(lambda: compose((*BASE, bare)))
+    text = message(lambda: psa.compose((*psa.BASE, bare)))
     assert "lacks the derivative of the state 'z'" in text
     assert "lacks the equation of the output 'w'" in text
-    foreign = component(lambda s: Equations(der={"x": s.v_x}, out={"displacement": s.x}))
-    text = message(lambda: compose((*BASE, foreign)))
+    foreign = component(lambda s: psa.Equations(der={"x": s.v_x}, out={"displacement": s.x}))
+    text = message(lambda: psa.compose((*psa.BASE, foreign)))
     assert "derivative of the state 'x', which it does not declare" in text
     assert "equation of the output 'displacement', which it does not declare" in text
-    nowhere = component(lambda s: Equations(add={"weight": s.x}))
-    assert "adds to 'weight', which is no balance" in message(lambda: compose((*BASE, nowhere)))
+    nowhere = component(lambda s: psa.Equations(add={"weight": s.x}))
+    assert "adds to 'weight', which is no balance" in message(
+        lambda: psa.compose((*psa.BASE, nowhere))
+    )
 
 
 @pytest.mark.parametrize("name", ["k_L", "x", "voltage"])
 def test_a_name_belongs_to_one_component(name: str) -> None:
-    twice = component(lambda _: Equations(), parameters=(gain_of(name),))
-    assert f"Two components declare '{name}'" in message(lambda: compose((*BASE, twice)))
+    twice = component(lambda _: psa.Equations(), parameters=(gain_of(name),))
+    assert f"Two components declare '{name}'" in message(lambda: psa.compose((*psa.BASE, twice)))
 
 
 def test_every_bad_value_is_named_at_once() -> None:
-    text = message(lambda: compose(BASE, {"k_l": 1.0, "n": 0.5, "m_P": float("nan")}))
+    text = message(lambda: psa.compose(psa.BASE, {"k_l": 1.0, "n": 0.5, "m_P": float("nan")}))
     assert "no parameter 'k_l'" in text
     assert "'n' is 0.5 1, outside its bounds [1, 4]" in text
     assert "'m_P' is nan" in text
-    model = compose(BASE)
+    model = psa.compose(psa.BASE)
     assert "'tau' is -1 s" in message(lambda: model.with_values({"tau": -1.0}))
     assert "no parameter 'creep_gain'" in message(lambda: model.with_values({"creep_gain": 0.1}))
     assert "no parameter 'tua'" in message(lambda: model.parameter("tua"))
@@ -81,7 +77,7 @@ def test_every_bad_value_is_named_at_once() -> None:
 
 
 def test_effects_come_and_go_without_a_trace() -> None:
-    base = compose(BASE, {"k_L": 12.0})
+    base = psa.compose(psa.BASE, {"k_L": 12.0})
     extended = base.with_effect(CREEP, {"creep_gain": 0.02}).with_effect(DRIFT)
     assert [e.name for e in extended.effects] == ["slow_creep", "offset_drift"]
     assert extended.values["k_L"] == 12.0
@@ -96,13 +92,13 @@ def test_effects_come_and_go_without_a_trace() -> None:
 
 @pytest.mark.parametrize("name", slow_but([n for n in SETS if n != "all"], SETS))
 def test_velocity_is_the_rate_of_the_displacement(name: str) -> None:
-    model = compose(SETS[name])
+    model = psa.compose(SETS[name])
     gains = {"creep_gain": 0.05, "mode_gain": 0.2}
     model = model.with_values({k: v for k, v in gains.items() if k in model.values})
     t = np.linspace(0.0, 2e-3, 4001)
     given = {"voltage": 50.0 * (1.0 - np.cos(4e3 * t)), "load_force": 20.0 * np.sin(3e3 * t)}
     u = input_samples(model, len(t), given)
-    y = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-9).y
+    y = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-9).y
     x, v = (y[:, model.output_names.index(n)] for n in ("displacement", "velocity"))
     slope = (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * 5e-7)
     assert np.ptp(x) > 5e-6

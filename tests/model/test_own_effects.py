@@ -8,11 +8,9 @@ from pathlib import Path
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.component import Component
-from psa_casadi.effects import EFFECTS
 from psa_casadi.model import own_effects as place
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.model.own_effects import declaration_hash, known_effects, own_effects
+from psa_casadi.model.own_effects import declaration_hash, known_effects
 
 RIPPLE = """
 import casadi as ca
@@ -44,37 +42,37 @@ SENSOR_RIPPLE = psa.Component(
 
 
 @pytest.fixture
-def ripple(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Component]:
+def ripple(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[psa.Component]:
     """The effect of a module in the current folder."""
     (tmp_path / "gratings.py").write_text(RIPPLE)
     monkeypatch.chdir(tmp_path)
     _forget()
-    yield own_effects("gratings")["encoder_ripple"]
+    yield psa.own_effects("gratings")["encoder_ripple"]
     _forget()
 
 
 def _forget() -> None:
-    own_effects.cache_clear()
+    psa.own_effects.cache_clear()
     place.installed_effects.cache_clear()
     sys.modules.pop("gratings", None)
     sys.modules.pop("rulings", None)
     importlib.invalidate_caches()
 
 
-def extended(ripple: Component) -> psa.Model:
+def extended(ripple: psa.Component) -> psa.Model:
     return psa.stack_model("P-885.51").with_effect(ripple, {"ripple": 5e-8})
 
 
-def test_a_declaration_that_has_changed_is_refused(ripple: Component, tmp_path: Path) -> None:
+def test_a_declaration_that_has_changed_is_refused(ripple: psa.Component, tmp_path: Path) -> None:
     text = dumps(extended(ripple))
     source = tmp_path / "gratings.py"
     source.write_text("# a comment changes nothing\n" + RIPPLE)
     _forget()
-    commented = own_effects("gratings")["encoder_ripple"]
+    commented = psa.own_effects("gratings")["encoder_ripple"]
     assert declaration_hash(commented) == declaration_hash(ripple)
     source.write_text(RIPPLE.replace("ca.sin", "ca.cos"))
     _forget()
-    other = own_effects("gratings")["encoder_ripple"]
+    other = psa.own_effects("gratings")["encoder_ripple"]
     with pytest.raises(psa.InputError, match="declared in another way"):
         loads(text, effects=[other])
 
@@ -114,8 +112,8 @@ def test_installed_packages_announce_theirs_and_no_neighbour_stands_for_one(
         monkeypatch.syspath_prepend(str(neighbours) if first else "")
     before = list(sys.path)
     assert "encoder_ripple" in known_effects()
-    assert len(known_effects()) == len(EFFECTS) + 1
-    assert own_effects("gratings").keys() == {"encoder_ripple"}
+    assert len(known_effects()) == len(psa.EFFECTS) + 1
+    assert psa.own_effects("gratings").keys() == {"encoder_ripple"}
     assert not list(neighbours.glob("*.ran"))
     assert sys.path == before
 
@@ -128,7 +126,7 @@ def test_a_neighbour_stands_for_nothing_that_is_missing(
     with pytest.raises(psa.InputError, match=r"No module named 'gratings'"):
         known_effects()
     assert not list(neighbours.glob("*.ran"))
-    assert "encoder_ripple" in own_effects("gratings")  # it is asked for
+    assert "encoder_ripple" in psa.own_effects("gratings")  # it is asked for
     assert (neighbours / "gratings.ran").is_file()
 
 
@@ -148,5 +146,5 @@ def test_a_module_that_does_not_do_is_told_in_a_sentence(
     monkeypatch.chdir(tmp_path)
     _forget()
     with pytest.raises(psa.InputError, match=message):
-        own_effects("gratings")
+        psa.own_effects("gratings")
     _forget()

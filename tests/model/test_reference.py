@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from psa_casadi.errors import InputError
-from psa_casadi.model.stacks import STACKS
+import psa_casadi as psa
 from psa_casadi.reference import Trajectory, from_samples, simulate
 from psa_casadi.units import FloatArray
 from tests.model.stack_models import PAPER_STACKS
@@ -17,7 +16,7 @@ SINGLE = {"m": 7e-3, "c": 90.0, "k": 9.6e7}
 
 
 def values(name: str = "PTBS200", **changes: float) -> dict[str, float]:
-    return {key: figure.value for key, figure in STACKS[name].values.items()} | changes
+    return {key: figure.value for key, figure in psa.STACKS[name].values.items()} | changes
 
 
 def linear_step(
@@ -58,7 +57,7 @@ def loop_width(trajectory: Trajectory, period: float) -> float:
     return float(down - up)
 
 
-@pytest.mark.parametrize("stack", sorted(STACKS))
+@pytest.mark.parametrize("stack", sorted(psa.STACKS))
 def test_linear_step_response_is_the_matrix_exponential(stack: str) -> None:
     p = values(stack) | LINEAR
     times = np.linspace(0.0, 3e-3, 601)
@@ -147,7 +146,7 @@ def test_the_papers_stacks_have_their_stroke_and_loop(stack: str, share: float) 
 def test_every_mistake_is_named_at_once() -> None:
     p = values(C_p=-1e-6)
     del p["beta"]
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(psa.InputError) as caught:
         simulate(p, lambda _: 0.0, np.array([0.0, 0.0]), initial={"z": 1.0}, rtol=1.0)
     text = str(caught.value)
     for word in ("beta", "C_p is -1e-06", "state 'z'", "do not increase", "rtol = 1"):

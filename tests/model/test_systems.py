@@ -7,22 +7,11 @@ import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
-from psa_casadi.component import Component, Equations
-from psa_casadi.errors import InputError
-from psa_casadi.export.fmu.archive import export_fmu
+import psa_casadi as psa
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.nanopositioner import (
-    controller_for,
-    margins_of,
-    nanopositioner,
     positioner_plant,
 )
-from psa_casadi.model.parts import part_model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.model.system import connect
-from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Input, Output
 from tests.export.modelica_runs import simulated
 from tests.studies.benchmarks.nonlinearity import simulate_positioner
 from tests.tiers import slow
@@ -34,23 +23,23 @@ STACK_AND_STAGE = (
 )
 
 
-def _gain(name: str, unit: str = "V") -> Model:
+def _gain(name: str, unit: str = "V") -> psa.Model:
     """A part whose output follows its input at once."""
-    part = Component(
+    part = psa.Component(
         name=name,
         description="twice the input",
         source="test",
-        equations=lambda s: Equations(out={"out": 2.0 * s.into}),
-        inputs=(Input("into", "V", "input", start=0.25),),
-        outputs=(Output("out", unit, "output"),),
+        equations=lambda s: psa.Equations(out={"out": 2.0 * s.into}),
+        inputs=(psa.Input("into", "V", "input", start=0.25),),
+        outputs=(psa.Output("out", unit, "output"),),
     )
-    return compose([part], name=name)
+    return psa.compose([part], name=name)
 
 
 def test_a_connected_model_has_the_equations_of_its_parts() -> None:
     """Derivatives and outputs of stack and stage at random points, wired by hand."""
-    stack, stage = stack_model("P-885.51").plant(), part_model("flexure_stage")
-    both = connect({"stack": stack, "flexure": stage}, STACK_AND_STAGE, name="both")
+    stack, stage = psa.stack_model("P-885.51").plant(), psa.part_model("flexure_stage")
+    both = psa.connect({"stack": stack, "flexure": stage}, STACK_AND_STAGE, name="both")
     assert both.input_names == ("stack_voltage",)
     draw = np.random.default_rng(2)
     for _ in range(5):
@@ -71,8 +60,8 @@ def test_every_mistake_in_the_wires_is_told_at_once() -> None:
     parts = {"a": _gain("a"), "b": _gain("b"), "c": _gain("c", unit="m")}
     wires = (("a.out", "b.into"), ("b.out", "b.into"), ("c.out", "a.into"), ("a.there", "c.into"),
              ("nowhere.out", "c.into"))  # fmt: skip
-    with pytest.raises(InputError) as caught:
-        connect(parts, wires, name="m", inputs={"x": "b.into", "2y": "c.into"})
+    with pytest.raises(psa.InputError) as caught:
+        psa.connect(parts, wires, name="m", inputs={"x": "b.into", "2y": "c.into"})
     text = str(caught.value)
     for part in (
         "'2y' cannot name",
@@ -87,17 +76,17 @@ def test_every_mistake_in_the_wires_is_told_at_once() -> None:
 
 def test_an_algebraic_loop_is_named() -> None:
     parts = {"a": _gain("a"), "b": _gain("b")}
-    with pytest.raises(InputError, match=r"a\.out -> b\.out -> a\.out"):
-        connect(parts, (("a.out", "b.into"), ("b.out", "a.into")), name="m")
+    with pytest.raises(psa.InputError, match=r"a\.out -> b\.out -> a\.out"):
+        psa.connect(parts, (("a.out", "b.into"), ("b.out", "a.into")), name="m")
 
 
 def test_sampled_parts_of_different_periods_are_refused() -> None:
-    parts = {n: part_model("position_controller", sample_time=t)
+    parts = {n: psa.part_model("position_controller", sample_time=t)
              for n, t in (("one", 1e-4), ("two", 2e-4))}  # fmt: skip
     with pytest.raises(
-        InputError, match=r"one_sample_time = 0\.0001 s, two_sample_time = 0\.0002 s"
+        psa.InputError, match=r"one_sample_time = 0\.0001 s, two_sample_time = 0\.0002 s"
     ):
-        connect(parts, (), name="m")
+        psa.connect(parts, (), name="m")
 
 
 def _reference(t: float) -> float:
@@ -107,13 +96,13 @@ def _reference(t: float) -> float:
 @pytest.mark.parametrize("compensated", [False, True])
 def test_the_closed_loop_is_that_of_an_independent_simulation(compensated: bool) -> None:
     """Position, command and voltage at every instant, against the loop in plain Python."""
-    system = nanopositioner(compensated=compensated)
+    system = psa.nanopositioner(compensated=compensated)
     found = simulate_positioner(
         {n: m.values for n, m in system.parts.items()}, _reference, 4e-3, 5e-5
     )
     model = system.model()
     samples = np.array([[_reference(t)] for t in found.time])
-    steps = run(model, found.time, samples, np.zeros(len(model.state_names)), rtol=1e-9)
+    steps = psa.run(model, found.time, samples, np.zeros(len(model.state_names)), rtol=1e-9)
     shown = dict(zip(model.output_names, steps.y.T, strict=True))
     assert np.ptp(found.position) > 8e-6
     np.testing.assert_allclose(shown["stage_position"], found.position, atol=1e-12)
@@ -127,22 +116,22 @@ def test_the_tuned_loop_keeps_its_margins(stack: str) -> None:
     plant = positioner_plant(stack).model()
     found = {}
     for limit in (1.4, 1.6):
-        tuned = controller_for(plant, position="stage_position", sensitivity=limit)
-        found[limit] = margins_of(plant, tuned, "stage_position")
+        tuned = psa.controller_for(plant, position="stage_position", sensitivity=limit)
+        found[limit] = psa.margins_of(plant, tuned, "stage_position")
         assert 1.2 < found[limit].sensitivity <= limit * 1.0001
         assert found[limit].gain > limit / (limit - 1.0)
         assert found[limit].phase > 2.0 * np.arcsin(0.5 / limit)
         for share in (0.9, 1.1):
             notch = share * tuned.values["notch_frequency"]
             beside = tuned.with_values({"notch_frequency": notch})
-            assert margins_of(plant, beside, "stage_position").sensitivity <= limit * 1.0001
+            assert psa.margins_of(plant, beside, "stage_position").sensitivity <= limit * 1.0001
     assert found[1.6].crossover > found[1.4].crossover > 50.0
 
 
 def test_a_plant_that_cannot_be_tuned_is_refused() -> None:
-    stack = stack_model("P-885.51").plant()
-    with pytest.raises(InputError) as caught:
-        controller_for(stack, sensitivity=9.0, sample_time=-1.0)
+    stack = psa.stack_model("P-885.51").plant()
+    with pytest.raises(psa.InputError) as caught:
+        psa.controller_for(stack, sensitivity=9.0, sample_time=-1.0)
     assert [p.split()[0] for p in caught.value.problems] == [
         "The", "The", "sample_time", "sensitivity",
     ]  # fmt: skip
@@ -151,14 +140,14 @@ def test_a_plant_that_cannot_be_tuned_is_refused() -> None:
 @slow
 def test_the_closed_loop_is_the_same_as_fmu_and_in_modelica(tmp_path: Path) -> None:
     """A step of 5 um: the stage in fmpy and in rumoca against `run`."""
-    system = nanopositioner()
+    system = psa.nanopositioner()
     model = system.model()
     span, T = 2e-3, 5e-5
     t = np.linspace(0.0, span, 41)
-    steps = run(model, t, np.full((41, 1), 5e-6), np.zeros(len(model.state_names)), rtol=1e-9)
+    steps = psa.run(model, t, np.full((41, 1), 5e-6), np.zeros(len(model.state_names)), rtol=1e-9)
     wanted = steps.y[:, model.output_names.index("stage_position")]
     assert wanted[-1] > 4e-6
-    path = export_fmu(model, tmp_path / "loop.fmu")
+    path = psa.export_fmu(model, tmp_path / "loop.fmu")
     found = simulate_fmu(
         str(path), stop_time=span, output_interval=T, relative_tolerance=1e-9,
         start_values={"reference": 5e-6}, output=["stage_position"], fmi_type="CoSimulation",

@@ -10,18 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psa_casadi.component import Component, Equations
+import psa_casadi as psa
 from psa_casadi.design.tracking.targets import respond
-from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.model_file import loads
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page import live
 from psa_casadi.report.page.designs import write_design_page
 from psa_casadi.report.page.live import live_data, live_design, thinned
-from psa_casadi.report.page.results import write_report
-from psa_casadi.simulation.simulate import simulate_record
-from psa_casadi.variables import Interval, Parameter, Provenance
+from psa_casadi.variables import Interval, Provenance
 from tests.report.browser import DARK, Browser, driven
 from tests.report.html_page import Page
 from tests.report.report_cases import diagnosis
@@ -33,7 +29,7 @@ NASTY = "<img src=x onerror=alert(1)>"
 
 
 @pytest.fixture(scope="module")
-def shown() -> Diagnosis:
+def shown() -> psa.Diagnosis:
     """A diagnosis of two records, of a name that is no HTML; an unnamed correction adds 20 nm."""
     d = diagnosis("cause_named", ("rig_a", "rig_b"))
     first = d.experiments[0]
@@ -42,17 +38,19 @@ def shown() -> Diagnosis:
 
 
 @pytest.fixture(scope="module")
-def page(shown: Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(shown: psa.Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("live") / "page.html"
-    write_report(shown, path)
+    psa.write_report(shown, path)
     return path
 
 
-def rms_of(d: Diagnosis, values: dict[str, float]) -> float:
+def rms_of(d: psa.Diagnosis, values: dict[str, float]) -> float:
     """Return the held-out rms [nm] of the first record at other values, the offset found again."""
     e, fit = d.experiments[0], d.extended_fit
     model = d.model.with_values(values)
-    found = simulate_record(model, e.record, fit.unknowns.start(fit.theta, 0), as_exported=False)
+    found = psa.simulate_record(
+        model, e.record, fit.unknowns.start(fit.theta, 0), as_exported=False
+    )
     residual = measured(e.record) - found.displacement
     seen, center = np.isfinite(residual), (measured(e.record) - d.extended[0])
     use = seen & ~e.held_out
@@ -119,7 +117,7 @@ def told_rms(text: str) -> float:
 
 @slow
 def test_a_moved_slider_shows_what_python_simulates(
-    moved: dict[str, Any], shown: Diagnosis
+    moved: dict[str, Any], shown: psa.Diagnosis
 ) -> None:
     names = shown.model.parameter_names
     at = dict(zip(names, moved["values"], strict=True))
@@ -134,7 +132,7 @@ def test_a_moved_slider_shows_what_python_simulates(
 
 
 @slow
-def test_the_error_budget_follows(moved: dict[str, Any], shown: Diagnosis) -> None:
+def test_the_error_budget_follows(moved: dict[str, Any], shown: psa.Diagnosis) -> None:
     assert moved["fitted"] == []  # no effect is on
     at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
     values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
@@ -152,7 +150,7 @@ def test_the_error_budget_follows(moved: dict[str, Any], shown: Diagnosis) -> No
 
 
 @slow
-def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: Diagnosis) -> None:
+def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: psa.Diagnosis) -> None:
     at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
     assert at["tau"] == pytest.approx(2.5e-4, rel=1e-12)
     assert at["creep_gain"] > 0.0
@@ -166,10 +164,10 @@ def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: Diagnosis
 
 @slow
 def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
-    browser: Browser, shown: Diagnosis, tmp_path: Path
+    browser: Browser, shown: psa.Diagnosis, tmp_path: Path
 ) -> None:
     model = shown.model.with_values({"creep_gain": 0.02})
-    write_report(replace(shown, model=model), tmp_path / "on.html")
+    psa.write_report(replace(shown, model=model), tmp_path / "on.html")
     said = driven(browser, tmp_path / "on.html", """
       var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
       box.psa.set('creep_gain', 0);
@@ -183,7 +181,7 @@ def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
 
 
 @slow
-def test_the_model_file_of_a_page_is_read(moved: dict[str, Any], shown: Diagnosis) -> None:
+def test_the_model_file_of_a_page_is_read(moved: dict[str, Any], shown: psa.Diagnosis) -> None:
     model = loads(moved["file"])
     assert model.parameter_vector().tolist() == moved["values"]
     assert "k_L" not in model.provenance.intervals
@@ -211,7 +209,7 @@ def test_names_are_text_and_no_foreign_script_runs(
 
 @slow
 def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -> None:
-    model = stack_model("P-885.51").plant()
+    model = psa.stack_model("P-885.51").plant()
     t = np.linspace(0.0, 0.02, 400)
     played = respond(model, t, 60.0 - 50.0 * np.cos(2.0 * np.pi * 100.0 * t))
     record = (t, played.voltage, played.displacement)
@@ -239,23 +237,23 @@ def test_the_page_with_its_model_is_small(page: Path) -> None:
 
 @slow
 def test_without_compiler_a_page_says_so(
-    shown: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shown: psa.Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("psa_casadi.export.web.has_zig", lambda: False)
     monkeypatch.setattr(live, "has_zig", lambda: False)
-    write_report(shown, tmp_path / "page.html")
+    psa.write_report(shown, tmp_path / "page.html")
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
     assert "the model does not run. It takes a compiler" in text
 
 
 def test_what_json_cannot_hold_stays_out_of_a_page() -> None:
-    free = Component(
+    free = psa.Component(
         name="free_gain", description="a test", source="none", gain="g",
-        equations=lambda _: Equations(),
-        parameters=(Parameter("g", 0.0, "1", (-math.inf, math.inf), "any", scale=2.0),),
+        equations=lambda _: psa.Equations(),
+        parameters=(psa.Parameter("g", 0.0, "1", (-math.inf, math.inf), "any", scale=2.0),),
     )  # fmt: skip
     sure = Provenance(intervals={"k_L": Interval(1.0, math.inf), "tau": Interval(1e-5, 1e-3)})
-    model = stack_model("P-885.51").with_effect(free).with_values({}, provenance=sure)
+    model = psa.stack_model("P-885.51").with_effect(free).with_values({}, provenance=sure)
     told = {p["name"]: p for p in live_data(model, b"")["parameters"]}
     json.dumps(told, allow_nan=False)
     assert told["k_L"]["interval"] is None

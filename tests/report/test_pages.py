@@ -14,7 +14,6 @@ import psa_casadi as psa
 from psa_casadi.command_line import typed
 from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.report.page.designs import write_design_page
-from psa_casadi.report.page.results import write_fit_report
 from psa_casadi.report.words.phrases import (
     handy_scale,
     length_scale,
@@ -34,7 +33,7 @@ def test_every_page_tells_date_version_command_and_the_records_hashes(
         d, found = diagnosis("cause_named"), identification()
         paths = [tmp_path / f"{k}.html" for k in range(3)]
         psa.write_report(d, paths[0], still=True)
-        write_fit_report(found, paths[1], still=True)
+        psa.write_fit_report(found, paths[1], still=True)
         write_design_page(paths[2], title="A design", summary=["It moves."])
     finally:
         typed.reset(token)

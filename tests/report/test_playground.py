@@ -13,15 +13,12 @@ import pytest
 from fmpy.validation import validate_fmu
 from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.model.model_file import loads, save_model
-from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.model.model_file import loads
 from psa_casadi.report.page.playground import playground
 from psa_casadi.simulation.compiler import run_compiler
-from psa_casadi.simulation.simulate import simulate
 from tests.model.sampled_models import controller
 from tests.report.browser import Browser, driven, on_a_phone
 from tests.report.test_report_browser import told_of
@@ -112,8 +109,8 @@ def played(browser: Browser, page: Path) -> dict[str, Any]:
 
 @slow
 def test_it_has_every_stack_and_effect(played: dict[str, Any], page: Path) -> None:
-    assert set(played["stacks"]) == set(STACKS)
-    assert played["switches"] == [n.replace("_", " ") for n in EFFECTS]
+    assert set(played["stacks"]) == set(psa.STACKS)
+    assert played["switches"] == [n.replace("_", " ") for n in psa.EFFECTS]
     assert page.stat().st_size < 3e6
 
 
@@ -124,10 +121,10 @@ def test_what_it_downloads_is_what_python_simulates(played: dict[str, Any]) -> N
     assert len(table) == 300
     t, v = table[:, 0], table[:, head.index("voltage [V]")]
     assert np.ptp(v) == pytest.approx(120.0, rel=1e-3)
-    model = stack_model("P-885.51").with_effect(EFFECTS["slow_creep"])
+    model = psa.stack_model("P-885.51").with_effect(psa.EFFECTS["slow_creep"])
     gain = model.parameter("creep_gain").typical(model.values)
     model = model.with_values({"creep_gain": gain})
-    wanted = simulate(model, t, v).displacement
+    wanted = psa.simulate(model, t, v).displacement
     shown = table[:, head.index("measured_displacement [m]")]
     assert np.max(np.abs(shown - wanted)) < 2e-6 * np.ptp(wanted)
 
@@ -144,7 +141,7 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
     equations = (folder / "documentation" / "index.html").read_text(encoding="utf-8")
     assert "<h1>PTBS200</h1>" in equations
     assert "creep_gain" in equations
-    model, stack = loads(played["chosen"]), stack_model("PTBS200")
+    model, stack = loads(played["chosen"]), psa.stack_model("PTBS200")
     assert model.name == "PTBS200"
     assert {n for n, v in stack.values.items() if model.values[n] != v} == {"tau"}
     assert model.values["creep_gain"] > 0.0
@@ -154,7 +151,7 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
     assert [float(described[n].nominal) for n in model.state_names] == [
         told[n] for n in model.state_names
     ]
-    others = {c.gain for c in EFFECTS.values()} - {"creep_gain"}
+    others = {c.gain for c in psa.EFFECTS.values()} - {"creep_gain"}
     assert {float(described[gain].start) for gain in others if gain} == {0.0}
 
     if not shutil.which("gcc"):
@@ -172,14 +169,14 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
         relative_tolerance=1e-8,
         input=np.array(list(zip(t, v, strict=True)), [("time", float), ("voltage", float)]),
     )  # fmt: skip
-    wanted = simulate(model, t, v, rtol=1e-9, hold="zero").displacement
+    wanted = psa.simulate(model, t, v, rtol=1e-9, hold="zero").displacement
     assert np.max(np.abs(found["measured_displacement"] - wanted)) < 1e-7 * np.ptp(wanted)
 
 
 @slow
 def test_its_model_file_has_what_is_switched_on(played: dict[str, Any]) -> None:
     model = loads(played["file"])
-    base = stack_model("P-885.51")
+    base = psa.stack_model("P-885.51")
     assert [c.name for c in model.effects] == ["slow_creep"]
     assert {n: model.values[n] for n in base.values} == base.values
     assert (model.name, model.description) == (base.name, base.description)
@@ -191,7 +188,7 @@ def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) ->
     said = [played[k] for k in ("plain", "effect", "other", "drawn")]
     assert len(set(said)) == 4
     assert all(s.startswith("Stroke ") for s in said)
-    assert played["knobs"] == len(EFFECTS["slow_creep"].parameters)
+    assert played["knobs"] == len(psa.EFFECTS["slow_creep"].parameters)
     assert list(played["corners"].values()) == [0.0, 50.0, 100.0, 75.0, 50.0]
     assert list(played["read"]["t"].values()) == pytest.approx([0.0, 1e-3, 2e-3, 3.5e-3])
     assert list(played["read"]["v"].values()) == pytest.approx([100.0, 200.0, 300.0, 100.0])
@@ -222,8 +219,8 @@ def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> N
 
 @slow
 def test_the_command_plays_a_model_of_ones_own(tmp_path: Path) -> None:
-    model = stack_model("PTBS200").with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02})
-    save_model(model, tmp_path / "m.json")
+    model = psa.stack_model("PTBS200").with_effect(psa.EFFECTS["slow_creep"], {"creep_gain": 0.02})
+    psa.save_model(model, tmp_path / "m.json")
     words = ["web", str(tmp_path / "m.json"), "-o", str(tmp_path / "p.html"), "--quiet"]
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
@@ -233,5 +230,5 @@ def test_the_command_plays_a_model_of_ones_own(tmp_path: Path) -> None:
 
 
 def test_what_is_no_stack_is_refused() -> None:
-    with pytest.raises(InputError, match="no stack"):
+    with pytest.raises(psa.InputError, match="no stack"):
         playground(controller())

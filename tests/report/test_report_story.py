@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.cli.diagnosis_files import models
 from psa_casadi.diagnosis.held_out import Budget, Share
-from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
-from psa_casadi.effects import EFFECTS
+from psa_casadi.diagnosis.result import BlindSpot
 from psa_casadi.report.page.results import drawn, split_table
 from psa_casadi.report.words.phrases import probability_text
 from psa_casadi.report.words.tables import blindest, candidate_table
-from psa_casadi.report.words.text import story
 from tests.report.html_page import figures, numbers, written
 from tests.report.report_cases import diagnosis, periodic, with_periodic
 
@@ -25,11 +24,11 @@ def headings(text: str) -> list[str]:
     return re.findall(r"<h2[^>]*>(.*?)</h2>", text)
 
 
-def told(d: Diagnosis) -> dict[str, str]:
+def told(d: psa.Diagnosis) -> dict[str, str]:
     """Return the terminal's story, line by line under its labels."""
     found: dict[str, str] = {}
     label = ""
-    for line in story(d, origin="synthetic").splitlines():
+    for line in psa.story(d, origin="synthetic").splitlines():
         label = line[:10].strip() or label
         found[label] = f"{found.get(label, '')} {line[11:].strip()}".strip()
     return found
@@ -137,7 +136,7 @@ def _names(figure: dict[str, object]) -> list[str]:
 def test_the_signature_stands_beside_the_data(tmp_path: Path) -> None:
     text, page = written(diagnosis("cause_named"), tmp_path)
     assert "slow creep, as it looks and as the data look" in page.text
-    assert EFFECTS["slow_creep"].looks_like in page.text
+    assert psa.EFFECTS["slow_creep"].looks_like in page.text
     assert "Simulated on the stack P-885.51 with creep_gain = 0.0300" in page.text
     signature = next(f for f in figures(text) if _names(f) == ["samples", "binned means"])
     assert np.ptp(numbers(signature["data"][1]["y"])) > 50
@@ -203,19 +202,19 @@ def test_the_terminal_tells_what_is_wrong_and_how_sure_the_cause_is() -> None:
 
 @pytest.mark.parametrize("width", range(60, 100, 3))
 def test_a_percent_sign_stays_with_its_number(width: int) -> None:
-    for line in story(diagnosis("ambiguous"), width=width).splitlines():
+    for line in psa.story(diagnosis("ambiguous"), width=width).splitlines():
         assert not line.strip().startswith("%")
         assert len(line) <= width
 
 
 def test_blind_spots_are_named_the_furthest_first_and_five_at_most() -> None:
-    names = list(EFFECTS)[:7]
+    names = list(psa.EFFECTS)[:7]
     # each is so many times its ordinary size away
     model = diagnosis("adequate").model
     spots = []
     for k, name in enumerate(names):
-        extended = model.with_effect(EFFECTS[name])
-        gain = extended.parameter(EFFECTS[name].gain or "")
+        extended = model.with_effect(psa.EFFECTS[name])
+        gain = extended.parameter(psa.EFFECTS[name].gain or "")
         size = (k + 2) * gain.typical({**extended.values, gain.name: 0.0})
         spots.append(BlindSpot(name, size, gain.unit, "why"))
     d = replace(diagnosis("adequate"), blind_to=tuple(spots))
