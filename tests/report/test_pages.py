@@ -4,7 +4,6 @@ import base64
 import gzip
 import hashlib
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ from plotly.offline import get_plotlyjs
 
 import psa_casadi as psa
 from psa_casadi.command_line import typed
-from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.report.page.designs import write_design_page
 from psa_casadi.report.words.phrases import (
     handy_scale,
@@ -60,19 +58,6 @@ def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
     assert f"'sha256-{digest}'" in text.split("Content-Security-Policy", 1)[1].split(">", 1)[0]
     assert text.count("Displacement, and residual") == 0
     assert "at the top of the page" in text
-
-
-def test_the_errors_of_a_page_have_one_unit(tmp_path: Path) -> None:
-    d = replace(
-        diagnosis("cause_named"),
-        base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
-        extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
-    )
-    text = written(d, tmp_path)[1].text.replace("\u00a0", " ")
-    start = text.index("Error on held-out samples")
-    bars = text[start : text.index("Dashed: the noise")]
-    assert "base model 2.50 µm extended model 0.0500 µm noise 0.00500 µm" in bars
-    assert " nm" not in bars
 
 
 def test_a_quantity_in_a_sentence_has_the_unit_of_its_page() -> None:
