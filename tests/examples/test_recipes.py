@@ -23,8 +23,7 @@ from psa_casadi.component import BALANCES
 from psa_casadi.examples.index import Example, Script, examples
 from tests.examples.recipe_commands import run_command
 from tests.examples.tool_interfaces import BLOCK_PARAMETERS, DYMOLA, OPENMODELICA, bound, calls_of
-from tests.export.modelica_runs import load
-from tests.export.modelica_stub import STUB
+from tests.export.modelica_runs import STUB, load
 from tests.tiers import slow
 
 RECIPES = [e.name for e in examples().values() if e.kind == "recipe"]

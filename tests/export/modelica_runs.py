@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import rumoca
@@ -17,6 +18,8 @@ FloatArray = NDArray[np.float64]
 #: Time to drive each stack once up and down [s]: slow beside its lags.
 SPANS = {"PTBS200": 0.02, "WYDS0808020": 0.02, "P-885.51": 0.02, "demo": 0.5, "micromanipulator": 2}
 _SAMPLES = 200
+#: The connectors and parts of Modelica's library that the wired example names, in our own words.
+STUB = Path(__file__).with_name("modelica_stub.mo").read_text("utf-8")
 
 
 @cache

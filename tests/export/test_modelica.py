@@ -16,6 +16,7 @@ from psa_casadi.cli.app import app
 from psa_casadi.export.modelica.package import modelica_text, reciprocal
 from tests.export.modelica_runs import (
     SPANS,
+    STUB,
     load,
     model_named,
     right_side_error,
@@ -24,7 +25,6 @@ from tests.export.modelica_runs import (
     text_of,
     triangle_error,
 )
-from tests.export.modelica_stub import STUB
 from tests.tiers import slow_but
 
 _GOLDEN = Path(__file__).parent / "golden" / "P-885.51.mo"

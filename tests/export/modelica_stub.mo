@@ -1,6 +1,4 @@
-"""The connectors and parts of Modelica's library that the wired example names, in our own words."""
-
-STUB = """
+// What the wired example names of Modelica's library: connectors and parts in our own words.
 package Modelica
   package Electrical
     package Analog
@@ -63,4 +61,3 @@ package Modelica
     end Translational;
   end Mechanics;
 end Modelica;
-"""
