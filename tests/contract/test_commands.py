@@ -241,7 +241,10 @@ def test_the_page_that_diagnoses_answers_to_who_has_its_address_alone(tmp_path: 
         assert asked(place, "GET", f"/?token={token}", Host="psa.example")[0] in (400, 403, 421)
         status, headers, page = asked(place, "GET", f"/?token={token}")
         assert status == 200
-        assert "default-src 'none'" in headers["content-security-policy"]
+        policy = headers["content-security-policy"]
+        assert {"default-src 'none'", "frame-ancestors 'none'"} <= {*policy.split("; ")}
+        assert "unsafe" not in policy
+        assert b"http" not in page.replace(b"http://www.w3.org/2000/svg", b"")
         assert "httponly" in headers["set-cookie"].lower()
         assert token.encode() not in page
         cookie, origin = headers["set-cookie"].split(";")[0], f"http://{place}"

@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 
 import psa_casadi as psa
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.simulation.simulate import input_samples
 
 FloatArray = NDArray[np.float64]
 
-#: Time to drive each stack once up and down [s]: slow beside its lags.
-SPANS = {"PTBS200": 0.02, "WYDS0808020": 0.02, "P-885.51": 0.02, "demo": 0.5, "micromanipulator": 2}
 _SAMPLES = 200
 #: The connectors and parts of Modelica's library that the wired example names, in our own words.
 STUB = Path(__file__).with_name("modelica_stub.mo").read_text("utf-8")
@@ -52,32 +49,6 @@ def simulated(text: str, name: str, span: float, rtol: float = 1e-11) -> Mapping
     result = load(text, name).simulate(t=(0.0, span), config=config)
     found = {n: np.asarray(result[n]) for n in result.names}
     return {**found, "time": np.asarray(result.time)}
-
-
-def triangle_error(model: psa.Model, text: str, span: float) -> dict[str, float]:
-    """Return the largest difference from `run`, over the range, of every state and output.
-
-    The voltage rises to half its rating and falls. A velocity, which is small beside what the stack
-    can reach as it rings, is compared to its usual size.
-    """
-    peak = 0.5 * model.values["u_rated"]
-    slope = 2.0 * peak / span
-    inputs = model.structure.inputs
-    kept = "".join(f", {i.name}={i.start!r}" for i in inputs if i.name != "voltage")
-    voltage = f"if time < {span / 2!r} then {slope!r}*time else {slope!r}*({span!r} - time)"
-    harness = f"model Harness PiezoStack.Signal psa(voltage={voltage}{kept}); end Harness;"
-    got = simulated(text + harness, "Harness", span)
-    t = np.linspace(0.0, span, _SAMPLES + 1)
-    u = input_samples(model, len(t), {"voltage": peak * (1.0 - np.abs(2.0 * t / span - 1.0))})
-    steps = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-11)
-    variables: list[psa.State | psa.Output] = [*model.structure.states, *model.structure.outputs]
-    nominals = [*model.state_nominals(), *model.output_nominals()]
-    errors = {}
-    for it, expected, nominal in zip(variables, [*steps.x.T, *steps.y.T], nominals, strict=True):
-        at = np.interp(t, got["time"], got[f"psa.{it.name}"])
-        size = nominal if it.unit == "m/s" else np.ptp(expected) or nominal
-        errors[it.name] = float(np.abs(at - expected).max() / size)
-    return errors
 
 
 def signal_class(text: str) -> str:

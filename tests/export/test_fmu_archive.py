@@ -8,7 +8,7 @@ import io
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,22 +18,43 @@ import casadi as ca
 import fmpy
 import matplotlib.image
 import numpy as np
+import numpy.typing as npt
 import pytest
 from fmpy.validation import validate_fmu
 from lxml import etree  # type: ignore[import-untyped]
+from typer.testing import CliRunner
 
 import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.check import CheckRow
+from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
 from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
+from psa_casadi.export.common.parameter_sets import parameter_set
+from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu import sources
 from psa_casadi.export.fmu.description import dependencies
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
+from psa_casadi.export.fmu.reference_run import (
+    EXPERIMENTS,
+    FOLDER,
+    INPUTS,
+    NOTES,
+    OUTPUTS,
+    PARAMETERS,
+    reference_entries,
+)
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.importer.masters import Signals
+from psa_casadi.model.model_file import save_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
-from tests.export.fmu_models import assert_valid, entries, model_named, rewritten
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.variables import Publication
+from tests.export.fmu_models import assert_valid, entries, exported, model_named, rewritten
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
@@ -302,3 +323,164 @@ def test_kinds_of_dependence() -> None:
     assert found["derivative", 0] == rate
     assert found["output", 0] == {v: "tunable", a: "dependent"}
     assert found["output", 1] == {state: "constant"}
+
+
+Table = Mapping[str, npt.NDArray[np.float64]]
+
+
+def table(content: bytes) -> Table:
+    names, *rows = content.decode().splitlines()
+    columns = np.array([[float(v) for v in row.split(",")] for row in rows]).T
+    return dict(zip(names.split(","), columns, strict=True))
+
+
+# Parameter sets
+
+
+@pytest.mark.parametrize("model", [psa.stack_model(STACK), flexure, every_effect])
+def test_parameter_sets_hold_every_value_exactly(model: psa.Model) -> None:
+    text = parameter_set(model)
+    assert_valid(text, "ssp", "schema", "SystemStructureParameterValues.xsd")
+    root = ET.fromstring(text)
+    spaces = {"v": root.tag[1:].partition("}")[0]}
+    spaces["c"] = spaces["v"].replace("ParameterValues", "Common")
+    found = {p.attrib["name"]: p for p in root.iterfind("v:Parameters/v:Parameter", spaces)}
+    units = {u.attrib["name"] for u in root.iterfind("v:Units/c:Unit", spaces)}
+    assert list(found) == list(model.parameter_names)
+    for p in model.structure.parameters:
+        real = found[p.name].find("v:Real", spaces)
+        assert real is not None
+        assert float(real.attrib["value"]) == model.values[p.name]
+        assert real.attrib["unit"] == p.unit
+        assert p.unit in units
+
+
+# The reference run
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_manifest_lists_every_file_as_the_schema_of_the_standard_has_it(fmi: int) -> None:
+    """Names, attributes and roles as FMI-LS-REF 1.0.0-beta.1 and the Experiments Format have them.
+
+    Its schema knows no other attribute of a file than these four.
+    """
+    inside = entries(STACK, fmi)
+    root = ET.fromstring(inside[f"{FOLDER}/fmi-ls-manifest.xml"])
+    space = "{http://fmi-standard.org/fmi-ls-manifest}"
+    assert root.tag == "fmiReferences"
+    assert root.attrib[f"{space}fmi-ls-name"] == "org.fmi-standard.fmi-ls-ref"
+    assert root.attrib[f"{space}fmi-ls-version"] == "1.0.0-beta.1"
+    assert len(root.attrib) == 3
+    roles = {}
+    for related in root:
+        path = f"{FOLDER}/{related.attrib['source']}".replace(f"{FOLDER}/../../", "")
+        assert related.tag == "Related"
+        assert set(related.attrib) == {"type", "source", "role", "description"}
+        assert path in inside
+        roles[path] = related.attrib["role"]
+    own = {n for n in inside if n.startswith(FOLDER)} - {f"{FOLDER}/fmi-ls-manifest.xml"}
+    assert set(roles) == {*own, NOTES}
+    assert roles[f"{FOLDER}/{EXPERIMENTS}"] == "experiment/smoke-test"
+    assert roles[f"{FOLDER}/{PARAMETERS}"] == "parameter"
+    assert roles[f"{FOLDER}/{OUTPUTS}"] == "result"
+    (experiment,) = ET.fromstring(inside[f"{FOLDER}/{EXPERIMENTS}"])
+    assert {e.tag: e.attrib["source"] for e in experiment} == {
+        "Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS,
+    }  # fmt: skip
+    times = table(inside[f"{FOLDER}/{OUTPUTS}"])["time"]
+    assert float(experiment.attrib["startTime"]) == times[0] == 0.0
+    assert float(experiment.attrib["stopTime"]) == times[-1]
+    assert float(experiment.attrib["stepSize"]) == pytest.approx(np.diff(times), rel=1e-6)
+    assert set(table(inside[f"{FOLDER}/{INPUTS}"])["time"]) == set(times)
+
+
+@pytest.mark.parametrize(
+    "name", slow_but([STACK, "single_mass"], ["PTBS200", STACK, "manipulator", "single_mass"])
+)
+def test_reference_outputs_agree_with_the_independent_reference(name: str) -> None:
+    model = model_named(name).plant()
+    inside = reference_entries(model, {})
+    inputs, outputs = (table(inside[f"{FOLDER}/{n}"]) for n in (INPUTS, OUTPUTS))
+    kinks = {name: column[::100] for name, column in inputs.items()}
+    times = kinks.pop("time")
+    signals = Signals(tuple(kinks), times, np.column_stack(list(kinks.values())))
+    truth = expected_outputs(model, outputs["time"], signals)
+    for column, (output, found) in zip(truth.T, list(outputs.items())[1:], strict=True):
+        assert np.max(np.abs(column - found)) < 1e-6 * np.ptp(found), output
+
+
+@pytest.mark.usefixtures("without_binary")
+def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise SimulationError("no")
+
+    monkeypatch.setattr("psa_casadi.export.fmu.reference_run.run", fails)
+    with zipfile.ZipFile(psa.export_fmu(flexure, tmp_path / "m.fmu", fmi=3)) as archive:
+        names = set(archive.namelist())
+        page = archive.read("documentation/index.html").decode()
+    assert not any(n.startswith("extra/") for n in names)
+    assert NOTES not in names
+    assert all(link.removeprefix("../") in names for link in re.findall(r'href="([^"]*)"', page))
+
+
+SAID = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+LICENSE = (Path(__file__).parents[2] / "LICENSE").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_every_fmu_holds_the_notices_that_its_licences_ask_for(fmi: int) -> None:
+    """BSD 3-Clause for the code, BSD 2-Clause for the headers, in the binaries' documentation."""
+    inside = entries(STACK, fmi)
+    assert LICENSE_ENTRY == "documentation/licenses/license.txt"
+    text = inside[LICENSE_ENTRY].decode()
+    assert LICENSE in text
+    assert 'Modelica Association Project "FMI"' in text
+    assert "Redistributions in binary form" in text.partition("B. Headers")[2]
+    assert inside["sources/LICENSE.txt"].decode() == LICENSE
+    root = ET.fromstring(inside["modelDescription.xml"])
+    assert LICENSE_ENTRY in root.attrib["license"]
+    assert LICENSE.splitlines()[2] in root.attrib["copyright"]
+    assert not {"author", "version"} & set(root.attrib)
+
+
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
+    fmi: int, tmp_path: Path
+) -> None:
+    plain, path = tmp_path / "model.json", tmp_path / "m.fmu"
+    model = replace(model_named("flexure"), publication=Publication(author="file", version="0.9"))
+    save_model(model, plain)
+    options = ["--author", SAID.author, "--copyright", SAID.copyright, "--license", SAID.license]
+    command = ["export", "fmu", "--model", str(plain), "--fmi", str(fmi), "-o", str(path)]
+    done = CliRunner().invoke(app, [*command, *options])
+    assert done.exit_code == 0, done.output
+    with zipfile.ZipFile(path) as archive:
+        xml = archive.read("modelDescription.xml").decode()
+        terms, page = (archive.read(f"documentation/{n}").decode()
+                       for n in ("licenses/license.txt", "index.html"))  # fmt: skip
+    assert_valid(xml, "schema", f"fmi{fmi}", f"fmi{fmi}ModelDescription.xsd")
+    stated = replace(SAID, version="0.9").stated
+    assert {n: ET.fromstring(xml).attrib[n] for n in stated} == stated
+    assert all(f"{name}: {text}" in terms for name, text in stated.items())
+    assert "(c) 2026 A. Author &amp; sons" in page
+    with Archive(path) as archived:
+        assert list(missing_notices(archived)) == []
+        as_exported = published_as(archived, model.plant())
+        assert as_exported.publication.stated == stated
+        assert list(unreproducible_parts(archived, as_exported)) == []
+    refused = CliRunner().invoke(app, [*command, "--author", " "])
+    assert refused.exit_code == 2
+    assert "--author is ' '" in refused.output
+
+
+def test_a_licence_that_was_lost_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "m.fmu"
+    gone = {LICENSE_ENTRY: lambda _: b"all rights reserved\n"}
+    with Archive(rewritten(exported("flexure", 2), path, gone)) as archive:
+        (found,) = missing_notices(archive)
+    assert "lacks the notice 'Copyright (c)" in found
+    unsaid = {"modelDescription.xml": lambda xml: re.sub(rb' license="[^"]*"', b"", xml)}
+    with Archive(rewritten(exported("flexure", 2), path, unsaid)) as archive:
+        assert list(missing_notices(archive)) == ["the description states no license"]

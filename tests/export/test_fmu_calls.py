@@ -105,12 +105,6 @@ def test_stop_time_is_kept() -> None:
             slave.step(2e-3, 1e-3)
 
 
-def test_initial_states_are_taken() -> None:
-    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION, values={"u": 80.0}) as slave:
-        assert slave.get(["u", "charge"]) == pytest.approx([80.0, 80.0 * 1.5e-6])
-        assert slave.get(["current"])[0] == pytest.approx(-80.0 / 8.0)
-
-
 _COUNTING = """
 #include <stdarg.h>
 #include <stdio.h>

@@ -38,6 +38,7 @@ def _short() -> Evidence | None:
 SAVED = replace(
     MODEL,
     evidence=_short(),
+    publication=psa.Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0"),
     provenance=Provenance(
         identified_from=(("rig", "0" * 64),),
         free=("k_L", "tau"),
@@ -68,6 +69,7 @@ def same_or_refused(text: str) -> bool:
     assert dumps(again) == written
     assert again.provenance == model.provenance
     assert again.evidence == model.evidence
+    assert again.publication == model.publication
     assert dict(again.values) == dict(model.values)
     assert again.own_starts() == model.own_starts()
     return False

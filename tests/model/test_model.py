@@ -1,14 +1,19 @@
 """Composition, values, and MODEL.json."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.model.model_file import loads
+from psa_casadi.model.evidence import Evidence
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.records.split import divided
 from psa_casadi.simulation.simulate import input_samples
+from psa_casadi.variables import Interval
+from tests.model.evidence_models import NOISE, OFFSET, evident_model, noisy_record
 from tests.tiers import slow_but
 
 CREEP, DRIFT = psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]
@@ -105,6 +110,60 @@ def test_velocity_is_the_rate_of_the_displacement(name: str) -> None:
     np.testing.assert_allclose(slope[5:], v[7:-2], rtol=0, atol=1e-6 * np.ptp(v))
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"x"', "null"])
-def test_what_is_no_model_file_says_so(text: str) -> None:
-    assert message(lambda: loads(text, "m.json")).startswith("m.json is not ")
+def evidence_in(model: psa.Model) -> Evidence:
+    assert model.evidence is not None
+    return model.evidence
+
+
+def test_it_says_what_the_record_has_shown_and_what_the_model_errs_by() -> None:
+    record, told = noisy_record(), evidence_in(evident_model())
+    rates = np.abs(np.diff(record.voltage) / np.diff(record.time))
+    assert told.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
+    assert told.seen.rate == pytest.approx(rates.max())
+    assert told.seen.duration == record.duration
+    assert told.seen.temperature is None
+    held = told.held_out
+    assert held is not None
+    assert held.interval_m.low < NOISE < held.interval_m.high
+    assert held.rms_m == pytest.approx(NOISE, rel=0.15)
+    (played,) = told.runs
+    assert (played.sha256, played.samples, played.averaged) == (record.sha256, 640, 1)
+    assert played.offset_m == pytest.approx(OFFSET, abs=1e-8)
+    (split,) = divided([record], ())
+    held_out = [k for first, stop in played.held_out for k in range(first, stop)]
+    assert held_out == np.flatnonzero(split.held_out).tolist()
+
+
+def test_the_covariance_is_that_of_the_intervals() -> None:
+    model = evident_model()
+    told, known = evidence_in(model).covariance, model.provenance.intervals
+    assert told.names == ("k_L", "A", "tau")
+    for k, name in enumerate(told.names):
+        half = 0.5 * (known[name].high - known[name].low)
+        assert 1.96 * told.matrix[k][k] ** 0.5 == pytest.approx(half, rel=0.02), name
+
+
+def test_other_values_or_physics_have_no_evidence() -> None:
+    model = evident_model()
+    same = model.with_values({"k_L": model.values["k_L"]})
+    assert same.evidence is model.evidence
+    assert model.with_values({"k_L": 1.01 * model.values["k_L"]}).evidence is None
+    assert model.with_effect(psa.EFFECTS["slow_creep"]).evidence is None
+    assert model.without(["creep_lag"]).evidence is None
+    assert model.with_starts({"u": 1.0}).evidence is model.evidence
+
+
+def test_a_plant_keeps_it_with_the_covariance_of_its_own_parameters() -> None:
+    model = evident_model()
+    drift = psa.EFFECTS["offset_drift"]
+    gain = drift.gain or ""
+    told = evidence_in(model)
+    names = ("k_L", gain)
+    wider = replace(told.covariance, names=names, matrix=((4.0, 1.0), (1.0, 9.0)))
+    both = replace(
+        model.with_effect(drift), evidence=replace(told, covariance=wider, outside=(drift.name,))
+    )
+    plant = loads(dumps(both)).plant()
+    assert evidence_in(plant).covariance.names == ("k_L",)
+    assert evidence_in(plant).covariance.matrix == ((4.0,),)
+    assert loads(dumps(plant)).evidence == plant.evidence

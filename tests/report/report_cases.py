@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import get_args
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval, Provenance
 
 NOISE = 5e-9
+VERDICTS: tuple[result.Verdict, ...] = get_args(result.Verdict)
 ADDED = {"cause_named", "partly_explained", "ambiguous"}
 
 

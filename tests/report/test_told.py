@@ -7,21 +7,22 @@ import difflib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.held_out import Budget, Errors, Share
-from psa_casadi.diagnosis.result import BlindSpot, Cause, Estimate, Verdict
+from psa_casadi.diagnosis.result import BlindSpot, Cause, Estimate
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.report.words.text import identification_text
 from tests.report.html_page import figures, numbers, written
-from tests.report.report_cases import diagnosis, identification, with_periodic
+from tests.report.report_cases import VERDICTS, diagnosis, identification, with_periodic
 
 FOLDER = Path(__file__).parent / "told"
 Result = psa.Diagnosis | psa.Identification
@@ -95,7 +96,7 @@ def wide(d: psa.Diagnosis) -> psa.Diagnosis:
 
 #: What is told in full.
 WHOLE: dict[str, Callable[[], Result]] = {
-    **{v: lambda v=v: diagnosis(v) for v in get_args(Verdict)},
+    **{v: partial(diagnosis, v) for v in VERDICTS},
     "fit": lambda: replace(identification(), doubts=(), starts=(), combinations=(), advice=()),
 }
 #: What differs from one of those.

@@ -21,7 +21,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
-from tests.model.test_own_effects import RIPPLE, install
+from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
 
 SMALL = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k % 50) for k in range(100))
@@ -106,17 +106,6 @@ def test_only_who_has_the_address_gets_in(server: Server) -> None:
     assert stranger.post("/start") == 403
     stranger.cookie = f"psa_{server.port}=guess"
     assert stranger.ask("GET", "/")[0] == 403
-
-
-def test_the_page_asks_for_nothing_outside_and_stands_in_no_frame(tab: Tab) -> None:
-    status, headers, text = tab.ask("GET", "/")
-    assert status == 200
-    policy = headers["Content-Security-Policy"]
-    assert "default-src 'none'" in policy
-    assert "frame-ancestors 'none'" in policy
-    assert "unsafe" not in policy
-    assert b"http" not in text.replace(b"http://www.w3.org/2000/svg", b"")
-    assert tab.server.token.encode() not in text
 
 
 @pytest.mark.parametrize(
