@@ -8,11 +8,9 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.characters import check_text, plain, visible
-from psa_casadi.cli.app import app
 from psa_casadi.cli.screen import show_table
 from psa_casadi.export.common.parameter_sets import parameter_set
 from psa_casadi.export.fmu.description import model_description
@@ -21,6 +19,7 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.files import atomic_write
 from psa_casadi.report.page.document import render
 from psa_casadi.report.words.tables import Table
+from tests.contract.helpers import command
 from tests.records.record_files import HEADER, ROWS, write
 
 BARRED = ("\0", "\x0b", "\x1b", "\ud800", "\ufffe", "\uffff")
@@ -118,16 +117,14 @@ def test_what_a_terminal_would_obey_is_spelled_out() -> None:
     assert visible("5 µm\n\tü \U0001f600 \\x1b") == "5 µm\n\tü \U0001f600 \\x1b"
 
 
-@pytest.mark.parametrize("command", ["identify", "diagnose", "check"])
-def test_no_name_of_a_file_or_a_column_reaches_the_terminal_raw(
-    command: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("name", ["identify", "diagnose", "check"])
+def test_no_name_of_a_file_or_a_column_reaches_the_terminal_raw(name: str, tmp_path: Path) -> None:
     path = write(tmp_path / "\x1b]0;own\x07.csv", "t\x1b[31m [s],U\x9b2J,\u202ex", *ROWS)
-    output = [] if command == "check" else ["-o", str(tmp_path / "m.json")]
-    result = CliRunner().invoke(app, [command, str(path), *output])
-    assert result.exit_code == 2
-    assert "\\x1b]0;own\\x07.csv" in result.output
-    assert all(c.isprintable() or c == "\n" for c in result.output)
+    output = [] if name == "check" else ["-o", tmp_path / "m.json"]
+    told = command(name, path, *output)
+    assert told.code == 2
+    assert "\\x1b]0;own\\x07.csv" in told.err
+    assert all(c.isprintable() or c == "\n" for c in told.out + told.err)
 
 
 @pytest.mark.parametrize("terminal", [False, True])

@@ -8,12 +8,10 @@ from xml.etree import ElementTree
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner, Result
 
 import psa_casadi
 from build_scripts.page_commands import block_in_tests, run_block
 from psa_casadi.cli import steps
-from psa_casadi.cli.app import app
 from psa_casadi.cli.screen import show_table, working
 from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, Course, Told
 from psa_casadi.diagnosis import diagnose
@@ -28,24 +26,15 @@ from psa_casadi.records.split import whole
 from psa_casadi.report.documents.junit import check_cases, junit_text
 from psa_casadi.report.page import playground
 from psa_casadi.report.words.tables import Table, effects_table
+from tests.contract.helpers import command, done
 from tests.identification.identified_plants import same_as_the_named_stack
 from tests.records.record_files import HEADER, ROWS, write
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
 
 
-def psa(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def done(*arguments: str | Path) -> Result:
-    result = psa(*arguments)
-    assert result.exit_code == 0, result.output
-    return result
-
-
 def test_the_version_is_one() -> None:
-    assert done("--version").stdout == f"psa_casadi {psa_casadi.__version__}\n"
+    assert done("--version").out == f"psa_casadi {psa_casadi.__version__}\n"
     root = Path(__file__).parents[2]
     citation = (root / "CITATION.cff").read_text(encoding="utf-8")
     assert f"\nversion: {psa_casadi.__version__}\n" in citation
@@ -76,28 +65,30 @@ def test_the_playground_and_a_posterior_take_a_model(
     file, played = tmp_path / "model.json", []
     save_model(stack_model("demo"), file)
     monkeypatch.setattr(playground, "write_playground", lambda *given: played.append(given))
-    assert psa("web", *way, file, "-o", tmp_path / "p.html").exit_code == 0
+    assert command("web", *way, file, "-o", tmp_path / "p.html").code == 0
     ((path, model),) = played
     assert path == tmp_path / "p.html"
     assert model.values == stack_model("demo").values
-    twice = psa("web", *way, file, file)
-    assert twice.exit_code == 2
-    assert "is one file too many" in twice.output
+    twice = command("web", *way, file, file)
+    assert twice.code == 2
+    assert "is one file too many" in twice.words
     words: list[str | Path] = [*way, file, tmp_path / "absent.csv"]
-    assert psa("sample", *words).stderr.startswith(f"Error: {tmp_path / 'absent.csv'}: there is no")
-    without = psa("sample", tmp_path / "absent.csv")
-    assert "No model is given; add --model MODEL.json" in without.stderr
+    assert command("sample", *words).err.startswith(
+        f"Error: {tmp_path / 'absent.csv'}: there is no"
+    )
+    without = command("sample", tmp_path / "absent.csv")
+    assert "No model is given; add --model MODEL.json" in without.err
 
 
 def test_an_identification_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(identify, "identify", lambda *_, **__: identification())
     monkeypatch.chdir(tmp_path)
     record = write(tmp_path / "a.csv", HEADER, *ROWS)
-    shown = psa("identify", record, "--stack", "P-885.51")
-    assert shown.exit_code == 0, shown.output
-    assert "95 % interval" in shown.stdout
-    assert "written" not in shown.stdout
-    assert max(map(len, shown.stdout.splitlines())) <= 80
+    shown = command("identify", record, "--stack", "P-885.51")
+    assert shown.code == 0, shown.words
+    assert "95 % interval" in shown.out
+    assert "written" not in shown.out
+    assert max(map(len, shown.out.splitlines())) <= 80
     assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
 
 
@@ -197,9 +188,9 @@ def test_a_result_that_is_not_as_expected_ends_with_1(
     asked: list[str | Path], options: tuple[str, ...], wrong: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "tests.xml"
-    result = psa(*asked, *options, "--junit", file)
-    assert result.exit_code == bool(wrong), result.output
-    assert result.output == (f"Not as expected: {wrong}\n" if wrong else "")
+    result = command(*asked, *options, "--junit", file)
+    assert result.code == bool(wrong), result.words
+    assert result.out + result.err == (f"Not as expected: {wrong}\n" if wrong else "")
     cases = cases_of(file.read_text(encoding="utf-8"))
     assert list(cases) == ["verdict", "held-out error"]
     assert [f for f in cases.values() if f] == [wrong] * bool(wrong)

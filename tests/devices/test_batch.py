@@ -15,11 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi import children
-from psa_casadi.cli.app import app
 from psa_casadi.devices import device, executors
 from psa_casadi.devices.executors import Processes, outcomes
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, jobs_given
@@ -27,6 +25,7 @@ from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.report.documents.files import identification_file
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.strict_json import json_text
+from tests.contract.helpers import command
 from tests.report.report_cases import identification
 from tests.tiers import slow
 
@@ -195,8 +194,8 @@ def test_a_damaged_result_is_named_and_made_again(
         # cut, or a digit is another one: still a file that can be read
         other = whole.replace(b"1", b"2", 1) if name != "device.json" else b"{}"
         (out / "d1" / name).write_bytes(other if length is None else whole[:length])
-        told = CliRunner().invoke(app, ["compare", str(out), "-o", str(tmp_path / "p.html")])
-        assert f"d1: failed: {out / 'd1' / name}: is damaged" in told.stdout
+        told = command("compare", out, "-o", tmp_path / "p.html").out
+        assert f"d1: failed: {out / 'd1' / name}: is damaged" in told
         assert "d1" in (tmp_path / "p.html").read_text("utf-8")
         again = psa.batch(jobs, out, executor=pool)
     assert (again.kept, again.counts, len(again.findings)) == (4, {"done": 5}, 5)
@@ -274,7 +273,7 @@ def test_an_address_of_no_scheduler_is_told_in_a_sentence(
     address: str, records: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed")
-    process = command(records, tmp_path / "out", "--dask", address)
+    process = batch_command(records, tmp_path / "out", "--dask", address)
     _, told = process.communicate(timeout=35)
     assert process.returncode == 1
     assert told.splitlines()[1:] == [told.splitlines()[-1]]
@@ -336,7 +335,7 @@ def test_devices_are_diagnosed(records: Path, tmp_path: Path) -> None:
     assert 2e-9 < np.nanstd(error) < 5e-9  # 3 nm were put in
 
 
-def command(folder: Path, out: Path, *more: str) -> "subprocess.Popen[str]":
+def batch_command(folder: Path, out: Path, *more: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-m", "psa_casadi.cli", "batch", str(folder), "-o", str(out),
          "--workers", "1", *more],
@@ -353,7 +352,7 @@ def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) ->
     folder.mkdir()
     for k in range(3):
         write_device(folder / f"d{k}.csv", 1.0 + 0.01 * k, seed=k)
-    process = command(folder, out)
+    process = batch_command(folder, out)
     assert process.stderr is not None
     for line in process.stderr:
         if "done)" in line:
@@ -364,7 +363,7 @@ def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) ->
     if number is signal.SIGINT:
         assert "of 3 devices are done. Kept: " in told
     before = stamps(out)
-    again = command(folder, out)
+    again = batch_command(folder, out)
     said, _ = again.communicate(timeout=120)
     assert again.returncode == 0
     assert "of them were there before" in said

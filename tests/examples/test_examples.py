@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from mkdocs.exceptions import PluginError
-from typer.testing import CliRunner
 
 import psa_casadi as psa
 from build_scripts.measured_data import ROOT
 from build_scripts.tutorial_pages import FOLDER, described, notebook_page
-from psa_casadi.cli.app import app
 from psa_casadi.examples import use_in_casadi, van_der_pol
 from psa_casadi.examples.index import examples, run_example
+from tests.contract.helpers import Ended, command
 from tests.tiers import slow, slow_but
 
 EXAMPLES = [e.name for e in examples().values() if e.kind == "example"]
@@ -110,33 +109,33 @@ def test_the_imported_fmu_is_not_the_symbolic_model(tmp_path: Path) -> None:
     assert "FmuFunction" not in use_in_casadi.symbolic(plant).class_name()
 
 
-def _run(*words: str) -> Any:
-    return CliRunner().invoke(app, ["examples", *words])
+def _run(*words: str | Path) -> Ended:
+    return command("examples", *words)
 
 
 def test_the_list_names_all() -> None:
     shown = _run()
-    assert shown.exit_code == 0
-    table, _, _ = shown.output.rpartition("\n\n")
+    assert shown.code == 0
+    table, _, _ = shown.out.rpartition("\n\n")
     head, _, *rows = re.split(r"\n(?=\S)", table)
     title = head.index("what it shows")
     for row, (name, example) in zip(rows, examples().items(), strict=True):
         assert row.split()[:2] == [name, example.kind]
         assert " ".join(line[title:] for line in row.splitlines()).split() == example.title.split()
-    assert _run("--quiet").output.split() == list(examples())
+    assert _run("--quiet").out.split() == list(examples())
 
 
 def test_a_recipe_is_shown_and_copied_with_its_scripts(tmp_path: Path) -> None:
-    assert _run("simulink").output == examples()["simulink"].text
+    assert _run("simulink").out == examples()["simulink"].text
     folder = tmp_path / "new" / "folder"
-    assert _run("Simulink.md", "-o", str(folder)).exit_code == 0
+    assert _run("Simulink.md", "-o", str(folder)).code == 0
     assert {p.name for p in folder.iterdir()} == {"simulink.md", "run_stack.m"}
     assert "add_block" in (folder / "run_stack.m").read_text(encoding="utf-8")
 
 
 def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copied = _run("van-der-pol", "-o", str(tmp_path), "--copy-only")
-    assert copied.exit_code == 0
+    assert copied.code == 0
     assert [p.name for p in tmp_path.iterdir()] == ["van_der_pol.py"]
 
     def main(folder: Path) -> dict[str, float]:
@@ -145,9 +144,9 @@ def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(van_der_pol, "main", main)
     ran = _run("van_der_pol", "-o", str(tmp_path))
-    assert ran.exit_code == 0
-    assert "amplitude [m]: 2\n" in ran.output
-    assert "left.txt" in ran.output
+    assert ran.code == 0
+    assert "amplitude [m]: 2\n" in ran.out
+    assert "left.txt" in ran.out
     assert (tmp_path / "left.txt").is_file()
 
 
@@ -161,8 +160,8 @@ def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 )
 def test_mistakes_are_told(words: list[str], sentence: str) -> None:
     result = _run(*words)
-    assert result.exit_code == 2
-    assert sentence in result.output
+    assert result.code == 2
+    assert sentence in result.words
 
 
 def test_a_recipe_is_nothing_to_run(tmp_path: Path) -> None:

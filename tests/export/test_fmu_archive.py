@@ -22,10 +22,8 @@ import numpy.typing as npt
 import pytest
 from fmpy.validation import validate_fmu
 from lxml import etree  # type: ignore[import-untyped]
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.check import CheckRow
 from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
@@ -54,6 +52,7 @@ from psa_casadi.model.model_file import save_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Publication
+from tests.contract.helpers import done, refused
 from tests.export.fmu_models import assert_valid, entries, exported, model_named, rewritten
 from tests.tiers import slow_but
 
@@ -453,9 +452,8 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
     model = replace(model_named("flexure"), publication=Publication(author="file", version="0.9"))
     save_model(model, plain)
     options = ["--author", SAID.author, "--copyright", SAID.copyright, "--license", SAID.license]
-    command = ["export", "fmu", "--model", str(plain), "--fmi", str(fmi), "-o", str(path)]
-    done = CliRunner().invoke(app, [*command, *options])
-    assert done.exit_code == 0, done.output
+    command = ["export", "fmu", "--model", plain, "--fmi", str(fmi), "-o", path]
+    done(*command, *options)
     with zipfile.ZipFile(path) as archive:
         xml = archive.read("modelDescription.xml").decode()
         terms, page = (archive.read(f"documentation/{n}").decode()
@@ -470,9 +468,7 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
         as_exported = published_as(archived, model.plant())
         assert as_exported.publication.stated == stated
         assert list(unreproducible_parts(archived, as_exported)) == []
-    refused = CliRunner().invoke(app, [*command, "--author", " "])
-    assert refused.exit_code == 2
-    assert "--author is ' '" in refused.output
+    assert "--author is ' '" in refused(*command, "--author", " ")
 
 
 def test_a_licence_that_was_lost_is_found(tmp_path: Path) -> None:

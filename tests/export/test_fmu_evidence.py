@@ -11,10 +11,8 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.components.outputs import OUTPUT
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.measured import Playback, played_again
@@ -33,6 +31,7 @@ from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import loads
 from psa_casadi.records.split import whole
 from psa_casadi.variables import Interval
+from tests.contract.helpers import done
 from tests.export.fmu_models import assert_valid, exported, rewritten
 from tests.model.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
 from tests.tiers import slow, slow_but
@@ -117,9 +116,8 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
     psa.save_model(evident_model(), tmp_path / "m.json")
     path, sets = tmp_path / "m.fmu", tmp_path / "sets"
     line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
-    said = CliRunner().invoke(app, f"{line} --parameter-sets 1 --sets-to {sets}".split())
-    assert said.exit_code == 0, said.output
-    assert "documentation/evidence.html (records: short), 8 parameter sets" in said.output
+    said = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
+    assert "documentation/evidence.html (records: short), 8 parameter sets" in said
     found = files_inside(path)
     assert len(list(sets.iterdir())) == 8
     for file in sets.iterdir():

@@ -18,13 +18,12 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckRow, check_fmu
 from psa_casadi.export.importer import archive as limits
 from psa_casadi.export.importer.archive import Archive, archive_problems
+from tests.contract.helpers import command
 from tests.export.hostile_fmus import DEED, PLACE, hostile_fmu
 from tests.export.ssp_master import SspArchive
 from tests.tiers import slow, slow_but
@@ -92,13 +91,13 @@ def test_the_command_fails_and_says_why(tmp_path: Path, monkeypatch: pytest.Monk
     """It ended with exit code 0, and without a word."""
     monkeypatch.setenv(DEED, "load:exit")
     path = hostile_fmu(tmp_path / "h.fmu", 2)
-    done = CliRunner().invoke(app, ["check", str(path), "--timeout", "30", "--memory", "512"])
-    assert done.exit_code == 1
-    assert "binary loads" in done.stdout.splitlines()[-1]
-    head, *lines = done.stdout.splitlines()
+    ended = command("check", path, "--timeout", "30", "--memory", "512")
+    assert ended.code == 1
+    assert "binary loads" in ended.out.splitlines()[-1]
+    head, *lines = ended.out.splitlines()
     remarks = " ".join(" ".join(line[head.index("remark") :] for line in lines).split())
     assert "the FMU ended its process with exit code 0 before the checks were done" in remarks
-    assert "RUNS THE CODE" in CliRunner().invoke(app, ["check", "--help"]).stdout
+    assert "RUNS THE CODE" in command("check", "--help").out
 
 
 @slow

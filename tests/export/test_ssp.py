@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from fmpy.ssp.ssd import read_ssd
 from lxml import etree  # type: ignore[import-untyped]
-from typer.testing import CliRunner, Result
 
-from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.importer.masters import Signals
@@ -193,35 +191,6 @@ def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     )
     assert results is not None
     assert results[1] == wiring.name
-
-
-def psa(*arguments: str) -> Result:
-    return CliRunner().invoke(app, arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentences"),
-    [
-        (("--model", "m.json", "--stack", "demo", "-o", "stage.ssp"), ("both given",)),
-        (
-            ("--stack", "P-1", "-o", "absent/stage.ssp", "--picture", "wiring.gif"),
-            ("P-1", "absent does not exist", "is .svg or .png"),
-        ),
-        (("--stack", "P-885.51", "--platforms", "vax", "-o", "stage.ssp"), ("vax",)),
-    ],
-)
-def test_mistakes_are_told_at_once_and_nothing_is_written(
-    arguments: tuple[str, ...],
-    sentences: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found = psa("export", "ssp", *arguments)
-    assert found.exit_code == 2
-    for sentence in sentences:
-        assert sentence in found.output
-    assert not list(tmp_path.iterdir())
 
 
 def ramp() -> Signals:

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import wrong_start_values
 from psa_casadi.export.check.structure import wrong_start
@@ -24,6 +22,7 @@ from psa_casadi.files import temporary_folder
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.simulation.start import initial_slope, start_state
 from psa_casadi.units import FloatArray
+from tests.contract.helpers import done, refused
 from tests.export.fmu_models import exported, model_named
 from tests.model.stack_models import jacobian, sine, stack
 from tests.tiers import slow
@@ -174,17 +173,14 @@ def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> 
 
 def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     path = tmp_path / "PiezoStack.mo"
-    command = ["export", "modelica", "--stack", "P-885.51", "-o", str(path)]
-    done = CliRunner().invoke(app, [*command, "--start-voltage", "60", "--history", "120"])
-    assert done.exit_code == 0, done.output
+    command = ["export", "modelica", "--stack", "P-885.51", "-o", path]
+    done(*command, "--start-voltage", "60", "--history", "120")
     text = path.read_text()
     starts = psa.settled_at(STACK, 60.0, [120.0]).own_starts()
     assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
     assert 'input Real voltage(unit="V", start=60.0' in text
     for history, said in (("120", "--start-voltage"), ("high", "--history is 'high'")):
-        refused = CliRunner().invoke(app, [*command, "--history", history])
-        assert refused.exit_code == 2
-        assert said in refused.output
+        assert said in refused(*command, "--history", history)
 
 
 @pytest.mark.parametrize(
@@ -205,12 +201,6 @@ TIME = np.linspace(0.0, 0.1, 1001)
 VOLTAGE = 60.0 + 60.0 * np.sin(2 * np.pi * 10.0 * TIME)
 
 
-def _run(*words: str) -> str:
-    done = CliRunner().invoke(app, list(words))
-    assert done.exit_code == 0, done.output
-    return done.output
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sine about 60 V, the stack as a model file, with and without starts, and its FMU."""
@@ -218,17 +208,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     psa.write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
     psa.save_model(STACK, made / "plain.json")
     psa.save_model(psa.settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
-    said = _run(
-        "export", "fmu", "--model", str(made / "plain.json"), "-o", str(made / "m.fmu"), *OPTIONS
-    )
+    said = done(
+        "export", "fmu", "--model", made / "plain.json", "-o", made / "m.fmu", *OPTIONS
+    ).words
     assert "start: the start values of the model at 60 V" in said
     return made
 
 
 def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str]:
     out = folder / "out.csv"
-    files = ["--model", str(folder / model), "--input", str(folder / "v.csv"), "-o", str(out)]
-    said = _run("simulate", *files, *options)
+    files = ["--model", folder / model, "--input", folder / "v.csv", "-o", out]
+    said = done("simulate", *files, *options).out
     found = psa.read_record(out).displacement
     assert found is not None
     return found, next(line for line in said.splitlines() if line.startswith("start: "))

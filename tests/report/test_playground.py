@@ -11,14 +11,13 @@ import fmpy
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.model.model_file import loads
 from psa_casadi.report.page.playground import playground
 from psa_casadi.simulation.compiler import run_compiler
+from tests.contract.helpers import done
 from tests.model.sampled_models import controller
 from tests.report.browser import SCRIPTS, Browser, driven, on_a_phone
 from tests.report.test_report_browser import told_of
@@ -156,9 +155,7 @@ def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> N
 def test_the_command_plays_a_model_of_ones_own(tmp_path: Path) -> None:
     model = psa.stack_model("PTBS200").with_effect(psa.EFFECTS["slow_creep"], {"creep_gain": 0.02})
     psa.save_model(model, tmp_path / "m.json")
-    words = ["web", str(tmp_path / "m.json"), "-o", str(tmp_path / "p.html"), "--quiet"]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.output
+    done("web", tmp_path / "m.json", "-o", tmp_path / "p.html", "--quiet")
     text = (tmp_path / "p.html").read_text(encoding="utf-8")
     assert "Play with PTBS200" in text
     assert "0.02" in text
