@@ -240,8 +240,11 @@ def asked(
 @posix
 def test_the_page_that_diagnoses_answers_to_who_has_its_address_alone(tmp_path: Path) -> None:
     with served(tmp_path) as (place, token):
-        for path in ("/", "/state", "/?token=guess"):
+        guess = f"psa_{place.partition(':')[2]}=guess"
+        for path in ("/", "/state", "/report", "/?token=", "/?token=guess", "/files/report.html"):
             assert asked(place, "GET", path)[0] == 403
+        assert asked(place, "POST", "/start")[0] == 403
+        assert asked(place, "GET", "/", Cookie=guess)[0] == 403
         assert asked(place, "GET", f"/?token={token}", Host="psa.example")[0] in (400, 403, 421)
         status, headers, page = asked(place, "GET", f"/?token={token}")
         assert status == 200

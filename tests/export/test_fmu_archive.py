@@ -28,7 +28,6 @@ from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.check import CheckRow
 from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
 from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
-from psa_casadi.export.common.parameter_sets import parameter_set
 from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu import sources
@@ -334,24 +333,6 @@ def table(content: bytes) -> Table:
 
 
 # Parameter sets
-
-
-@pytest.mark.parametrize("model", [psa.stack_model(STACK), flexure, every_effect])
-def test_parameter_sets_hold_every_value_exactly(model: psa.Model) -> None:
-    text = parameter_set(model)
-    assert_valid(text, "ssp", "schema", "SystemStructureParameterValues.xsd")
-    root = ET.fromstring(text)
-    spaces = {"v": root.tag[1:].partition("}")[0]}
-    spaces["c"] = spaces["v"].replace("ParameterValues", "Common")
-    found = {p.attrib["name"]: p for p in root.iterfind("v:Parameters/v:Parameter", spaces)}
-    units = {u.attrib["name"] for u in root.iterfind("v:Units/c:Unit", spaces)}
-    assert list(found) == list(model.parameter_names)
-    for p in model.structure.parameters:
-        real = found[p.name].find("v:Real", spaces)
-        assert real is not None
-        assert float(real.attrib["value"]) == model.values[p.name]
-        assert real.attrib["unit"] == p.unit
-        assert p.unit in units
 
 
 # The reference run

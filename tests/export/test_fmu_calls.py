@@ -175,19 +175,6 @@ def test_what_the_model_does_not_have_gives_no_instance() -> None:
     assert b"no scheduled execution" in said[-1]
 
 
-def test_co_simulation_equals_that_of_fmi_2_bit_for_bit(slave: Instance3) -> None:
-    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION) as older:
-        for k in range(200):
-            voltage = 50.0 * np.sin(0.1 * k) if k < 150 else -20.0
-            slave.set({"voltage": voltage})
-            older.set({"voltage": voltage})
-            done = slave.try_step(k * 1e-5, 1e-5)
-            assert done[:4] == (OK, False, False, False)
-            assert done.time == pytest.approx((k + 1) * 1e-5)
-            older.step(k * 1e-5, 1e-5)
-            assert slave.get(OUTPUTS).tobytes() == older.get(OUTPUTS).tobytes()
-
-
 def test_calls_out_of_order_are_refused_with_function_and_state(slave: Instance3) -> None:
     vector = (c_double * 20)()
     illegal: dict[str, tuple[object, ...]] = {

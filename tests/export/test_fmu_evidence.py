@@ -54,6 +54,14 @@ def test_experiments_name_files_that_are_there() -> None:
         assert all(f"{FOLDER}/{e.attrib['source']}" in found for e in experiment)
     for name in (n for n in found if n.endswith(".ssv")):
         assert_valid(found[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
+        root = ET.fromstring(found[name])
+        told = {
+            p.get("name"): p[0].get("unit") for p in root.iterfind("{*}Parameters/{*}Parameter")
+        }
+        assert {*told.values()} <= {u.get("name") for u in root.iterfind("{*}Units/{*}Unit")}
+        own = {p.name: p.unit for p in evident_model().structure.parameters if p.name in told}
+        assert own.items() <= told.items()
+        assert own
     one = found[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
     assert re.findall(r'Parameter name="(\w+)"', one) == ["k_L", "A", "tau"]
 

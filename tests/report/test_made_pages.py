@@ -3,7 +3,6 @@
 import json
 import re
 
-import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from typer.core import TyperGroup
@@ -107,18 +106,3 @@ def test_the_page_of_ports_has_every_port_with_its_sign() -> None:
     names = {i.name for c in psa.COMPONENTS.values() for i in c.inputs}
     names |= {o.name for c in psa.COMPONENTS.values() for o in c.outputs}
     assert names <= {*re.findall(r"^\|.*?`(\w+)` \| (?:in|out) \|", text, re.MULTILINE)}
-
-
-def test_the_signs_of_the_page_are_those_of_the_models() -> None:
-    model = psa.stack_model("P-885.51").plant()
-    t = np.linspace(0.0, 0.02, 201)
-    rising = psa.simulate(model, t, 5000.0 * t).outputs
-    for name in ("displacement", "velocity", "current", "charge", "blocked_force"):
-        assert rising[name][100] > 0, name
-    pulled = psa.simulate(model, t, 0 * t, load_force=np.minimum(1e4 * t, 50.0)).outputs
-    assert pulled["displacement"][-1] > 0
-    stage = psa.part_model("flexure_stage")
-    x0 = np.zeros(len(stage.state_names))
-    pushed = psa.run(stage, t, np.column_stack([1e-3 * t, 1e-3 + 0 * t]), x0, hold="linear").y
-    force, position = pushed[-1]
-    assert force < 0 < position

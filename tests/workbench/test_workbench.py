@@ -99,15 +99,6 @@ def tab(server: Server) -> Tab:
     return Tab(server).enter()
 
 
-def test_only_who_has_the_address_gets_in(server: Server) -> None:
-    stranger = Tab(server)
-    for path in ("/", "/state", "/report", "/?token=", "/?token=guess", "/files/report.html"):
-        assert stranger.ask("GET", path)[0] == 403, path
-    assert stranger.post("/start") == 403
-    stranger.cookie = f"psa_{server.port}=guess"
-    assert stranger.ask("GET", "/")[0] == 403
-
-
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
