@@ -27,7 +27,7 @@ from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import simulated
 from tests.export.ssp_systems import END, RATE, monolithic
 from tests.studies.benchmarks.coupling import load_ecos
-from tests.tiers import slow, slow_but
+from tests.tiers import slow_but
 
 STACK = "P-885.51"
 #: The two versions are two faces of one core: each kind of model in one of them, one in both. Other
@@ -178,28 +178,6 @@ def _error(result: Any) -> float:
     times, first = np.unique(result["time"], return_index=True)
     truth = _truth(times)
     return float(np.max(np.abs(result["displacement"][first] - truth)) / np.ptp(truth))
-
-
-@VERSIONS
-@pytest.mark.parametrize("tolerance", slow_but([1e-6], [1e-4, 1e-6, 1e-8]))
-def test_fmpy_co_simulation(fmi: int, tolerance: float) -> None:
-    result = fmpy.simulate_fmu(
-        str(exported(STACK, fmi)), stop_time=0.03, fmi_type="CoSimulation",
-        relative_tolerance=tolerance, output_interval=1e-3, input=_jumps(), output=["displacement"],
-    )  # fmt: skip
-    assert len(np.unique(result["time"])) >= 31
-    assert _error(result) < 10.0 * tolerance
-
-
-@slow
-def test_fmpy_co_simulation_with_events_and_early_return() -> None:
-    """FMI 3: the importer enters event mode at the jumps and may be returned to early."""
-    result = fmpy.simulate_fmu(
-        str(exported(STACK, 3)), stop_time=0.03, fmi_type="CoSimulation", relative_tolerance=1e-7,
-        output_interval=1e-3, input=_jumps(), output=["displacement"], use_event_mode=True,
-        early_return_allowed=True,
-    )  # fmt: skip
-    assert _error(result) < 1e-6
 
 
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))

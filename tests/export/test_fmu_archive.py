@@ -433,7 +433,7 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
     model = replace(model_named("flexure"), publication=Publication(author="file", version="0.9"))
     save_model(model, plain)
     options = ["--author", SAID.author, "--copyright", SAID.copyright, "--license", SAID.license]
-    command = ["export", "fmu", "--model", plain, "--fmi", str(fmi), "-o", path]
+    command = ("export", "fmu", "--model", plain, "--fmi", str(fmi), "-o", path)
     done(*command, *options)
     with zipfile.ZipFile(path) as archive:
         xml = archive.read("modelDescription.xml").decode()

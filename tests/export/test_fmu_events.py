@@ -11,7 +11,6 @@ import fmpy
 import numpy as np
 import pytest
 from fmpy import simulate_fmu
-from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi import reference
@@ -35,9 +34,6 @@ from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
 (SWITCH,) = [v.name for v in variable_table(model_named(STACK)) if v.kind == "indicator"]
-#: Corners of a triangle of 100 Hz, 0 V to 50 V [s], [V]
-CORNERS = np.array([0.0, 5e-3, 10e-3, 15e-3, 20e-3])
-VOLTS = np.array([0.0, 50.0, 0.0, 50.0, 0.0])
 
 
 def _rate(u: float, voltage: float) -> float:
@@ -96,42 +92,6 @@ def test_a_held_voltage_makes_no_events(fmi: int) -> None:
     assert np.count_nonzero(np.diff(path["time"]) == 0.0) <= 4
 
 
-@slow
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_importer_locates_reversals_where_they_are(fmi: int) -> None:
-    """After a corner of a triangle, u turns R_s C_p ln 2 later: the drive is of first order."""
-    events: list[float] = []
-    with Fmu(exported(STACK, fmi)) as fmu, fmu.start(MODEL_EXCHANGE, tolerance=1e-6) as instance:
-        nominal = np.array([fmu.nominals[n] for n in fmu.states()])
-
-        def slope(time: float, x: FloatArray) -> FloatArray:
-            return instance.derivatives(
-                time, x, {"voltage": float(np.interp(time, CORNERS, VOLTS))}
-            )
-
-        def indicator(time: float, x: FloatArray) -> float:
-            slope(time, x)
-            return float(instance.vector("GetEventIndicators", 1)[0])
-
-        indicator.terminal = True  # type: ignore[attr-defined]  # as scipy asks for it
-        time, x = 0.0, np.zeros(len(nominal))
-        while time < CORNERS[-1]:
-            solved = solve_ivp(
-                slope, (time, float(CORNERS[-1])), x, "Radau", events=indicator,
-                rtol=1e-6, atol=1e-6 * nominal, max_step=1e-4,
-            )  # fmt: skip
-            time, x = float(solved.t[-1]), solved.y[:, -1]
-            if time < CORNERS[-1]:
-                events.append(time)
-                instance.require("EnterEventMode")
-                instance.update_discrete_states()
-                instance.require("EnterContinuousTimeMode")
-    values = model_named(STACK).values
-    turns = CORNERS[1:-1] + values["R_s"] * values["C_p"] * np.log(2.0)
-    assert len(events) == len(turns) == 3
-    assert np.abs(events - turns).max() < 0.01 * values["R_s"] * values["C_p"]
-
-
 @cache
 def fmu(fmi: int) -> Fmu:
     return Fmu(exported(STACK, fmi))
@@ -174,14 +134,6 @@ def test_a_ramp_in_fmpy_at_its_default_tolerance(name: str, fmi: int, interval: 
     found = errors(name, fmi, [0.0, 0.1, 0.2], [0.0, 0.8, 0.0], interval)
     assert found["displacement"] < 3e-4
     assert found["velocity"] < 0.03
-
-
-@pytest.mark.parametrize("name", slow_but(["demo"], [STACK, "PTBS200", "demo", "slow_creep"]))
-def test_a_jump_in_fmpy_at_its_default_tolerance(name: str) -> None:
-    """The tolerance of a velocity is a tenth of what it was, and 33 % of its range were wrong."""
-    found = errors(name, 2, [0.0, 2e-3, 2e-3, 0.02], [0.0, 0.0, 0.8, 0.8], 1e-4)
-    assert found["displacement"] < 1e-3
-    assert found["velocity"] < 0.05
 
 
 def rates(fmi: int, asked: str, *, jump: bool = False, last: float | None = None) -> FloatArray:

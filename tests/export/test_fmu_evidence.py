@@ -306,15 +306,6 @@ def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
 
 
 @pytest.mark.slow
-def test_the_whole_check_with_evidence() -> None:
-    report = psa.check_fmu(evident_fmu(), evidence=True, records=[noisy_record()])
-    assert report.passed, report.failures
-    names = [r.name for r in report.rows]
-    assert {"evidence inside", "reproducible", "reference run"} < set(names)
-    assert names[-1] == "held-out error of short"
-
-
-@pytest.mark.slow
 def test_an_fmu_without_evidence_does_not_pass_when_it_is_asked_for() -> None:
     """Where none is asked for, it passes: tests/export/test_fmu.py."""
     report = psa.check_fmu(exported("P-885.51"), evidence=True)

@@ -173,7 +173,7 @@ def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> 
 
 def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     path = tmp_path / "PiezoStack.mo"
-    command = ["export", "modelica", "--stack", "P-885.51", "-o", path]
+    command = ("export", "modelica", "--stack", "P-885.51", "-o", path)
     done(*command, "--start-voltage", "60", "--history", "120")
     text = path.read_text()
     starts = psa.settled_at(STACK, 60.0, [120.0]).own_starts()
@@ -217,7 +217,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str]:
     out = folder / "out.csv"
-    files = ["--model", folder / model, "--input", folder / "v.csv", "-o", out]
+    files = ("--model", folder / model, "--input", folder / "v.csv", "-o", out)
     said = done("simulate", *files, *options).out
     found = psa.read_record(out).displacement
     assert found is not None

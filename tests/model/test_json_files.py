@@ -38,7 +38,6 @@ def _short() -> Evidence | None:
 SAVED = replace(
     MODEL,
     evidence=_short(),
-    publication=psa.Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0"),
     provenance=Provenance(
         identified_from=(("rig", "0" * 64),),
         free=("k_L", "tau"),
@@ -73,6 +72,11 @@ def same_or_refused(text: str) -> bool:
     assert dict(again.values) == dict(model.values)
     assert again.own_starts() == model.own_starts()
     return False
+
+
+def test_a_whole_file_comes_back() -> None:
+    said = psa.Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+    assert not same_or_refused(dumps(replace(SAVED, publication=said)))
 
 
 def _places(content: Any) -> Iterator[tuple[Any, Any]]:

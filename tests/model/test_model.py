@@ -11,13 +11,10 @@ import psa_casadi as psa
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.records.split import divided
-from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.variables import Interval
 from tests.model.evidence_models import NOISE, OFFSET, evident_model, noisy_record
-from tests.tiers import slow_but
 
 CREEP, DRIFT = psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]
-SETS = {"base": psa.BASE, "simplified": psa.SIMPLIFIED, "all": (*psa.BASE, *psa.EFFECTS.values())}
 
 
 def component(equations: Callable[[psa.Symbols], psa.Equations], **declared: Any) -> psa.Component:
@@ -93,21 +90,6 @@ def test_effects_come_and_go_without_a_trace() -> None:
     back = extended.without(["slow_creep", "offset_drift"])
     assert back.structure is base.structure
     assert back.values == base.values
-
-
-@pytest.mark.parametrize("name", slow_but([n for n in SETS if n != "all"], SETS))
-def test_velocity_is_the_rate_of_the_displacement(name: str) -> None:
-    model = psa.compose(SETS[name])
-    gains = {"creep_gain": 0.05, "mode_gain": 0.2}
-    model = model.with_values({k: v for k, v in gains.items() if k in model.values})
-    t = np.linspace(0.0, 2e-3, 4001)
-    given = {"voltage": 50.0 * (1.0 - np.cos(4e3 * t)), "load_force": 20.0 * np.sin(3e3 * t)}
-    u = input_samples(model, len(t), given)
-    y = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-9).y
-    x, v = (y[:, model.output_names.index(n)] for n in ("displacement", "velocity"))
-    slope = (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * 5e-7)
-    assert np.ptp(x) > 5e-6
-    np.testing.assert_allclose(slope[5:], v[7:-2], rtol=0, atol=1e-6 * np.ptp(v))
 
 
 def evidence_in(model: psa.Model) -> Evidence:

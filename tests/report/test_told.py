@@ -185,6 +185,11 @@ def told(result: Result) -> list[str]:
     return [re.sub(r"\b[0-9a-f]{64}\b", "SHA-256", line.rstrip()) for line in kept]
 
 
+def place(name: str) -> Path:
+    """Return the file of what was accepted for a case."""
+    return FOLDER / f"{name.replace(' ', '_')}.txt"
+
+
 def now(name: str) -> list[str]:
     """Return what is told of a case."""
     if name in WHOLE:
@@ -216,7 +221,7 @@ def _last_digit(number: str) -> float:
 
 @pytest.mark.parametrize("name", [*WHOLE, *OTHERWISE])
 def test_what_is_told_is_what_was_accepted(name: str) -> None:
-    accepted = (FOLDER / f"{name}.txt").read_text("utf-8").splitlines()
+    accepted = place(name).read_text("utf-8").splitlines()
     found = now(name)
     if len(found) != len(accepted) or not all(map(alike, found, accepted)):
         change = "\n".join(difflib.unified_diff(accepted, found, "accepted", "found", lineterm=""))
@@ -232,4 +237,4 @@ def test_other_words_and_numbers_are_noticed() -> None:
 
 if __name__ == "__main__":
     for case in (*WHOLE, *OTHERWISE):
-        (FOLDER / f"{case}.txt").write_text("\n".join(now(case)) + "\n", encoding="utf-8")
+        place(case).write_text("\n".join(now(case)) + "\n", encoding="utf-8")
