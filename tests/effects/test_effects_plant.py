@@ -359,23 +359,13 @@ def test_a_held_voltage_holds_the_output(effect: Component, base: tuple[Componen
 _STROKE, _RATED, _NOISE = 20e-6, 100.0, 20e-9
 
 
-def _plays(v: FloatArray, radii: FloatArray) -> FloatArray:
-    """Ideal play operators (n, k), from rest at 0 V."""
-    found = np.empty((v.size, radii.size))
-    state = np.zeros(radii.size)
-    for k, value in enumerate(v):
-        state = np.clip(state, value - radii, value + radii)
-        found[k] = state
-    return found
-
-
 def _loops() -> dict[str, FloatArray]:
     """Loops of rising and falling amplitude of a generalised Prandtl-Ishlinskii stack."""
     t = np.arange(3000) * 2e-3
     swing = 0.5 * _RATED * np.interp(t, [0.0, 3.0, 6.0], [0.1, 1.0, 0.3])
     v = swing * (1.0 - np.cos(2.0 * np.pi * 1.5 * t))
     radii = _RATED * np.array([0.015, 0.04, 0.08, 0.13, 0.2, 0.3])
-    plays = _plays(v, radii) / _RATED
+    plays = np.column_stack([play(v, radius) for radius in radii]) / _RATED
     weights = np.array([0.04, 0.035, 0.03, 0.03, 0.025, 0.02])
     x = 0.75 * v / _RATED + plays @ weights + plays**2 @ (0.6 * weights[::-1])
     noise = np.random.default_rng(7).normal(0.0, _NOISE, t.size)

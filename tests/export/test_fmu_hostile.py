@@ -30,6 +30,7 @@ from psa_casadi.files import temporary_folder
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
 from tests.contract.helpers import command
 from tests.export.ssp_master import SspArchive
+from tests.test_files import ended
 from tests.tiers import slow, slow_but
 
 #: What the library does, and when: "MOMENT:DEED" in this variable; MOMENT is load, make or step.
@@ -162,7 +163,7 @@ def test_a_hang_ends_at_the_time_limit(
         "did not come back within the time limit of 4 s of the whole check (--timeout sets it)"
         in row.remark
     )
-    assert _gone(tmp_path / "place")
+    assert ended(int((tmp_path / "place").read_text()))
 
 
 @slow
@@ -171,22 +172,7 @@ def test_a_process_of_the_fmu_is_ended_with_it(
 ) -> None:
     monkeypatch.setenv(PLACE, str(tmp_path / "place"))
     _ended(tmp_path, 2, "step:child", monkeypatch)
-    assert _gone(tmp_path / "place")
-
-
-def _gone(place: Path) -> bool:
-    """Say whether the process that noted its number ends within a second."""
-    number = int(place.read_text())
-    for _ in range(50):
-        try:
-            os.kill(number, 0)
-            state = Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except (ProcessLookupError, FileNotFoundError):
-            return True
-        if state == "Z":  # dead, and not yet fetched by whoever inherited it
-            return True
-        time.sleep(0.02)
-    return False
+    assert ended(int((tmp_path / "place").read_text()))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits memory")
@@ -224,7 +210,7 @@ def test_a_request_to_end_leaves_nothing_behind(request_: signal.Signals, tmp_pa
         process.send_signal(request_)
         assert process.wait(30) not in (0, 1, 2)
     assert list(folder.iterdir()) == []
-    assert _gone(place)
+    assert ended(int(place.read_text()))
 
 
 Change = Callable[[zipfile.ZipFile], None]
