@@ -1,17 +1,22 @@
 """Every effect's claims, measured: one test for all entries of the table."""
 
+import ctypes
 import random
+from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 
 import psa_casadi as psa
 from psa_casadi.component import READ_OFF, RECORD_DURATION
+from psa_casadi.model.compose import Structure
+from psa_casadi.simulation.compiler import functions_of, generate_c, shared_library
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.units import FloatArray, convert
 from psa_casadi.variables import nominal_value
 from tests.model.random_models import Point, random_model, random_point
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 ALL = tuple(psa.EFFECTS.values())
 _draw = random.Random(20)  # pairs and triples: all of them would take too long
@@ -20,6 +25,8 @@ SETS = [
     *(tuple(_draw.sample(ALL, size)) for size in (2, 3) for _ in range(15)),
     ALL,
 ]
+#: All effects at once take long to compile.
+EVERY = pytest.param(ALL, marks=slow)
 every_effect = pytest.mark.parametrize("effect", ALL, ids=lambda e: e.name)
 #: What runs the compiled model is tried with every fourth effect in the quick tier.
 each_in_turn = pytest.mark.parametrize("effect", slow_but(ALL[::4], ALL), ids=lambda e: e.name)
@@ -29,10 +36,45 @@ def name_of(effects: tuple[psa.Component, ...]) -> str:
     return "all" if effects == ALL else "+".join(e.name for e in effects) or "base"
 
 
+#: The functions of model.h that the Python side compiles, seen from outside the library.
+_EXPORTS = """\
+#include "model.h"
+#define FACE(name) __attribute__((visibility("default"))) int test_##name
+#define POINT double t, const double *x, const double *u, const double *p
+static double w[PSA_SZ_W];
+FACE(ode)(POINT, double *a) { return psa_model_ode(t, x, u, p, a, w); }
+FACE(jacobian)(POINT, double *a) { return psa_model_jacobian(t, x, u, p, a, w); }
+FACE(outputs)(POINT, double *a) { return psa_model_outputs(t, x, u, p, a, w); }
+FACE(switches)(POINT, double *a) { return psa_model_switches(t, x, u, p, a, w); }
+FACE(sensitivity)(POINT, double *a, double *b) {
+    return psa_model_sensitivity(t, x, u, p, a, b, w);
+}
+FACE(output_sensitivity)(POINT, double *a, double *b) {
+    return psa_model_output_sensitivity(t, x, u, p, a, b, w);
+}
+"""
+
+
+@cache
+def compiled(structure: Structure) -> ctypes.CDLL:
+    texts = generate_c(structure, sensitivities=True) | {"exports.c": _EXPORTS}
+    return ctypes.CDLL(str(shared_library(texts, ["model_casadi.c"])))
+
+
 def values_of(model: psa.Model, point: Point) -> list[FloatArray]:
     """Return x' and the outputs as CasADi evaluates them."""
     result = model.structure.f(point.time, point.x, point.u, model.parameter_vector())
     return [np.array(part).ravel() for part in result]
+
+
+def c_values(model: psa.Model, name: str, point: Point, sizes: list[int]) -> list[FloatArray]:
+    """Call one compiled function; its results have the given sizes."""
+    results = [np.full(size, np.nan) for size in sizes]
+    arrays = (point.x, point.u, model.parameter_vector(), *results)
+    function = getattr(compiled(model.structure), f"test_{name}")
+    pointers = [ctypes.c_void_p(a.ctypes.data) for a in arrays]
+    assert function(ctypes.c_double(point.time), *pointers) == 0
+    return results
 
 
 def drive(
@@ -149,6 +191,25 @@ def test_variables_have_units_bounds_and_sizes(component: psa.Component) -> None
         assert len(variable.description) > 3
         unit = variable.display_unit or variable.unit
         assert convert(1.0, variable.unit, unit) > 0.0
+
+
+@pytest.mark.parametrize("effects", [(), EVERY], ids=name_of)
+def test_c_value_is_the_casadi_value(effects: tuple[psa.Component, ...]) -> None:
+    generator = np.random.default_rng(4)
+    for gains in (True, True, True, False):
+        model = random_model(effects, generator, gains=gains)
+        point = random_point(model, generator)
+        functions = functions_of(model.structure, sensitivities=True)
+        at = [ca.DM(v) for v in (point.time, point.x, point.u, model.parameter_vector())]
+        rate, outputs = model.structure.f.call(at)
+        for name, function in functions.items():
+            plain = {"psa_ode": [rate], "psa_outputs": [outputs]}
+            expected = plain.get(name) or function.call(at)
+            wanted = [np.array(e).ravel(order="F") for e in expected]
+            sizes = [w.size for w in wanted]
+            found = c_values(model, name.removeprefix("psa_"), point, sizes)
+            for ours, theirs in zip(found, wanted, strict=True):
+                np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=0, err_msg=name)
 
 
 @each_in_turn

@@ -18,12 +18,6 @@ from psa_casadi.command_line import typed
 from psa_casadi.notes import note
 from psa_casadi.report.page.designs import write_design_page
 from psa_casadi.report.words.notes import SENTENCES
-from psa_casadi.report.words.phrases import (
-    handy_scale,
-    length_scale,
-    one_unit,
-    quantity,
-)
 from tests.report.html_page import Page, written
 from tests.report.report_cases import diagnosis, identification
 
@@ -64,23 +58,6 @@ def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
     assert f"'sha256-{digest}'" in text.split("Content-Security-Policy", 1)[1].split(">", 1)[0]
     assert text.count("Displacement, and residual") == 0
     assert "at the top of the page" in text
-
-
-def test_a_quantity_in_a_sentence_has_the_unit_of_its_page() -> None:
-    values = [(-0.29e-6, "m"), (0.17, "s"), (6e-8, "m"), (1.2e-5, "m"), (3e-3, "m"), (3.0, "V")]
-
-    def shown() -> list[str]:
-        return [quantity(*value) for value in values]
-
-    handy = ["-0.29 µm", "0.17 s", "60 nm", "12 µm", "3 mm", "3 V"]
-    assert shown() == handy
-    with one_unit(handy_scale(2e-9)):
-        assert shown() == ["-290 nm", *handy[1:]]
-    with one_unit(handy_scale(2e-6)):
-        assert shown() == [*handy[:2], "0.06 µm", *handy[3:]]
-    with one_unit(length_scale(1.0, counts=True)):
-        assert shown() == handy
-    assert shown() == handy  # a unit of a page ends with it
 
 
 def _said() -> list[tuple[str, set[str]]]:
