@@ -124,6 +124,12 @@ OTHERWISE: dict[str, tuple[str, Callable[[], Result]]] = {
         lambda: replace(diagnosis("ambiguous"), budget=shares(-0.1, -0.1, together=-0.1)),
     ),
     "many rivals": ("ambiguous", lambda: rival(*(f"effect_{k}" for k in range(9)))),
+    "no rival": (
+        "cause_named",
+        lambda: replace(
+            diagnosis("cause_named"), candidates=diagnosis("cause_named").candidates[:1]
+        ),
+    ),
     "a second cause": ("partly_explained", with_memory),
     "shares of several": (
         "partly_explained",
