@@ -37,7 +37,7 @@ from psa_casadi.simulation.compiler import (
     zig_command,
 )
 from tests.export.c_host.build import HEADERS
-from tests.export.fmu_models import rewritten
+from tests.export.fmu_models import files_inside, rewritten
 from tests.model.stack_models import stack
 from tests.simulation.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect
 from tests.tiers import slow, slow_but
@@ -491,8 +491,6 @@ def test_the_check_notices_smaller_errors_than_there_are(tmp_path: Path) -> None
     assert {"reproducible", "fixed step, tones", "fixed step, jumps"} <= failed
     assert "fixed step, ramps and holds, 10 at once" not in failed
     for nothing in (b"{}", b'{"errors": {"sine": "x"}}', b"no JSON"):
-        with zipfile.ZipFile(changed) as archive:
-            entries = {n: archive.read(n) for n in archive.namelist()}
-        write_archive(tmp_path / "c.fmu", {**entries, FIXED_ENTRY: nothing})
+        write_archive(tmp_path / "c.fmu", {**files_inside(changed), FIXED_ENTRY: nothing})
         with pytest.raises(psa.InputError, match=r"fixed_step\.json.*xport the FMU again"):
             psa.check_fmu(tmp_path / "c.fmu")

@@ -32,8 +32,8 @@ from psa_casadi.model.model_file import loads
 from psa_casadi.records.split import whole
 from psa_casadi.variables import Interval
 from tests.contract.helpers import done
-from tests.export.fmu_models import assert_valid, exported, rewritten
-from tests.model.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
+from tests.export.fmu_models import assert_valid, exported, files_inside, rewritten
+from tests.model.evidence_models import evident_fmu, evident_model, noisy_record
 from tests.tiers import slow, slow_but
 
 

@@ -1,7 +1,6 @@
 """A model with evidence: three values fitted to a short noisy record, judged on held-out blocks."""
 
 import tempfile
-import zipfile
 from functools import cache
 from pathlib import Path
 
@@ -44,9 +43,3 @@ def evident_fmu(fmi: int = 2) -> Path:
     return psa.export_fmu(
         evident_model(), path, name="evident", fmi=fmi, parameter_sets=2, validity_output=True
     )
-
-
-def files_inside(path: Path) -> dict[str, bytes]:
-    """Return the files of an archive by their place."""
-    with zipfile.ZipFile(path) as archive:
-        return {n: archive.read(n) for n in archive.namelist()}

@@ -7,7 +7,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -196,6 +196,7 @@ def place(name: str) -> Path:
     return FOLDER / f"{name.replace(' ', '_')}.txt"
 
 
+@cache
 def now(name: str) -> list[str]:
     """Return what is told of a case."""
     if name in WHOLE:
