@@ -133,12 +133,8 @@ def test_results_are_data_frames() -> None:
     parameters = found.to_frame().set_index("parameter")
     assert parameters.value.to_dict() == dict(found.model.values)
     assert (parameters.low <= parameters.value)[parameters.low.notna()].all()
-    run = psa.simulate(found.model, T, V)
-    table = run.to_frame()
-    np.testing.assert_array_equal(table["voltage [V]"], V)
+    table = psa.simulate(found.model, T, V).to_frame()
     assert {"time [s]", "measured_displacement [m]", "f_H [N]"} <= {*table}
-    read = psa.record_from(table[["time [s]", "voltage [V]", "displacement [m]"]])
-    np.testing.assert_array_equal(read.displacement, run.outputs["displacement"])
 
 
 def test_one_output_is_drawn_on_the_axes_that_are_given() -> None:

@@ -187,5 +187,8 @@ def test_links_to_recipes_and_notebooks_lead_to_their_pages_in_the_site() -> Non
     assert recipes <= set(copied_pages.RECIPES)
 
 
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+def test_the_readme_is_short_and_its_badges_are_of_workflows() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    badges = set(re.findall(r"\.\./\.\./actions/workflows/([\w.]+)/badge\.svg", text))
+    assert badges <= {path.name for path in (ROOT / ".github" / "workflows").iterdir()}

@@ -136,6 +136,14 @@ def test_a_ramp_in_fmpy_at_its_default_tolerance(name: str, fmi: int, interval: 
     assert found["velocity"] < 0.03
 
 
+@pytest.mark.parametrize("name", slow_but(["demo"], [STACK, "PTBS200", "demo", "slow_creep"]))
+def test_a_jump_in_fmpy_at_its_default_tolerance(name: str) -> None:
+    """The tolerance of a velocity is a tenth of what it was, and 33 % of its range were wrong."""
+    found = errors(name, 2, [0.0, 2e-3, 2e-3, 0.02], [0.0, 0.0, 0.8, 0.8], 1e-4)
+    assert found["displacement"] < 1e-3
+    assert found["velocity"] < 0.05
+
+
 def rates(fmi: int, asked: str, *, jump: bool = False, last: float | None = None) -> FloatArray:
     """Return the derivatives at 2 ms of an importer that gave 10 V at 0 and 30 V at 1 ms.
 

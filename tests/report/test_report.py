@@ -138,16 +138,11 @@ def test_every_column_of_pixels_keeps_its_extremes() -> None:
     assert len(shown) <= 4002
     assert np.all(np.diff(shown) > 0)
     assert (shown[0], shown[-1]) == (0, 999_999)
-    column_of = np.arange(1_000_000) // 1000
+    starts = np.searchsorted(shown, 1000 * np.arange(1000))
     for values in signals:
-        for column in range(1000):
-            part = values[column * 1000 : (column + 1) * 1000]
-            seen = values[shown[column_of[shown] == column]]
-            if np.isfinite(part).any():
-                assert np.nanmax(seen) == np.nanmax(part)
-                assert np.nanmin(seen) == np.nanmin(part)
-            else:
-                assert np.isnan(seen).any()
+        for extreme in (np.fmax, np.fmin):  # NaN where a whole column is
+            whole = extreme.reduce(values.reshape(1000, 1000), axis=1)
+            np.testing.assert_array_equal(extreme.reduceat(values[shown], starts), whole)
     assert {777, 900_000} <= set(shown.tolist())
 
 
