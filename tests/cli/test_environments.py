@@ -2,45 +2,24 @@
 
 import errno
 import os
-import signal
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 
-import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
 
-import psa_casadi as psa
 from psa_casadi import cache
-from psa_casadi.cli.app import app
 from psa_casadi.cli.failures import guarded
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.export.importer import masters
 from psa_casadi.files import PREFIX, atomic_path, atomic_write
-from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.identify import identify
-from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps
 from psa_casadi.simulation import compiler
-from psa_casadi.simulation.exact.run import run_exact
-from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
-from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.units import FloatArray
 from tests.contract.helpers import refused
 from tests.records.record_files import write
-from tests.report.report_cases import diagnosis
-from tests.studies.plants.make import make_record
-from tests.tiers import slow
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
 MODEL = dumps(compose(BASE))
@@ -252,199 +231,3 @@ def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
         fill()
     assert (tmp_path / "x.fmu").read_text() == "old"
     assert os.listdir(tmp_path) == ["x.fmu"]
-
-
-TIME: FloatArray = np.arange(600, dtype=float) * 5e-3
-VOLTAGE = 50.0 - 50.0 * np.cos(4 * np.pi * TIME)
-TABLE = [psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]]
-
-
-@pytest.fixture(autouse=True)
-def _threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work is done side by side, as it is for users, where the other tests have one thread."""
-    monkeypatch.setenv(VARIABLE, "2")
-
-
-@pytest.fixture(scope="module")
-def record() -> psa.Record:
-    """A stack with a drift that the base does not have."""
-    y = psa.simulate(psa.stack_model("P-885.51"), TIME, VOLTAGE).displacement
-    noise = 3e-9 * np.random.default_rng(2).standard_normal(TIME.size)
-    drifting = y + noise + 2e-7 * (TIME / TIME[-1]) ** 2
-    return psa.Record(name="drifting", time=TIME, voltage=VOLTAGE, displacement=drifting)
-
-
-def at(word: str) -> Callable[[str], None]:
-    """Return a listener that interrupts where a step of the work begins."""
-
-    def listen(step: str) -> None:
-        if word in step:
-            raise KeyboardInterrupt
-
-    return listen
-
-
-def cut(*given: object, **options: object) -> None:
-    raise KeyboardInterrupt
-
-
-WAYS: dict[str, Callable[[psa.Model, FloatArray, FloatArray, FloatArray], object]] = {
-    "stepper": lambda model, t, u, x0: psa.run(model, t, u, x0, rtol=1e-9),
-    "exact": lambda model, t, u, x0: run_exact(model, t, u, x0, tolerance=1e-12, coarsest=9),
-}
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_another_thread_ends_a_long_run_in_c(way: str) -> None:
-    model, n = psa.stack_model("P-885.51"), 400_000
-    t: FloatArray = np.arange(n, dtype=float) * 1e-4
-    u = input_samples(model, n, {"voltage": 50.0 - 50.0 * np.cos(300.0 * t)})
-    x0 = np.zeros(len(model.state_names))
-    with interruptible_work() as work:
-        threading.Timer(0.1, work.stop).start()
-        begin = time.perf_counter()
-        with pytest.raises(KeyboardInterrupt):
-            WAYS[way](model, t, u, x0)
-        assert time.perf_counter() - begin < 2.0
-
-
-def test_an_interrupt_ends_the_other_threads_too() -> None:
-    """The one who waits has the interrupt; the other would go on simulating for minutes."""
-    model = psa.stack_model("P-885.51")
-
-    def work(item: int) -> None:
-        if item == 0:
-            raise KeyboardInterrupt
-        while True:
-            psa.simulate(model, TIME, VOLTAGE)
-
-    with pytest.raises(KeyboardInterrupt):
-        side_by_side(work, [0, 1])
-
-
-@pytest.mark.parametrize(("word", "effects"), [("screening effects", 0), ("judging", 1)])
-def test_a_diagnosis_keeps_the_best_model_so_far(
-    word: str, effects: int, record: psa.Record
-) -> None:
-    with pytest.raises(DiagnosisInterrupted) as stop:
-        diagnose([record], effects=TABLE, progress=at(word))
-    model = stop.value.model
-    assert model.provenance.interrupted
-    assert len(model.effects) == effects
-    error = psa.simulate(model, TIME, VOLTAGE).displacement - measured(record)
-    assert np.std(error) < 0.1 * record.range_m
-    assert ("not judged" in str(stop.value)) == bool(effects)
-
-
-def test_the_base_fit_is_not_swallowed(record: psa.Record) -> None:
-    with pytest.raises(KeyboardInterrupt) as stop:
-        diagnose([record], effects=TABLE, progress=at("base fit from"))
-    assert not isinstance(stop.value, DiagnosisInterrupted)  # nothing was fitted yet
-    with pytest.raises(DiagnosisInterrupted, match="base model; its values are not final"):
-        diagnose([record], effects=TABLE, progress=at("to the end"))
-
-
-@pytest.mark.parametrize(
-    ("word", "search"), [("to the end", True), ("what further records", False)]
-)
-def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Record) -> None:
-    found = identify([record], progress=at(word))
-    assert found.interrupted
-    assert found.fit.interrupted == found.model.provenance.interrupted == search
-    assert not found.advice
-    assert found.fit.rms < 0.1 * record.range_m
-
-
-@pytest.mark.parametrize(
-    ("command", "word", "told"),
-    [
-        ("diagnose", "screening", "there is no verdict; the best fit so far is the base model"),
-        ("diagnose", "writing", "the diagnosis was finished before. Kept: {m}, {j}. Not"),
-        ("identify", "to the end", "the search was cut off. Kept: {m} (marked as interrupted). N"),
-        ("identify", "writing", "the fit was finished before. Kept: {m}. Not written: {r}."),
-        ("identify", "starting", "there was no result yet, so nothing was kept."),
-    ],
-)
-def test_a_command_says_what_it_kept(
-    command: str, word: str, told: str, record: psa.Record, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    for home in ("diagnose", "identify"):
-        module = sys.modules[f"psa_casadi.cli.{home}"]
-        monkeypatch.setattr(module, "working", lambda *given: nullcontext(at(word)))
-    if word == "writing":
-        finished = diagnosis("cause_named")
-        module = sys.modules["psa_casadi.diagnosis.diagnose"]
-        monkeypatch.setattr(module, "diagnose", lambda *given, **options: finished)
-    psa.write_record(tmp_path / "r.csv", record)
-    m, j, r = (tmp_path / n for n in ("m.json", "d.json", "r.html"))
-    given = [command, str(tmp_path / "r.csv"), "-o", str(m), "--report", str(r), "--still"]
-    if command == "diagnose":
-        given += ["--json", str(j)]
-    ended = CliRunner().invoke(app, given)
-    assert ended.exit_code == 130
-    assert f"Interrupted: {told.format(m=m, j=j, r=r)}" in ended.stderr
-    assert m.exists() == ("Kept" in told or "best fit" in told)
-    assert not r.exists()
-    if m.exists():
-        cut = "finished" not in told
-        assert psa.load_model(m).provenance.interrupted == cut
-
-
-def test_a_solver_does_not_take_an_interrupt_for_its_own_failure() -> None:
-    """IPOPT ends at an interrupt as at a failure, which other starts would make up for."""
-    with interruptible_work() as work:
-        work.stop()
-        with pytest.raises(KeyboardInterrupt):
-            psa.design_mechanism(psa.stack_model("PTBS200"), damping=0.7, starts=2)
-
-
-def test_a_designed_voltage_is_kept_without_its_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(masters, "played_on_fmu", cut)
-    time = np.arange(40) * 1e-3
-    path = {"time [s]": time, "displacement [um]": 5.0 - 5.0 * np.cos(150.0 * time)}
-    psa.write_record(tmp_path / "path.csv", path)
-    voltage = tmp_path / "v.csv"
-    given = ["design", "input", "--fast", "--stack", "P-885.51", "-o", str(voltage)]
-    ended = CliRunner().invoke(app, [*given, "--target", str(tmp_path / "path.csv")])
-    assert ended.exit_code == 130
-    assert f"the voltage was designed before. Kept: {voltage}." in ended.stderr
-    assert voltage.exists()
-
-
-def test_files_that_stand_are_named_however_late_the_interrupt(
-    record: psa.Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys.modules["psa_casadi.cli.simulate"], "tell_written", cut)
-    psa.write_record(tmp_path / "r.csv", record)
-    out = tmp_path / "out.csv"
-    given = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]
-    ended = CliRunner().invoke(app, given)
-    assert ended.exit_code == 130
-    assert f"Interrupted: written before: {out}." in ended.stderr
-
-
-@slow
-@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to one process")
-def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
-    record, model, page = (tmp_path / n for n in ("r.csv", "m.json", "r.html"))
-    make_record("slow_creep", 3, record)
-    given: list[str | Path] = [sys.executable, "-m", "psa_casadi.cli", "diagnose", record]
-    process = subprocess.Popen(
-        [*given, "-o", model, "--report", page, "--still"],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
-    assert process.stderr is not None
-    assert any("screening" in line for line in process.stderr)
-    time.sleep(0.05)
-    begin = time.perf_counter()
-    for _ in range(2):
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.02)
-    process.communicate()
-    assert time.perf_counter() - begin < 0.5
-    assert process.returncode == 130
-    assert {p.name for p in tmp_path.iterdir()} <= {"r.csv", "m.json"}
