@@ -281,3 +281,10 @@ def test_a_playground_holds_every_stack_and_loads_nothing(tmp_path: Path) -> Non
     assert not re.search(r"(src|href)=[\"']?(https?:)?//", text)
     assert "default-src 'none'" in text
     assert 1e5 < len(text) < 3e6
+
+
+@slow
+def test_a_command_of_another_process_keeps_its_exit_code_and_streams(tmp_path: Path) -> None:
+    ended = command("export", "c", "--stack", "P-885.51", "--step", "10us", "-o", tmp_path / "code")
+    assert ended.code == 0
+    assert sorted(p.suffix for p in (tmp_path / "code").iterdir()) == [".c", ".h"]
