@@ -16,7 +16,7 @@ from urllib.parse import quote
 import pytest
 
 import psa_casadi as psa
-from tests.contract.helpers import DATA, done, refused
+from tests.contract.helpers import DATA, command, done, refused
 from tests.tiers import slow
 
 PSA = [sys.executable, "-m", "psa_casadi.cli"]
