@@ -7,7 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import BALANCES, Component, Equations, Expression, OnDemand, Symbols
+from psa_casadi.component import Component, Equations, Expression, OnDemand, Symbols
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.units import parse_unit
@@ -275,11 +275,6 @@ def _declared(
     every_name = [v.name for rows in found.values() for v in rows]
     for twice in sorted({n for n in every_name if every_name.count(n) > 1}):
         problems.add(f"Two variables are named '{twice}'; rename one.")  # as in FMI and Modelica
-    if "velocity" in [output.name for output in found["y"]]:
-        problems.add(
-            "An output is named 'velocity', which models of this package derive from"
-            " 'displacement'; choose another name."
-        )
     problems.raise_if_any()
     return found
 
@@ -317,11 +312,8 @@ def _check_variable(variable: Any, values: Mapping[str, float], problems: Proble
         problems.add(
             f"'{name}' cannot name a variable; use letters, digits, underscores, no digit first."
         )
-    if name == "time" or name in BALANCES:
-        problems.add(
-            f"'{name}' is the name of time or of a sum that models of this package share; choose"
-            " another name."
-        )
+    if name == "time":
+        problems.add("'time' is the name of time; choose another name.")
     for unit in filter(None, (variable.unit, variable.display_unit)):
         try:
             parse_unit(unit)
