@@ -190,9 +190,14 @@ def blocks_of(page: Path) -> tuple[Block, ...]:
     return find_blocks(page.read_text(encoding="utf-8"), page.relative_to(ROOT).as_posix())
 
 
+def blocks_in_tests(page: str) -> tuple[Block, ...]:
+    """Return the blocks of a page that a test runs."""
+    return tuple(b for b in blocks_of(ROOT / page) if "in-tests" in b.marks)
+
+
 def block_in_tests(page: str) -> Block:
     """Return the one block of a page that a test runs; raises ValueError without one, or of two."""
-    (block,) = (b for b in blocks_of(ROOT / page) if "in-tests" in b.marks)
+    (block,) = blocks_in_tests(page)
     return block
 
 

@@ -13,7 +13,7 @@ import pytest
 
 import psa_casadi as psa
 from build_scripts.measured_data import ROOT
-from build_scripts.page_commands import block_in_tests
+from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.runs import runs_of
@@ -149,15 +149,34 @@ def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
     assert page.text.count(_HOSTILE) >= 6  # the record thrice and more, cause, misfit, note
 
 
+def _run(block: Block, names: dict[str, Any]) -> None:
+    """Run the program of a page."""
+    (program,) = block.commands
+    exec("\n".join(program.split("\n")[1:-1]), names)
+
+
+def test_an_oscillator_is_sampled_and_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program of the page, with a model that has no input."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    _run(block_in_tests("docs/python.md"), names)
+    (mu,) = names["drawn"].figures
+    assert abs(mu.mean - 1.0) < 4.0 * mu.sd < 0.05
+    page = Page((tmp_path / "both.html").read_text("utf-8"))
+    assert "Beyond noise, mu differs (1 parameters compared)." in page.text
+
+
 @pytest.mark.slow
 def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The program of the page, whose plant has its own equations."""
     monkeypatch.chdir(tmp_path)
-    (program,) = block_in_tests("docs/howto/own_model.md").commands
+    first, effect, posterior = blocks_in_tests("docs/howto/own_model.md")
     names: dict[str, Any] = {}
-    exec("\n".join(program.split("\n")[1:-1]), names)
+    _run(first, names)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["motor.html", "motor_with_friction.fmu"]
     d = names["result"]
     assert isinstance(d, psa.OdeDiagnosis)
@@ -173,6 +192,16 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
     assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
     assert f"it removes {share.text} of the held-out error" in " ".join(repr(d).split())
+    _run(effect, names)
+    assert [c.effect for c in names["worn_result"].causes] == ["brush_drop"]
+    _run(posterior, names)
+    for f in names["posterior"].figures:
+        true = {"k": 0.05, "J": 3e-5, "b": 2e-5}[f.name]
+        assert abs(f.mean - true) < 4.0 * f.sd < 0.1 * true
+    told = Page((tmp_path / "two_motors.html").read_text("utf-8")).text
+    assert "Beyond noise, J differs (3 parameters compared)." in told
+    assert {(o.device, o.parameter) for o in names["motors"].outliers} == {("4", "J")}
+    assert (tmp_path / "motors.html").stat().st_size > 10_000
 
 
 @pytest.mark.slow
