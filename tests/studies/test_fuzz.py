@@ -33,7 +33,6 @@ from tests.studies.fuzz.campaign import (
     FOREIGN,
     HANG,
     LEFT_OVER,
-    Amount,
     Found,
     Tally,
     Target,
@@ -58,7 +57,7 @@ SURROUNDED = {"surroundings": "HOME a file", "run": "simulate"}
 
 def attacked(amounts: dict[str, int], keep: Path, jobs: int = 1) -> None:
     """Attack targets; on a failure show the tables, which name the inputs."""
-    tally = run([TARGETS[n] for n in amounts], 1, Amount(inputs=amounts), jobs=jobs, keep=keep)
+    tally = run([TARGETS[n] for n in amounts], 1, inputs=amounts, jobs=jobs, keep=keep)
     assert {n: tally.inputs[n] for n in amounts} == amounts
     assert not tally.failures, "\n\n".join(map(str, tables(tally)))
 
@@ -136,7 +135,7 @@ def _counted(**options: object) -> Tally:
     fake = Target(
         "fake", "fake", ".txt", lambda rng: _BEHAVIOURS[rng.turn].encode(), _behaviour, limit_s=0.6
     )
-    return run([fake], 7, Amount(inputs={"fake": 10}), jobs=2, **options)  # type: ignore[arg-type]
+    return run([fake], 7, inputs={"fake": 10}, jobs=2, **options)  # type: ignore[arg-type]
 
 
 def test_every_way_to_fail_is_seen_and_counted(tmp_path: Path) -> None:

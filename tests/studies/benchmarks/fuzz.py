@@ -12,7 +12,7 @@ from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.screen import Quiet, show, working
 from tests.studies.benchmarks.table import TitledTable
 from tests.studies.fuzz import commands, fmus, readers, surroundings
-from tests.studies.fuzz.campaign import KINDS, Amount, Tally, Target, replay, run
+from tests.studies.fuzz.campaign import KINDS, Tally, Target, replay, run
 
 TARGETS: dict[str, Target] = {
     target.name: target
@@ -40,9 +40,8 @@ def tables(tally: Tally) -> list[TitledTable]:
     rows = []
     for name in (*(n for n in TARGETS if tally.inputs[n]), "all"):
         own = [n for n in TARGETS if name in (n, "all")]
-        inputs, accepted, seconds = (
-            sum(c[n] for n in own) for c in (tally.inputs, tally.accepted, tally.seconds)
-        )
+        inputs, accepted = (sum(c[n] for n in own) for c in (tally.inputs, tally.accepted))
+        seconds = sum(tally.seconds.get(n, 0.0) for n in own)
         failures = {kind: f"{sum(tally.kinds[n, kind] for n in own):,}" for kind in KINDS}
         rows.append({
             "target": name, "inputs": f"{inputs:,}", "accepted": f"{accepted:,}", **failures,
@@ -105,14 +104,16 @@ def fuzz(
     else:
         targets = chosen_targets([n.strip() for n in only.split(",") if n.strip()])
         each = None if inputs is None else {t.name: inputs for t in targets}
-        amount = Amount(seconds if each is None else float("inf"), each, first)
         for which in (
             signal.SIGINT,
             signal.SIGTERM,
         ):  # both end with a table, in the background too
             signal.signal(which, signal.default_int_handler)
         with working("attacking", quiet) as progress:
-            tally = run(targets, seed, amount, jobs=jobs, keep=keep, progress=progress)
+            tally = run(
+                targets, seed, seconds=seconds if each is None else float("inf"), inputs=each,
+                first=first, jobs=jobs, keep=keep, progress=progress,
+            )  # fmt: skip
     for titled in tables(tally):
         show(f"\n{titled}", quiet)
     if tally.failures:

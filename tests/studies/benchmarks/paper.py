@@ -34,7 +34,7 @@ STACK_NAMES = ("PTBS200", "WYDS0808020", "P-885.51")
 NOISES, WINDOW, SEEDS = (0.0, 1e-5, 1e-4, 1e-3), 40.0, 3
 #: What is searched, and starts of the search: factors on the true values, + is 1.3 and - is 0.7.
 _FREE = ("k_L", "tau", "c_P", "c_B", "m_P", "m_B", "k_P")
-_FAR = ("+++++++", "-------", "+-+-+-+", "+--+--+")
+_FAR = ("+++++++", "-------", "+-+-+-+", "+--++-+")
 _SHORT, _LONG, _SHORT_RTOL = 15, 80, 1e-4
 #: No hysteresis; R_s C_p = 13 ns.
 _LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}

@@ -336,7 +336,7 @@ def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Out
     )  # fmt: skip
     model, doubts, done = psa.stack_model("P-885.51"), [], []
     most = max(sets for _, sets in ways.values())
-    sets, whole_rows, rows = drawn(model, max(count, most)), [], []
+    sets, rows = drawn(model, max(count, most)), []
     for record in given:
         progress(f"{record.name}: reference")
         short = record.slice(0, min(_PART, record.n))
@@ -344,54 +344,42 @@ def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Out
         truth = work.first(_JUDGED).reference(_TRUTH)
         apart = np.abs(work.first(1).reference(_CHECK)[0] - truth[0])
         doubts.append(float(np.max(apart) / np.ptp(truth[0])))
-        progress(f"{record.name}: {OURS}, {count} sets")
 
         def ours(rtol: float, short: psa.Record = short) -> Solve:
             return partial(psa.simulate_many, model, sets[:_JUDGED], short, rtol=rtol)
 
-        rtol, error, _ = loosest(ours, truth)
-        done.append((record, rtol))
-        how: Any = {"rtol": rtol, "reduce": np.ptp}
-        keep = partial(psa.simulate_many, model, sets[:count], record, **how)
-        ((wall, spent),) = least_times([keep], _REPEATS, _SLOW)
-        each = spent / count / record.n
-        whole_rows.append({
-            "voltage": record.name, "sets": count, "samples": record.n, "tolerance": f"{rtol:.0e}",
-            "largest error / range": number(error, 2), "wall [s]": number(wall),
-            "processor [s]": number(spent), "ns per sample and set": number(1e9 * each),
-        })  # fmt: skip
-        reached = [(OURS, count, record.n, rtol, error, each)]
-        for name, (prepare, together) in ways.items():
+        own = math.nan
+        for name, (prepare, together) in {OURS: (None, count), **ways}.items():
             progress(f"{record.name}: {name}")
-            rtol, error, solve = loosest(prepare(work.first(together)), truth)
-            ((_, spent),) = least_times([solve], _REPEATS, _SLOW)
-            theirs = spent / together / short.n
-            reached.append((name, together, short.n, rtol, error, theirs))
-        rows += [
-            {"voltage": record.name, "way": name, "sets x samples": f"{n} x {samples}",
-             "tolerance": f"{rtol:.0e}",
-             "largest error / range": number(error, 2) + " (missed)" * (error > WANTED),
-             "us per sample and set": number(1e6 * theirs),
-             "over simulate_many": number(theirs / each, 2)}
-            for name, n, samples, rtol, error, theirs in reached
-        ]  # fmt: skip
+            at = ours if prepare is None else prepare(work.first(together))
+            rtol, error, solve = loosest(at, truth)
+            whole_one = record if prepare is None else short
+            if prepare is None:
+                done.append((record, rtol))
+                how: Any = {"rtol": rtol, "reduce": np.ptp}
+                solve = partial(psa.simulate_many, model, sets[:count], record, **how)
+            ((wall, spent),) = least_times([solve], _REPEATS, _SLOW)
+            each = spent / together / whole_one.n
+            own = each if prepare is None else own
+            rows.append({
+                "voltage": record.name, "way": name, "sets": together, "samples": whole_one.n,
+                "tolerance": f"{rtol:.0e}",
+                "largest error / range": number(error, 2) + " (missed)" * (error > WANTED),
+                "wall [s]": number(wall), "processor [s]": number(spent),
+                "us per sample and set": number(1e6 * each), "over ours": number(each / own, 2),
+            })  # fmt: skip
     gpu, missing = on_gpu(progress, model, done, MORE * count)
-    whole_table = TitledTable(
-        "Many sets of parameters of a full stack",
-        whole_rows,
-        f"Threads: {threads()}. Of each set the range is kept. The starts of the sets are in the"
-        f" times, compiling is not. The error is the largest of {_JUDGED} sets over {_PART}"
-        " samples, against the reference at 1e-11, which differs from that at 1e-10 by"
-        f" {number(max(doubts), 2)}.{missing}",
-    )
-    beside = TitledTable(
-        "Others on a part of the work, at equal error",
+    table = TitledTable(
+        "Many sets of parameters of a full stack; others on a part of the work, at equal error",
         rows,
-        "Every way has the loosest of the tolerances 1e-3, 3e-4, 1e-4, ... at which its error is"
-        f" below {WANTED:.0e} of the range. Times are processor time over all threads, building and"
-        " compiling left out. CVODES runs CasADi's virtual machine; LSODA calls Python." + absent,
+        f"Threads: {threads()}. Every way has the loosest of the tolerances 1e-3, 3e-4, 1e-4, ..."
+        f" at which its error is below {WANTED:.0e} of the range: the largest of {_JUDGED} sets"
+        f" over {_PART} samples, against the reference at 1e-11, which differs from that at 1e-10"
+        f" by {number(max(doubts), 2)}. Processor times are over all threads, building and"
+        f" compiling left out. {OURS} keeps the range of each set; its starts are in the times."
+        f" CVODES runs CasADi's virtual machine; LSODA calls Python.{absent}{missing}",
     )
-    return Outcome((whole_table, *gpu, beside))
+    return Outcome((table, *gpu))
 
 
 def on_gpu(

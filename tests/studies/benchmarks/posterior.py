@@ -140,7 +140,7 @@ class Replica:
 def run(progress: Progress, quick: bool, size: int | None = None) -> Outcome:
     """Measure calibration and evidence; with a size the calibration of so many replicas alone."""
     calibration = _calibration(progress, size or (QUICK_REPLICAS if quick else REPLICAS))
-    return Outcome([*calibration, *([] if size else [evidence_table(progress, quick)])])
+    return Outcome([calibration] if size else [calibration, evidence_table(progress, quick)])
 
 
 def centred_model() -> psa.Model:
@@ -167,7 +167,7 @@ def task_for(record: psa.Record, model: psa.Model, widths: Mapping[str, float]) 
     return task_of(model, [record], free=tuple(wide), prior=centre, widths=wide)
 
 
-def _calibration(progress: Progress, count: int) -> tuple[TitledTable, TitledTable]:
+def _calibration(progress: Progress, count: int) -> TitledTable:
     rng, model = np.random.default_rng(20261125), centred_model()
     clean = recorded(model, f_H=0.0)
     noise = NOISE * clean.range_m
@@ -177,8 +177,7 @@ def _calibration(progress: Progress, count: int) -> tuple[TitledTable, TitledTab
     for k, truth in enumerate(prior_draws(before, count, rng)):
         progress(f"calibration: {k + 1} of {count}")
         found.append(_replica(before, truth, noise, k))
-    names = (*WIDTHS, "f_H at the start")
-    return _ranks(found, names), _coverage(found, names)
+    return _ranks(found)
 
 
 def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replica:
@@ -195,35 +194,30 @@ def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replic
     return Replica(ranks, inside, chains.divergences, task.inflation[0])
 
 
-def _ranks(found: Sequence[Replica], names: Sequence[str]) -> TitledTable:
-    """Return chi-square and Kolmogorov's test of the ranks, each by parameter."""
+def _ranks(found: Sequence[Replica]) -> TitledTable:
+    """Return chi-square and Kolmogorov's test of the ranks, and the intervals, by parameter."""
     possible, expected, rows = DRAWS // THIN + 1, len(found) / BINS, []
-    for name, ranks in zip(names, np.array([r.ranks for r in found]).T, strict=True):
-        counts = np.bincount(ranks * BINS // possible, minlength=BINS)
+    ranks = np.array([r.ranks for r in found])
+    inside = 100.0 * np.array([r.inside for r in found]).mean(axis=0)  # (unknowns, levels)
+    heads = [f"in the {100 * level:.0f} % interval" for level in LEVELS]
+    for k, name in enumerate((*WIDTHS, "f_H at the start")):
+        counts = np.bincount(ranks[:, k] * BINS // possible, minlength=BINS)
         power = float(np.sum((counts - expected) ** 2) / expected)
         rows.append({
             "unknown": name, f"in {BINS} bins": " ".join(map(str, counts)),
             "chi-square": f"{power:.1f}", "p": f"{chi2.sf(power, BINS - 1):.2f}",
-            "p (Kolmogorov)": f"{kstest((ranks + 0.5) / possible, 'uniform').pvalue:.2f}",
+            "p (Kolmogorov)": f"{kstest((ranks[:, k] + 0.5) / possible, 'uniform').pvalue:.2f}",
+            **{h: f"{share:.0f} %" for h, share in zip(heads, inside[k], strict=True)},
         })  # fmt: skip
+    every = {h: f"{share:.1f} %" for h, share in zip(heads, inside.mean(axis=0), strict=True)}
+    rows.append(dict.fromkeys(rows[0], "") | {"unknown": "all", **every})
     worth = float(np.median([r.inflation for r in found]))
-    return TitledTable(
-        f"Ranks of the truth among {possible - 1} draws, {len(found)} replicas",
-        rows,
-        f"{sum(r.divergences for r in found)} of {len(found) * DRAWS} transitions diverged;"
-        f" {worth:.2f} samples count as one (median).",
-    )
-
-
-def _coverage(found: Sequence[Replica], names: Sequence[str]) -> TitledTable:
-    inside = 100.0 * np.array([r.inside for r in found])  # (replicas, unknowns, levels)
-    shares = np.vstack([inside.mean(axis=0), inside.mean(axis=(0, 1))])
-    heads = [f"in the {100 * level:.0f} % interval" for level in LEVELS]
-    rows = [
-        {"unknown": name} | {h: f"{s:.{name == 'all'}f} %" for h, s in zip(heads, own, strict=True)}
-        for name, own in zip((*names, "all"), shares, strict=True)
-    ]
     bands = [np.array(binom.interval(0.95, len(found), q)) / len(found) for q in LEVELS]
     ends = ", ".join(f"{100 * a:.0f} to {100 * b:.0f} %" for a, b in bands)
-    note = f"Of one unknown, 95 % of such tables lie within {ends}."
-    return TitledTable("Truth in central intervals", rows, note)
+    return TitledTable(
+        f"Ranks of the truth among {possible - 1} draws, {len(found)} replicas; its intervals",
+        rows,
+        f"{sum(r.divergences for r in found)} of {len(found) * DRAWS} transitions diverged;"
+        f" {worth:.2f} samples count as one (median). Of one unknown, 95 % of such tables have"
+        f" {ends} of the truths in the intervals.",
+    )

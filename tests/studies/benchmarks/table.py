@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from math import inf
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -101,38 +102,8 @@ def least_times(
 #: what it shows. The module is loaded when it is run: `run(progress, quick)` measures everything
 #: again, `quick` on fewer or smaller cases; some also take a `size`, the number of cases, or a
 #: `folder` of records.
-_TABLE = """
-identify|peers:identify|identification against scipy's least_squares with solve_ivp, and its growth
-fits|fits|exact steps against the stepper: error against time, lanes, effects, whole diagnoses
-ensembles|peers:ensembles|many sets beside LSODA, CVODES, diffrax at equal error (--size)
-batch|batch|many devices with hidden defects: which are told, cost, a run again (--size)
-web|pages:web|models in pages: sizes, redraw times in a headless browser, errors
-coverage|coverage|identified parameters, their intervals against the truth, over stacks (--size)
-causes|causes|hidden causes as a data set for other methods: write, answer, table
-posterior|posterior|whole posteriors: calibration (--size), and evidence by bridge sampling
-sampling|sampling|effective samples per second beside an ODE in PyMC, on one posterior (--size)
-own_model|pages:own_model|models that are no stacks: hidden causes, errors before and after, a page
-paper|paper|the paper's identification beside the prediction-error fit, against noise
-measured|measured|the micromanipulator: held-out error of the paper's model and of two effects
-floors|floors|measured records: held-out error of a diagnosis beside each one's floor (--folder)
-mirror|mirror|models of one axis of the steering mirror by its authors' score (--folder)
-diagnose|diagnose|hidden causes on independent plants: what is named, how surely, how often rightly
-exam|exam|plants of another author: six kinds of hysteresis, causes in other forms, with marks
-exam_constants|exam:constants|hard records of the exam with each constant halved and doubled
-ablation|ablation|the diagnosis without each of its steps, and with each deciding constant moved
-stability|changed:stability|the diagnosis of data changed by 1 % of their noise: what stays
-added|changed:added|an effect of a plant added to a measured record: what is named on top
-excerpts|changed:excerpts|pieces of measured records, decimated, scaled, turned: none may crash
-method|method|the picture of docs/method.md: the hypotheses of one search, and its error budget
-simulated|simulated|the package's own simulations: whether nothing is said to be missing
-verification|verification|the paper's figures 6 to 10 (loops, steps, others), and three mechanics
-fmu|fmu|error against work: the FMU beside CVode, Radau, LSODA; cost of a fixed step
-coupling|coupling|a positioner of FMUs against one model: error over step, stability
-nonlinearity|nonlinearity|a positioner: open and closed loop, with and without the compensator
-design|design|designed inputs: causes told apart, paths followed, hysteresis compensated
-fuzz|fuzz|damaged files, hostile FMUs, kills, odd surroundings: none may fail (fuzz --help)
-"""
-_LINES = [line.split("|") for line in _TABLE.strip().splitlines()]
+_TABLE = Path(__file__).with_name("benchmarks.tsv").read_text(encoding="utf-8")
+_LINES = [line.split("\t") for line in _TABLE.splitlines()[1:]]
 BENCHES: dict[str, str] = {name: shows for name, _, shows in _LINES}
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from jinja2 import Template
 
 import psa_casadi as psa
 from tests.studies.benchmarks.hidden_cases import (
@@ -238,29 +239,6 @@ def json_lines(content: Any) -> str:
     return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
 
 
-def markdown(model: psa.Model) -> str:
-    """Return base model and causes as one page for people."""
-    base = base_content(model)
-    lines = ["# The base model", "", base["values"], base["start"], ""]
-    lines += [f"* {e['part']}: `{e['equation']}`" for e in base["equations"]]
-    lines += ["", "Letters:", ""]
-    lines += [f"* `{letter}`: {meaning}" for letter, meaning in LETTERS.items()]
-    lines += ["", "Parameters (an example's values):", ""]
-    lines += [_line(p) for p in base["parameters"]]
-    lines += ["", "# Possible causes", ""]
-    for cause in causes_content():
-        lines += [f"## {cause['name']}", ""]
-        lines += [f"Sits in: {cause['sits_in']}. {cause['definition']}.", ""]
-        lines += [f"`{cause['equation']}`", "", f"Looks like: {cause['what_it_looks_like']}.", ""]
-        lines += [*(_line(p) for p in cause["parameters"]), "", f"Source: {cause['source']}", ""]
-    return "\n".join(lines)
-
-
-def _line(p: dict[str, Any]) -> str:
-    low, high = p["bounds"]
-    return f"* `{p['name']}` [{p['unit']}]: {p['meaning']}; {p['example']:g}, {low:g} to {high:g}"
-
-
 FORMAT, VERSION = "psa_causes.data/1", "1.0"
 LICENCE = "BSD-3-Clause, psa_casadi authors (the licence of the project that made it)"
 #: What of this folder goes with the data.
@@ -291,9 +269,11 @@ def write_model(folder: Path) -> None:
     (folder / "model").mkdir(parents=True, exist_ok=True)
     psa.export_fmu(model, folder / "model" / "base.fmu")
     psa.export_modelica(model, folder / "model" / "Base.mo")
-    _put(folder / "model" / "base.json", json_lines(base_content(model)))
-    _put(folder / "model" / "causes.json", json_lines(causes_content()))
-    _put(folder / "model" / "model.md", markdown(model))
+    base, causes = base_content(model), causes_content()
+    _put(folder / "model" / "base.json", json_lines(base))
+    _put(folder / "model" / "causes.json", json_lines(causes))
+    page = Template(Path(__file__).with_name("model.md.j2").read_text("utf-8"))
+    _put(folder / "model" / "model.md", page.render(base=base, causes=causes).rstrip() + "\n")
     for name in ALONG:
         shutil.copyfile(Path(__file__).with_name(name), folder / name)
 
