@@ -27,27 +27,12 @@ from psa_casadi.report.words.phrases import number, plain
 from psa_casadi.simulation import simulate as simulate_module
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_exact, run_sets
 from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.simulate import (
-    EXACT,
-    STEP_SHARE,
-    STEPPER,
-    Way,
-    input_samples,
-    record_inputs,
-    trace,
-)
+from psa_casadi.simulation.simulate import EXACT, STEP_SHARE, STEPPER, Way, input_samples, trace
 from psa_casadi.simulation.start import start_on
 from tests.model.stack_models import at_ordinary_size
+from tests.studies.benchmarks import table
 from tests.studies.benchmarks.records import hidden_record, noisy, played_again
-from tests.studies.benchmarks.table import (
-    FloatArray,
-    Outcome,
-    Progress,
-    TitledTable,
-    least_times,
-    share,
-    styled,
-)
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, share
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P", "m_B")
 #: Tolerances of a step. Looser ones run exact steps at 1e-5 (`ways.LOOSEST`), so none is below.
@@ -86,7 +71,7 @@ class Task:
     @property
     def inputs(self) -> FloatArray:
         """Samples of the model's inputs (n, nu)."""
-        return record_inputs(self.model, self.record, self.record.n)
+        return simulate_module.record_inputs(self.model, self.record, self.record.n)
 
     def start(self, model: psa.Model) -> tuple[FloatArray, FloatArray]:
         """Return the initial state (nx,) and its derivatives by the unknowns (nx, k)."""
@@ -101,8 +86,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     tables = (
         run_table(points, task.record.n),
         _lanes(task, cheapest(points, EXACT, "plain").tolerance, repeats, progress),
-        ways_table(_tried_alone(progress)),
-        errors_table(_tried_everywhere(progress, quick)),
+        *ways_tables(_tried(progress, quick)),
         diagnosis_table(task.record, progress, quick),
     )
     return Outcome(tables, partial(picture, points))
@@ -122,7 +106,7 @@ def picture(points: Sequence[Point]) -> Figure:
             markerfacecolor=colour if of == "differentiated" else "white",
         )  # fmt: skip
     error, took = "largest error of the displacement / its range", "processor time per sample [µs]"
-    styled(axes, error, took, "One simulation of the demonstration's record, as in a fit")
+    table.styled(axes, error, took, "One simulation of the demonstration's record, as in a fit")
     low, high = axes.get_ylim()
     axes.set_yticks(
         [y for k in range(-3, 5) for m in (1, 2, 5) if low <= (y := m * 10.0**k) <= high]
@@ -149,7 +133,7 @@ def measured(task: Task, repeats: int, progress: Progress) -> list[Point]:
     ways = [(way, rtol) for way, rtols in TOLERANCES.items() for rtol in rtols]
     works = [partial(_run, task, *way, x0, given) for way in ways for given in (s0, None)]
     shown = [work() for work in works]  # compiles and loads what the first use needs
-    times = [1e6 * s / task.record.n for _, s in least_times(works, repeats)]
+    times = [1e6 * s / task.record.n for _, s in table.least_times(works, repeats)]
     points = []
     for k, (way, rtol) in enumerate(ways):
         x, taken = shown[2 * k + 1]
@@ -231,7 +215,7 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
         if not np.array_equal(together().T, others):
             raise psa.PsaError("A set has other bits in a lane than by itself.")
     side, *alone = (
-        s / LANES / task.record.n for _, s in least_times([together, *singles], repeats)
+        s / LANES / task.record.n for _, s in table.least_times([together, *singles], repeats)
     )
     rows = [
         {"how": name, "ns per sample and set": number(1e9 * seconds),
@@ -282,16 +266,11 @@ class Reached(NamedTuple):
     fit: str
 
 
-def _tried_alone(progress: Progress) -> list[Reached]:
-    progress("ways of the effects")
-    return [r for n in (BASE_NAME, *psa.EFFECTS) for r in tried(Trial("demo", n, MIXED, 1e-3))]
-
-
-def _tried_everywhere(progress: Progress, quick: bool) -> list[Reached]:
+def _tried(progress: Progress, quick: bool) -> list[Reached]:
     found: list[Reached] = []
-    hows = [("steps", 1e-3)] if quick else product((*KINKED, MIXED), (2e-5, 1e-3))
+    hows = [(MIXED, 1e-3)] if quick else product((*KINKED, MIXED), (2e-5, 1e-3))
     trials = list(product((BASE_NAME, *psa.EFFECTS), hows))
-    for stack in list(psa.STACKS)[: 3 if quick else None]:
+    for stack in list(psa.STACKS)[: 1 if quick else None]:
         progress(f"errors over tolerance: {stack}")
         for reached in side_by_side(tried, [Trial(stack, n, *how) for n, how in trials]):
             found += reached
@@ -333,45 +312,45 @@ def tried(trial: Trial) -> list[Reached]:
     return [Reached(trial, rtol, r.way, _error(r.displacement, truth), fit) for rtol, r in runs]
 
 
-def ways_table(found: Sequence[Reached]) -> TitledTable:
-    """Return the ways of the base and of each effect beside it."""
-    rows = []
+def ways_tables(found: Sequence[Reached]) -> list[TitledTable]:
+    """Return the ways of the base and of each effect beside it, and errors over the tolerance."""
+    ways, errors = [], []
     for name in dict.fromkeys(r.trial.effect for r in found):
         own = [r for r in found if r.trial.effect == name]
-        rows.append({"effect": plain(name), "in a fit": own[0].fit}
-                    | {f"way at {r.rtol:.0e}": r.way for r in own}
-                    | {"largest error / tolerance": number(max(r.error / r.rtol for r in own), 2)}
-                    )  # fmt: skip
-    fits = {r.trial.effect: r.fit == EXACT for r in found if r.trial.effect != BASE_NAME}
-    return TitledTable(
-        f"Ways of the effects, one at a time: {MIXED} ({_SAMPLES} samples)",
-        rows,
-        f"Of {len(fits)} effects {sum(fits.values())} take the exact way in a fit (tolerance of a"
-        f" step {FIT_RTOL:.0e}). In `simulate` the others fall back on the stepper at"
-        f" {STEP_SHARE:g} of the tolerance. Errors are against the stepper at {_TRUTH:.0e}.",
-    )
-
-
-def errors_table(found: Sequence[Reached]) -> TitledTable:
-    """Return how the errors of `simulate` compare with the tolerance."""
-    rows = []
+        row = {"effect": plain(name), "in a fit": ", ".join({r.fit: 0 for r in own})}
+        for rtol in dict.fromkeys(r.rtol for r in own):
+            exact = [r.way == EXACT for r in own if r.rtol == rtol]
+            row[f"exact at {rtol:.0e}"] = f"{sum(exact)} of {len(exact)}"
+        ways.append(row)
     for rtol in sorted({r.rtol for r in found}, reverse=True):
         own = [r for r in found if r.rtol == rtol]
         worst = max(own, key=lambda r: r.error)
         stack, effect, record, step = worst.trial
-        rows.append({
+        errors.append({
             "tolerance": f"{rtol:.0e}", "by exact steps": share(r.way == EXACT for r in own),
             "error / tolerance above 1": share(r.error > rtol for r in own),
             "worst": number(worst.error / rtol, 2),
             "where": f"{stack}, {plain(effect)}, {record}, {1e3 * step:g} ms",
         })  # fmt: skip
+    effects = {r.trial.effect for r in found} - {BASE_NAME}
+    fits = effects - {r.trial.effect for r in found if r.fit != EXACT}
     trials = [len(set(of)) for of in zip(*{r.trial for r in found}, strict=True)]
-    return TitledTable(
-        "Error over tolerance of `simulate`, records with kinks and jumps",
-        rows,
-        f"{trials[0]} stacks, {trials[1]} models (the base, and each effect alone beside it),"
-        f" {trials[2]} kinds of record, {trials[3]} sampling times.",
-    )
+    return [
+        TitledTable(
+            "Ways of the effects, one at a time",
+            ways,
+            f"Of {len(effects)} effects {len(fits)} take the exact way in a fit (tolerance of a"
+            f" step {FIT_RTOL:.0e}). In `simulate` the others fall back on the stepper at"
+            f" {STEP_SHARE:g} of the tolerance.",
+        ),
+        TitledTable(
+            "Error over tolerance of `simulate`, records with kinks and jumps",
+            errors,
+            f"{trials[0]} stacks, {trials[1]} models (the base, and each effect alone beside it),"
+            f" {trials[2]} kinds of record of {_SAMPLES} samples, {trials[3]} sampling times,"
+            f" against the stepper at {_TRUTH:.0e}.",
+        ),
+    ]
 
 
 #: Causes hidden in a device of the independent plants each, of which there are six records.
@@ -393,34 +372,26 @@ def diagnosis_table(demo: psa.Record, progress: Progress, quick: bool) -> Titled
 
     What is diagnosed is so once before it counts: models get compiled.
     """
-    rows: list[dict[str, str]] = []
-
-    def measure(work: str, samples: str, do: Callable[[], str], peer: bool) -> None:
-        """Add what a work takes by exact steps, and by the `peer`, which is the stepper alone."""
-        for way in ("", ", by the stepper alone")[: 1 + peer]:
-            progress(work + way)
-            if way:
-                with stepper_alone():
-                    row = _spent(work + way, samples, do)
-                ratio = number(float(rows[-1]["processor [s]"]) / float(row["processor [s]"]), 2)
-                rows[-1]["over the stepper's"] = ratio
-            else:
-                row = _spent(work, samples, do)
-            rows.append(row)
-
-    work, again = "diagnose, demonstration", partial(_diagnosed, [demo])
-    with stepper_alone():
-        again()
-    again()
-    measure(work, str(demo.n), again, True)
+    long, several = long_record(_QUICK_LONG if quick else _LONG), f"{_RECORDS} x {_CUT}"
+    works: list[tuple[str, str, Callable[[], str], bool]] = [
+        ("diagnose, demonstration", str(demo.n), partial(_diagnosed, [demo]), True),
+        ("identify, loops and steps", str(long.n), partial(_identified, long), True),
+    ]
     for cause in HIDDEN[: 1 if quick else None]:
-        again = partial(_diagnosed, six_records(cause))
-        progress(f"{cause}: first use")
-        again()
         name = f"diagnose, {_RECORDS} records, hidden {plain(cause)}"
-        measure(name, f"{_RECORDS} x {_CUT}", again, False)
-    long = long_record(_QUICK_LONG if quick else _LONG)
-    measure("identify, loops and steps", str(long.n), partial(_identified, long), True)
+        works.append((name, several, partial(_diagnosed, six_records(cause)), False))
+    rows = []
+    for work, samples, do, peer in works:
+        progress(work)
+        do()
+        spent = _spent(work, samples, do)
+        rows.append(spent)
+        if peer:
+            progress(f"{work}, by the stepper alone")
+            with stepper_alone():
+                rows.append(_spent(f"{work}, by the stepper alone", samples, do))
+            ratio = float(spent["processor [s]"]) / float(rows[-1]["processor [s]"])
+            spent["over the stepper's"] = number(ratio, 2)
     note = "Models are compiled and cached before. Wall times are those of a shared machine."
     return TitledTable("Whole fits and diagnoses", rows, note)
 
