@@ -9,7 +9,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,42 +28,32 @@ from tests.studies.plants.make import write_csv
 from tests.studies.plants.stack import Stack, draw_stack
 
 
-@dataclass
-class Killer:
-    """Kills a worker, as a machine that is lost would be, when a share of the devices is there."""
-
-    workers: dict[str, int]
-    devices: int
-    share: float = 1.0 / 3.0
-    done: int = 0
-    killed: list[int] = field(default_factory=list)
-
-    def __call__(self, told: str, progress: Progress) -> None:
-        """Count the devices by what is told after each; kill the first worker when it is time."""
-        progress(told)
-        self.done += " devices" in told
-        if self.done >= self.share * self.devices and not self.killed:
-            pid = min(self.workers.values())
-            os.kill(pid, signal.SIGKILL)
-            self.killed.append(pid)
-
-
 def on_dask(
     records: Path, output: Path, workers: int, progress: Progress, *, kill: bool = False
 ) -> tuple[psa.BatchRun, str]:
-    """Return a batch on a new cluster of so many workers, and what became of them."""
-    devices = len(list(records.glob("*.csv"))) - 1  # jobs.csv
+    """Return a batch on a new cluster of so many workers, and what became of them.
+
+    With `kill` a worker is killed, as a machine that is lost would be, when a third of the devices
+    is there, by what is told after each.
+    """
+    devices, done, killed = len(list(records.glob("*.csv"))) - 1, 0, list[int]()  # one is jobs.csv
     with dask_client(LOCAL, workers) as client:
-        before: dict[str, int] = client.run(os.getpid)  # by the worker's address
-        killer = Killer(before, devices)
-        say: Progress = partial(killer, progress=progress) if kill else progress
+        before: set[int] = set(client.run(os.getpid).values())
+
+        def say(told: str) -> None:
+            nonlocal done
+            progress(told)
+            done += " devices" in told
+            if kill and 3 * done >= devices and not killed:
+                killed.append(min(before))
+                os.kill(killed[0], signal.SIGKILL)
+
         found = psa.batch(records, output, executor=client, progress=say)
         after = set(client.run(os.getpid).values())
-    gone = sorted(set(before.values()) - after)
-    if kill and gone != killer.killed:
-        raise RuntimeError(f"Workers {killer.killed} were killed, and {gone} are gone.")
-    new = len(after - set(before.values()))
-    return found, f", {len(gone)} worker killed, {new} new in its place" if kill else ""
+    if kill and sorted(before - after) != killed:
+        raise RuntimeError(f"Workers {killed} were killed, and {before - after} are gone.")
+    new = len(after - before)
+    return found, f", {len(killed)} worker killed, {new} new in its place" if kill else ""
 
 
 #: Samples of a record, time between them [s], noise over the stroke.

@@ -1,7 +1,6 @@
 """Designed inputs measured: tracking, wrong parameters, quickest moves, time to design."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -116,74 +115,59 @@ ARCS = 6
 _SAMPLES, _TAIL, _EVALUATIONS, _SOLVED = 200, (0.02, 0.002), 200, 1e-6
 
 
-@dataclass(frozen=True)
-class BangBang:
-    """A move between the `limits` [V] from a rest in `initial` states, of which x has crept."""
+def own_bang_bang(model: psa.Model, found: QuickMove) -> float | None:
+    """Return the length [s] of the stack's own bang-bang move that a design leads to.
 
-    values: Mapping[str, float]
-    initial: Mapping[str, float]
-    begin: float
-    end: float
-    limits: tuple[float, float]
-    upward: bool
+    Between the limits, from the rest in which the design begins, of which x has crept; the search
+    starts from the arcs of the design's voltage. None if it does not settle.
+    """
+    first = dict(zip(model.state_names, found.response.states[0].tolist(), strict=True))
+    initial = {n: first[n] for n in ("u", "f_H", "f_out", "y", "v_y", "x", "v_x")}
+    limits = (found.limits.min_voltage, found.limits.max_voltage)
+    played, length = found.response.voltage[2 : 2 + INTERVALS], found.move_time
+    span, upward = limits[1] - limits[0], found.end > found.begin
+    shares = _arcs(played, limits)
 
-    def shortest(self, voltage: FloatArray, length: float) -> float | None:
-        """Return the length [s] of the move; None if the search does not settle.
-
-        It starts from the arcs of a `voltage` [V] on equal intervals of a designed move.
-        """
-        arcs = _arcs(voltage, self.limits, length)
-        scale = np.append(np.maximum(arcs / length, 0.01), 0.5)
-        start = np.append(arcs / length, voltage[-1] / self._span)
-        low = np.append(np.zeros(ARCS), self.limits[0] / self._span)
-        high = np.append(np.full(ARCS, np.inf), self.limits[1] / self._span)
-
-        def miss(q: FloatArray) -> FloatArray:
-            return self._miss(q[:-1] * length, float(q[-1]) * self._span)
-
-        found = least_squares(
-            miss, start, bounds=(low, high), x_scale=scale, diff_step=[1e-5],
-            xtol=1e-12, ftol=1e-12, max_nfev=_EVALUATIONS,
-        )  # fmt: skip
-        solved = float(np.max(np.abs(found.fun))) < 100.0 * _SOLVED
-        return float(np.sum(found.x[:-1]) * length) if solved else None
-
-    @property
-    def _span(self) -> float:
-        return self.limits[1] - self.limits[0]
-
-    def _miss(self, arcs: FloatArray, held: float) -> FloatArray:
-        """Return the distances from rest at the end (7,), in percent of the move."""
-        p, move = self.values, abs(self.end - self.begin)
-        ends = np.cumsum(np.maximum(arcs, 1e-12))
+    def miss(q: FloatArray) -> FloatArray:
+        """Return the distances from rest at the end (8,), in percent of the move."""
+        p, move, held = model.values, abs(found.end - found.begin), float(q[-1]) * span
+        ends = np.cumsum(np.maximum(q[:-1] * length, 1e-12))
         time = np.unique(np.concatenate([[0.0], ends, np.linspace(0.0, ends[-1], _SAMPLES)]))
 
         def voltage(t: float) -> float:
             arc = min(int(np.searchsorted(ends, t, side="right")), ARCS - 1)
-            return self.limits[int((arc % 2 == 0) == self.upward)]
+            return limits[int((arc % 2 == 0) == upward)]
 
-        found = reference.simulate(
-            p, voltage, time, initial=self.initial, breakpoints=ends[:-1].tolist(), rtol=1e-9
+        run = reference.simulate(
+            p, voltage, time, initial=initial, breakpoints=ends[:-1].tolist(), rtol=1e-9
         )
-        s = {n: float(v[-1]) for n, v in found.states.items()}
-        shown = float(crept(p, time, found.displacement)[-1])
-        force = p["k_L"] * p["G"] * held + s["f_H"]
-        y, x = force / p["k_P"], force * (1.0 / p["k_P"] + 1.0 / p["k_B"])
+        s = {n: float(v[-1]) for n, v in run.states.items()}
+        shown = float(crept(p, time, run.displacement)[-1])
+        force, c = p["k_L"] * p["G"] * held + s["f_H"], 1.0 / p["k_P"] + 1.0 / p["k_B"]
         w_p, w_b = np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])
-        positions = [s["y"] - y, s["x"] - x, shown - self.end, s["v_y"] / w_p, s["v_x"] / w_b]
-        electric = (s["u"] - p["G"] * held) / self._span
-        mechanic = (s["f_out"] - force) * (1.0 / p["k_P"] + 1.0 / p["k_B"]) / move
-        return 100.0 * np.array([electric, mechanic, *(d / move for d in positions)])
+        far = [(s["f_out"] - force) * c, s["y"] - force / p["k_P"], s["x"] - force * c,
+               shown - found.end, s["v_y"] / w_p, s["v_x"] / w_b]  # fmt: skip
+        return 100.0 * np.array([(s["u"] - p["G"] * held) / span, *(d / move for d in far)])
+
+    solved = least_squares(
+        miss, np.append(shares, played[-1] / span),
+        bounds=(np.append(np.zeros(ARCS), limits[0] / span),
+                np.append(np.full(ARCS, np.inf), limits[1] / span)),
+        x_scale=np.append(np.maximum(shares, 0.01), 0.5), diff_step=[1e-5],
+        xtol=1e-12, ftol=1e-12, max_nfev=_EVALUATIONS,
+    )  # fmt: skip
+    settled = float(np.max(np.abs(solved.fun))) < 100.0 * _SOLVED
+    return float(np.sum(solved.x[:-1]) * length) if settled else None
 
 
-def _arcs(voltage: FloatArray, limits: tuple[float, float], length: float) -> FloatArray:
-    """Return the lengths [s] of the first four arcs of a designed voltage, and two short ones."""
+def _arcs(voltage: FloatArray, limits: tuple[float, float]) -> FloatArray:
+    """Return the shares of the first four arcs of a designed voltage, and two short ones."""
     high = voltage > 0.5 * sum(limits)
     switches = np.flatnonzero(np.diff(high.astype(int))) + 1
     edges = np.concatenate([[0], switches, [high.size]]) / high.size
     seen = np.diff(edges)[: ARCS - len(_TAIL)]
     rest = np.full(ARCS - len(_TAIL) - len(seen), _TAIL[0])
-    return length * np.concatenate([seen, rest, _TAIL])
+    return np.concatenate([seen, rest, _TAIL])
 
 
 #: The stack carries a payload [kg], so that it rings at 1.6 kHz, and a loop 10 % of the stroke.
@@ -334,16 +318,3 @@ def _moves(progress: Progress, quick: bool) -> TitledTable:
         " over the bound, 0.1 % of residual vibration."
     )
     return TitledTable("Quickest moves", rows, note)
-
-
-def own_bang_bang(model: psa.Model, found: QuickMove) -> float | None:
-    """Return the length [s] of the stack's own bang-bang move that a design leads to."""
-    first = dict(zip(model.state_names, found.response.states[0].tolist(), strict=True))
-    chain = ("u", "f_H", "f_out", "y", "v_y", "x", "v_x")
-    low, high = found.limits.min_voltage, found.limits.max_voltage
-    own = BangBang(
-        model.values, {n: first[n] for n in chain}, found.begin, found.end, (low, high),
-        found.end > found.begin,
-    )  # fmt: skip
-    played = found.response.voltage[2 : 2 + INTERVALS]
-    return own.shortest(played, found.move_time)
