@@ -1,7 +1,7 @@
 """The benchmark `diagnose`: hidden causes on independent plants, and what was named."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,95 +64,98 @@ def _unlike(found: Sequence[Found]) -> list[Found]:
 def missed(found: Sequence[Found]) -> list[Found]:
     """Return the cases of one effect, no bend, that is not named alone, or not at all if weak."""
     known = [f for f in _unlike(_of(found, "known")) if not f.right_alone]
-    return known + [f for f in _of(found, "weak") if not _within(f)]
+    return known + [f for f in _of(found, "weak") if f.case.right not in f.within]
 
 
-def _within(f: Found) -> bool:
-    return f.case.right in f.within
+def _in_set(found: Sequence[Found]) -> str:
+    return share(f.case.right in f.within for f in found)
 
 
-def _wrong(f: Found) -> bool:
-    return f.alone is not None and f.alone not in f.case.hidden
+def _alone(found: Sequence[Found]) -> str:
+    return share(f.right_alone for f in found)
 
 
-def _not_alone(f: Found) -> bool:
-    return f.alone is None
+def _wrong(found: Sequence[Found]) -> str:
+    return share(f.alone not in (None, *f.case.hidden) for f in found)
 
 
-def _named(f: Found) -> bool:
-    return bool(f.named)
+def _not_alone(found: Sequence[Found]) -> str:
+    return share(f.alone is None for f in found)
 
 
-def _all_named(f: Found) -> bool:
-    return set(f.named) == set(f.case.hidden)
+def _named(found: Sequence[Found]) -> str:
+    return share(bool(f.named) for f in found)
 
 
-def _all_within(f: Found) -> bool:
-    """Whether as many are named as are hidden, and all of these are in the named sets."""
-    return len(f.named) == len(f.case.hidden) and set(f.case.hidden) <= set(f.within)
+def _all_named(found: Sequence[Found]) -> str:
+    return share(set(f.named) == set(f.case.hidden) for f in found)
 
 
-def _seen(f: Found) -> bool:
-    """Whether the right one is in the set, or said to be a blind spot."""
-    return f.case.right in (*f.within, *f.blind)
+def _all_in_sets(found: Sequence[Found]) -> str:
+    """Return where as many are named as are hidden, and all of these are in the named sets."""
+    return share(
+        len(f.named) == len(f.case.hidden) and set(f.case.hidden) <= set(f.within) for f in found
+    )
+
+
+def _seen(found: Sequence[Found]) -> str:
+    """Return where the right one is in the set, or said to be a blind spot."""
+    return share(f.case.right in (*f.within, *f.blind) for f in found)
 
 
 def _summary(found: Sequence[Found]) -> TitledTable:
-    known, weak, clean, left_out, foreign, two, three, six = (
+    known, weak, clean, left_out, foreign, two, three, six, design = (
         _of(found, kind)
-        for kind in ("known", "weak", "clean", "left out", "foreign", "two", "three", "six")
-    )
+        for kind in
+        ("known", "weak", "clean", "left out", "foreign", "two", "three", "six", "design")
+    )  # fmt: skip
+    poor, ringing = ([f for f in found if f.case.kind == k] for k in ("poor", "ringing"))
+    white, coloured = ([f for f in clean if f.case.noise == n] for n in ("white", "ar"))
     one = [
         f for f in _of(found, "known", "weak", "poor", "design", "six") if f.case.right in f.named
     ]
-    poor, ringing = ([f for f in found if f.case.kind == k] for k in ("poor", "ringing"))
-    design, told = _of(found, "design"), [f for f in (*known, *weak) if f.named]
-    white, coloured = ([f for f in clean if f.case.noise == n] for n in ("white", "ar"))
-    bends = f"the same, {' and '.join(ALIKE)} not counted"
-    counted: tuple[tuple[str, str, Sequence[Found], Callable[[Found], bool]], ...] = (
-        ("right name alone, rho 0.3 to 3", "-", known, lambda f: f.right_alone),
-        (bends, "95 %", _unlike(known), lambda f: f.right_alone),
-        ("right name in the named set, rho 0.3 to 3", "98 %", known, _within),
-        ("right name in the named set, rho 0.1 to 0.3", "85 %", weak, _within),
-        ("a single wrong name, rho 0.3 to 3", "at most 1 %", known, _wrong),
-        ("a single wrong name, rho 0.1 to 0.3", "at most 5 %", weak, _wrong),
-        ("clean, white noise: a cause named", "0", white, _named),
-        ("clean, AR(1) noise: a cause named", "0", coloured, _named),
-        ("clean: any alarm", "at most 1 %", clean, lambda f: f.verdict != "adequate"),
-        ("own entry left out: not named alone", "97 %", left_out, _not_alone),
-        (bends, "97 %", _unlike(left_out), _not_alone),
-        ("foreign plants: not named alone", "97 %", foreign, _not_alone),
-        ("two causes: both named, no third", "90 %", two, _all_named),
-        ("two causes: both in the named sets, no third name", "-", two, _all_within),
-        ("three causes: all named, no fourth", "70 %", three, _all_named),
-        ("three causes: all in the named sets, no fourth name", "-", three, _all_within),
-        ("six records of a device: right name in the named set", "98 %", six, _within),
-        ("one cause: a second named beside the right one", "at most 3 %", one,
-         lambda f: len(f.named) > 1),
-        ("poor voltages: a single wrong name", "-", poor, _wrong),
-        ("poor voltages: right in the set, or said to be blind", "-", poor, _seen),
-        ("other designs of record: a single wrong name", "-", design, _wrong),
-        ("other designs: right in the set, or said to be blind", "-", design, _seen),
-        ("clean, resonances in or near the band: a cause named", "at most 1 %", ringing, _named),
-        ("95 % credible set holds the cause, where one is named", "93 %", told, _within),
-    )  # fmt: skip
-    rows = [(text, asked, share(map(holds, own))) for text, asked, own, holds in counted]
     absent = [f for f in found if f.case.kind in ("foreign", "left out")]
     absent = [f for f in absent if f.verdict == "unexplained"]
     ahead = [f for f in absent if not HIDDEN_EFFECTS[str(f.case.effect)].random]
     ratios = [f.ratio for f in known if f.case.right in f.named] or [np.nan]
     sizes = [float(len(f.within)) for f in known if len(f.named) == 1] or [np.nan]
-    seconds = [f.seconds for f in found]
-    rows += [
+    seconds, bends = [f.seconds for f in found], f"the same, {' and '.join(ALIKE)} not counted"
+    rows = (
+        ("right name alone, rho 0.3 to 3", "-", _alone(known)),
+        (bends, "95 %", _alone(_unlike(known))),
+        ("right name in the named set, rho 0.3 to 3", "98 %", _in_set(known)),
+        ("right name in the named set, rho 0.1 to 0.3", "85 %", _in_set(weak)),
+        ("a single wrong name, rho 0.3 to 3", "at most 1 %", _wrong(known)),
+        ("a single wrong name, rho 0.1 to 0.3", "at most 5 %", _wrong(weak)),
+        ("clean, white noise: a cause named", "0", _named(white)),
+        ("clean, AR(1) noise: a cause named", "0", _named(coloured)),
+        ("clean: any alarm", "at most 1 %", share(f.verdict != "adequate" for f in clean)),
+        ("own entry left out: not named alone", "97 %", _not_alone(left_out)),
+        (bends, "97 %", _not_alone(_unlike(left_out))),
+        ("foreign plants: not named alone", "97 %", _not_alone(foreign)),
         ("foreign or left out and unexplained: share that the unnamed correction removes, median",
          "70 %", _removed(absent)),
         ("the same, without the three whose plant adds a random signal", "-", _removed(ahead)),
+        ("two causes: both named, no third", "90 %", _all_named(two)),
+        ("two causes: both in the named sets, no third name", "-", _all_in_sets(two)),
+        ("three causes: all named, no fourth", "70 %", _all_named(three)),
+        ("three causes: all in the named sets, no fourth name", "-", _all_in_sets(three)),
+        ("six records of a device: right name in the named set", "98 %", _in_set(six)),
+        ("one cause: a second named beside the right one", "at most 3 %",
+         share(len(f.named) > 1 for f in one)),
+        ("poor voltages: a single wrong name", "-", _wrong(poor)),
+        ("poor voltages: right in the set, or said to be blind", "-", _seen(poor)),
+        ("other designs of record: a single wrong name", "-", _wrong(design)),
+        ("other designs: right in the set, or said to be blind", "-", _seen(design)),
+        ("clean, resonances in or near the band: a cause named", "at most 1 %", _named(ringing)),
         ("held-out rms over the noise's: median, 95th percentile", "1.05, 1.15",
          f"{np.median(ratios):.3f}, {np.quantile(ratios, 0.95):.3f}"),
+        ("95 % credible set holds the cause, where one is named", "93 %",
+         _in_set([f for f in (*known, *weak) if f.named])),
         ("size of the named set, mean", "at most 2.2", f"{np.mean(sizes):.2f}"),
         ("processor time of a diagnosis: median, 90th percentile", "8 s",
          f"{np.median(seconds):.1f} s, {np.quantile(seconds, 0.9):.0f} s"),
-    ]  # fmt: skip
+    )  # fmt: skip
     return TitledTable(
         "Hidden causes on independent plants",
         [dict(zip(("figure", "asked", "reached"), row, strict=True)) for row in rows],

@@ -134,20 +134,16 @@ def changes(whole: Sequence[Marked], found: Sequence[Marked]) -> dict[str, str]:
     """Return what is another answer than before: how many, which marks, false alarms, and time."""
     pairs = list(zip(whole, found, strict=True))
     other = [old.record.name for old, new in pairs if _said(old) != _said(new)]
-    named = [n for o, n in pairs if n.record.group == "clean" and n.answer.causes]
+    marked_so = [f"{o.record.name}: {o.mark} > {n.mark}" for o, n in pairs if o.mark != n.mark]
+    named = [o.record.name for o, n in pairs if n.answer.causes and not o.answer.causes
+             and o.record.group == "clean"]  # fmt: skip
     spent = sum(new.seconds for new in found) / max(sum(old.seconds for old in whole), 1e-9)
-    before = [o.record.name for o in whole if o.answer.causes]
     return {
-        "answers changed": f"{len(other)} of {len(pairs)}"
-        + (f" ({', '.join(other)})" if other else ""),
-        "marks changed": "; ".join(
-            f"{o.record.name}: {o.mark} > {n.mark}" for o, n in pairs if o.mark != n.mark
-        ) or "-",
-        "names in a clean record": ", ".join(
-            n.record.name for n in named if n.record.name not in before
-        ) or "-",
+        "answers changed": f"{len(other)} of {len(pairs)} {', '.join(other)}",
+        "marks changed": "; ".join(marked_so) or "-",
+        "names in a clean record": ", ".join(named) or "-",
         "processor time": f"{spent:.2f}",
-    }  # fmt: skip
+    }
 
 
 def _said(one: Marked) -> object:
