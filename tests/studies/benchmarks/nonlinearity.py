@@ -42,7 +42,6 @@ class Case:
     position: FloatArray
     deviation: FloatArray
     nonlinearity: float
-    tracking: float
 
 
 class Run(NamedTuple):
@@ -202,9 +201,8 @@ _NOTE = (
     f"Stack {STACK} on the flexure stage (0.2 kg, 5 N/um), {1e6 * PEAK:g} um at {FREQUENCY:g} Hz,"
     f" controller every {1e6 * PERIOD:g} us; second period from rest, simulated by an independent"
     " plain loop (scipy). Nonlinearity: largest distance from the best line of position against the"
-    " position of the same loop with a linear stack, over the range. Tracking error: largest"
-    " |position - reference| over the reference's range, nothing fitted; in open loop the command"
-    " is the reference over the linear plant's gain, in closed loop it is the feed-forward too."
+    " position of the same loop with a linear stack, over the range. In open loop the command is the"
+    " reference over the linear plant's gain, in closed loop it is the feed-forward too."
 )
 _WRONG = "The stack simulated has other hysteresis parameters than compensator and controller know."
 #: The raster, up to the peak and down at one speed, and a sine from 0 to the peak [m].
@@ -240,8 +238,7 @@ def simulate_case(wave: str, closed: bool, compensated: bool, error: str = "exac
     )
     deviation = position - line(linear)
     nonlinearity = float(np.abs(deviation).max() / np.ptp(position))
-    tracking = float(np.abs(position - reference).max() / np.ptp(reference))
-    shown = (time, reference, position, deviation, nonlinearity, tracking)
+    shown = (time, reference, position, deviation, nonlinearity)
     return Case(closed, compensated, wave, error, *shown)
 
 
@@ -266,9 +263,9 @@ def tables(cases: Sequence[Case]) -> tuple[TitledTable, ...]:
     """Return the nonlinearity of exact compensators, and of wrong ones."""
     rows = [
         {"reference": c.wave, "loop": "closed" if c.closed else "open",
-         "compensator": "with" if c.compensated else "without", "stack's parameters": c.error,
-         "nonlinearity [% of range]": f"{100 * c.nonlinearity:.3f}",
-         "tracking error [%]": f"{100 * c.tracking:.3f}"}
+         "compensator": "with" if c.compensated else "without",
+         "stack's parameters": c.error,
+         "nonlinearity [% of range]": f"{100 * c.nonlinearity:.3f}"}
         for c in cases
     ]  # fmt: skip
     exact = [r for r in rows if r["stack's parameters"] == "exact"]

@@ -6,8 +6,6 @@ equations, CVODES through CasADi, diffrax.
 """
 
 import math
-import resource
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -169,18 +167,15 @@ def _growth(lengths: tuple[int, ...], progress: Progress) -> TitledTable:
     for samples in lengths:
         progress(f"fit to {samples} samples")
         found, spent = _fitted(_record(samples))
-        unit = 1.0 if sys.platform == "darwin" else 1024.0
-        peak = unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         each = 1e6 * spent / found.evaluations / samples
         rows.append({
             "samples": samples, "CPU time [s]": f"{spent:.2f}", "simulations": found.evaluations,
-            "each, per sample [us]": f"{each:.1f}", "peak memory [MiB]": f"{peak:.0f}",
+            "each, per sample [us]": f"{each:.1f}",
         })  # fmt: skip
     return TitledTable(
         "The same fit over the length of the record",
         rows,
-        "Every simulation carries the derivatives by all parameters. Memory is the highest of the"
-        " whole process so far, Python and libraries included; nothing was averaged.",
+        "Every simulation carries the derivatives by all parameters; nothing was averaged.",
     )
 
 
