@@ -34,7 +34,7 @@ from tests.studies.benchmarks import design_tracking
 from tests.studies.benchmarks.records import hidden_record, played_again
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, least_times, on_all_cores
 from tests.studies.plants.excitations import PoorKind
-from tests.studies.plants.table import KNOWN
+from tests.studies.plants.table import KNOWN, called
 
 #: Ambiguous pairs that are resolved, and the seeds from which they are drawn.
 PAIRS, QUICK_PAIRS, FIRST = 20, 2, 8400
@@ -105,7 +105,7 @@ def resolve(seed: int) -> Resolved | None:
     effect = str(rng.choice([n for n in KNOWN if n != "temperature"]))
     voltage = CLASSES[rng.integers(len(CLASSES))]
     truth, first = hidden_record(effect, seed, excitation=voltage, visible=RHO)
-    first = first.slice(0, SAMPLES)
+    first, effect = first.slice(0, SAMPLES), called(effect)
     try:
         rival = likely_rival(first, effect)
         pair = [psa.EFFECTS[effect], psa.EFFECTS[rival]]

@@ -201,8 +201,8 @@ _NOTE = (
     f"Stack {STACK} on the flexure stage (0.2 kg, 5 N/um), {1e6 * PEAK:g} um at {FREQUENCY:g} Hz,"
     f" controller every {1e6 * PERIOD:g} us; second period from rest, simulated by an independent"
     " plain loop (scipy). Nonlinearity: largest distance from the best line of position against the"
-    " position of the same loop with a linear stack, over the range. In open loop the command is the"
-    " reference over the linear plant's gain, in closed loop it is the feed-forward too."
+    " position of the same loop with a linear stack, over the range. In open loop the command is"
+    " the reference over the linear plant's gain, in closed loop it is the feed-forward too."
 )
 _WRONG = "The stack simulated has other hysteresis parameters than compensator and controller know."
 #: The raster, up to the peak and down at one speed, and a sine from 0 to the peak [m].

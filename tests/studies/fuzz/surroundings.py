@@ -42,8 +42,8 @@ _USUAL = {
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """Words of which a failure must say one, lower case, and how the surroundings are made.
+class Odd:
+    """Odd surroundings: how they are made, and words of which a failure must say one, lower case.
 
     Without `words` the command must work. The command runs as a user who may not do everything.
     `place` is made in the command's folder, `variable` names it, and `output` is written there;
@@ -112,11 +112,11 @@ def _ignore(_: Path) -> None:
         signal.signal(which, signal.SIG_IGN)
 
 
-def _limited(which: int, value: int, *words: str) -> Surroundings:
-    return Surroundings(words, first=lambda _: resource.setrlimit(which, (value, value)))
+def _limited(which: int, value: int, *words: str) -> Odd:
+    return Odd(words, first=lambda _: resource.setrlimit(which, (value, value)))
 
 
-def _compiler(text: str, folder: str = "tools") -> Surroundings:
+def _compiler(text: str, folder: str = "tools") -> Odd:
     """Let CC name a program by its text."""
 
     def make(path: Path) -> None:
@@ -124,7 +124,7 @@ def _compiler(text: str, folder: str = "tools") -> Surroundings:
         path.write_text(text)
         path.chmod(0o755)
 
-    return Surroundings(_CC, {}, make, "CC", f"{folder}/cc")
+    return Odd(_CC, {}, make, "CC", f"{folder}/cc")
 
 
 _CACHE = ("cache", "psa_casadi_cache", "home", "place")
@@ -133,68 +133,67 @@ _DISK = ("space", "full", "place", "disk")
 _CC = ("cc", "compiler")
 _ASCII = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 _KEPT_IN = "PSA_CASADI_CACHE"
-_Odd = Surroundings
 
-SURROUNDINGS: dict[str, Surroundings] = {
-    "no HOME": _Odd(_CACHE, {**_USUAL, "HOME": None}),
-    "HOME unwritable": _Odd(_CACHE, _USUAL, _unwritable, "HOME"),
-    "HOME a file": _Odd(_CACHE, _USUAL, _file, "HOME"),
-    "HOME empty": _Odd(_CACHE, {**_USUAL, "HOME": ""}),
-    "HOME missing": _Odd((*_CACHE, "/nowhere"), {**_USUAL, "HOME": "/nowhere/at/all"}),
-    "HOME relative": _Odd(_CACHE, {**_USUAL, "HOME": "home"}),
-    "XDG_CACHE_HOME empty": _Odd(_CACHE, {**_USUAL, "XDG_CACHE_HOME": "", "HOME": "/no"}),
-    "XDG_CACHE_HOME relative": _Odd(_CACHE, {**_USUAL, "XDG_CACHE_HOME": "here"}),
-    "cache a file": _Odd(_CACHE, {}, _file, _KEPT_IN),
-    "cache unwritable": _Odd(_CACHE, {}, _unwritable, _KEPT_IN),
-    "cache in /proc": _Odd((*_CACHE, "/proc"), {_KEPT_IN: "/proc/no/such"}),
-    "cache a link to nothing": _Odd(
+SURROUNDINGS: dict[str, Odd] = {
+    "no HOME": Odd(_CACHE, {**_USUAL, "HOME": None}),
+    "HOME unwritable": Odd(_CACHE, _USUAL, _unwritable, "HOME"),
+    "HOME a file": Odd(_CACHE, _USUAL, _file, "HOME"),
+    "HOME empty": Odd(_CACHE, {**_USUAL, "HOME": ""}),
+    "HOME missing": Odd((*_CACHE, "/nowhere"), {**_USUAL, "HOME": "/nowhere/at/all"}),
+    "HOME relative": Odd(_CACHE, {**_USUAL, "HOME": "home"}),
+    "XDG_CACHE_HOME empty": Odd(_CACHE, {**_USUAL, "XDG_CACHE_HOME": "", "HOME": "/no"}),
+    "XDG_CACHE_HOME relative": Odd(_CACHE, {**_USUAL, "XDG_CACHE_HOME": "here"}),
+    "cache a file": Odd(_CACHE, {}, _file, _KEPT_IN),
+    "cache unwritable": Odd(_CACHE, {}, _unwritable, _KEPT_IN),
+    "cache in /proc": Odd((*_CACHE, "/proc"), {_KEPT_IN: "/proc/no/such"}),
+    "cache a link to nothing": Odd(
         (*_CACHE, "/nowhere"), {}, lambda p: p.symlink_to("/nowhere/x"), _KEPT_IN
     ),
-    "cache with spaces and unicode": _Odd((), {}, None, _KEPT_IN, "mein käsch ➕ 'x'"),
-    "cache on a full disk": _Odd((*_CACHE, *_DISK), {}, _full, _KEPT_IN),
-    "TMPDIR missing": _Odd((*_TEMPORARY, "/nowhere"), {"TMPDIR": "/nowhere/at/all"}),
-    "TMPDIR unwritable": _Odd(_TEMPORARY, {}, _unwritable, "TMPDIR"),
-    "TMPDIR a file": _Odd(_TEMPORARY, {}, _file, "TMPDIR"),
-    "TMPDIR on a full disk": _Odd((*_TEMPORARY, *_DISK), {}, _full, "TMPDIR"),
-    "output on a full disk": _Odd((*_DISK, "write"), {}, _full, output=True),
-    "output folder unwritable": _Odd(("write",), {}, _unwritable, output=True),
-    "output with spaces and unicode": _Odd((), {}, _open, name="o ü ➕", output=True),
-    "unicode path without UTF-8": _Odd((), {**_ASCII, "LC_ALL": "C"}, _open, "", "ü", True),
-    "LC_ALL=C": _Odd((), {"LC_ALL": "C", "LANG": None}),
-    "POSIX without UTF-8": _Odd((), {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii", **_ASCII}),
-    "unknown locale": _Odd((), {"LC_ALL": "xx_YY.nonsense", "LANG": "tlh"}),
-    "PYTHONOPTIMIZE=2": _Odd((), {"PYTHONOPTIMIZE": "2"}),
-    "stdin closed": _Odd(first=lambda _: os.close(0)),
-    "stdout closed": _Odd(("output", "closed", "written", "descriptor"),
+    "cache with spaces and unicode": Odd((), {}, None, _KEPT_IN, "mein käsch ➕ 'x'"),
+    "cache on a full disk": Odd((*_CACHE, *_DISK), {}, _full, _KEPT_IN),
+    "TMPDIR missing": Odd((*_TEMPORARY, "/nowhere"), {"TMPDIR": "/nowhere/at/all"}),
+    "TMPDIR unwritable": Odd(_TEMPORARY, {}, _unwritable, "TMPDIR"),
+    "TMPDIR a file": Odd(_TEMPORARY, {}, _file, "TMPDIR"),
+    "TMPDIR on a full disk": Odd((*_TEMPORARY, *_DISK), {}, _full, "TMPDIR"),
+    "output on a full disk": Odd((*_DISK, "write"), {}, _full, output=True),
+    "output folder unwritable": Odd(("write",), {}, _unwritable, output=True),
+    "output with spaces and unicode": Odd((), {}, _open, name="o ü ➕", output=True),
+    "unicode path without UTF-8": Odd((), {**_ASCII, "LC_ALL": "C"}, _open, "", "ü", True),
+    "LC_ALL=C": Odd((), {"LC_ALL": "C", "LANG": None}),
+    "POSIX without UTF-8": Odd((), {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii", **_ASCII}),
+    "unknown locale": Odd((), {"LC_ALL": "xx_YY.nonsense", "LANG": "tlh"}),
+    "PYTHONOPTIMIZE=2": Odd((), {"PYTHONOPTIMIZE": "2"}),
+    "stdin closed": Odd(first=lambda _: os.close(0)),
+    "stdout closed": Odd(("output", "closed", "written", "descriptor"),
                           first=lambda _: os.close(1)),
-    "stderr closed": _Odd(first=lambda _: os.close(2)),
-    "stdout a broken pipe": _Odd(("",), streams={"stdout": "a broken pipe"}),
-    "stdout on a full disk": _Odd((*_DISK, "output"), streams={"stdout": "/dev/full"}),
-    "stderr on a full disk": _Odd(("",), streams={"stderr": "/dev/full"}),
-    "COLUMNS=1": _Odd((), {"COLUMNS": "1", "LINES": "1"}),
-    "COLUMNS no number": _Odd((), {"COLUMNS": "wide", "TERM": "dumb", "NO_COLOR": "1"}),
-    "unknown terminal": _Odd((), {"TERM": "no-such-terminal", "FORCE_COLOR": "1"}),
-    "CC missing": _Odd(_CC, {"CC": "/nowhere/cc"}),
+    "stderr closed": Odd(first=lambda _: os.close(2)),
+    "stdout a broken pipe": Odd(("",), streams={"stdout": "a broken pipe"}),
+    "stdout on a full disk": Odd((*_DISK, "output"), streams={"stdout": "/dev/full"}),
+    "stderr on a full disk": Odd(("",), streams={"stderr": "/dev/full"}),
+    "COLUMNS=1": Odd((), {"COLUMNS": "1", "LINES": "1"}),
+    "COLUMNS no number": Odd((), {"COLUMNS": "wide", "TERM": "dumb", "NO_COLOR": "1"}),
+    "unknown terminal": Odd((), {"TERM": "no-such-terminal", "FORCE_COLOR": "1"}),
+    "CC missing": Odd(_CC, {"CC": "/nowhere/cc"}),
     "CC with a space": _compiler(
         f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc "$@"\n', "my tools"
     ),
     "CC fails": _compiler("#!/bin/sh\nexit 1\n"),
     "CC is no program": _compiler("\0\1\2"),
     "CC does nothing": _compiler("#!/bin/sh\nexit 0\n"),
-    "CC with quotes": _Odd(_CC, {"CC": "cc '-DX=\"a"}),
-    "PATH empty": _Odd((), {"PATH": ""}),
+    "CC with quotes": Odd(_CC, {"CC": "cc '-DX=\"a"}),
+    "PATH empty": Odd((), {"PATH": ""}),
     "little memory": _limited(resource.RLIMIT_AS, 700 << 20, "memory"),
     "few open files": _limited(resource.RLIMIT_NOFILE, 16, "open files", "files"),
     "small files only": _limited(
         resource.RLIMIT_FSIZE, 4096, "large", "space", "write", "cache", "compiler"
     ),
     "no new processes": _limited(resource.RLIMIT_NPROC, 1, "process", "resource", "compiler"),
-    "directory gone": _Odd(("directory", "folder"), {}, _open, name="gone", first=_leave),
-    "umask 777": _Odd((*_CACHE, *_TEMPORARY, "permission", "write"),
+    "directory gone": Odd(("directory", "folder"), {}, _open, name="gone", first=_leave),
+    "umask 777": Odd((*_CACHE, *_TEMPORARY, "permission", "write"),
                       first=lambda _: os.umask(0o777)),
-    "debugging": _Odd((), {"PSA_CASADI_DEBUG": "1"}),
-    "SIGPIPE and SIGCHLD ignored": _Odd(first=_ignore),
-    "odd numbers of threads": _Odd(
+    "debugging": Odd((), {"PSA_CASADI_DEBUG": "1"}),
+    "SIGPIPE and SIGCHLD ignored": Odd(first=_ignore),
+    "odd numbers of threads": Odd(
         (), {"OPENBLAS_NUM_THREADS": "0", "OMP_NUM_THREADS": "x", "MKL_NUM_THREADS": "-1"}
     ),
 }  # fmt: skip
