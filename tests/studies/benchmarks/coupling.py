@@ -32,14 +32,7 @@ from psa_casadi.export.ssp.steps import stable_step
 from psa_casadi.model.nanopositioner import positioner_plant
 from psa_casadi.report.words.phrases import number
 from tests.export.ssp_master import SspArchive, couple, points
-from tests.studies.benchmarks.table import (
-    FloatArray,
-    Outcome,
-    Progress,
-    TitledTable,
-    plain_ticks,
-    styled,
-)
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, styled
 
 _END, _FREQUENCY, _TRUTH_STEP, _TRUTH, _TOLERANCE = 4e-3, 250.0, 2.5e-7, 1e-10, 1e-9
 _STEPS = (1e-5, 5e-6, 2.5e-6, 1.25e-6, 6.25e-7)
@@ -342,17 +335,16 @@ def picture(steps: FloatArray, errors: Mapping[str, Errors], found: Sequence[Lim
                 markerfacecolor="none" if size > 5 else colour, linewidth=1.4,
                 label=name + (f" (slope {slope:.2f})" if isfinite(slope) else ""),
             )  # fmt: skip
-        styled(axes, "communication step [us]", "largest error of the position [% of range]", title)
-        plain_ticks(axes, 1e6 * steps)
+        errors_label = "largest error of the position [% of range]"
+        styled(axes, "communication step [us]", errors_label, title, ticks=1e6 * steps)
     for slopes, colour in ((False, "#d55e00"), (True, "#0072b2")):
         x, _, predicted, stable = np.array([f for f in found if f.slopes == slopes]).T
         name = "input derivatives" if slopes else "inputs held"
         how: Any = {"color": colour, "linewidth": 1.4}
         last.loglog(1e-6 * x, 1e6 * predicted, label=f"{name}: predicted", **how)
         last.loglog(1e-6 * x, 1e6 * stable, "o", label=f"{name}: found", **how)
-    title = "where the co-simulation turns unstable"
-    styled(last, "contact stiffness [N/um]", "longest stable step [us]", title)
-    plain_ticks(last, sorted({1e-6 * f.stiffness for f in found}))
+    title, ticks = "where the co-simulation turns unstable", {1e-6 * f.stiffness for f in found}
+    styled(last, "contact stiffness [N/um]", "longest stable step [us]", title, ticks=ticks)
     for axes in (*panels, last):
         axes.legend(fontsize=8.5)
     return figure

@@ -21,14 +21,7 @@ from psa_casadi.records.split import whole
 from psa_casadi.report.words.phrases import number
 from tests.identification.paper_cases import coefficients_of_values
 from tests.studies.benchmarks.records import Values, noisy, slowest
-from tests.studies.benchmarks.table import (
-    FloatArray,
-    Outcome,
-    Progress,
-    TitledTable,
-    plain_ticks,
-    styled,
-)
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, styled
 
 STACK_NAMES = ("PTBS200", "WYDS0808020", "P-885.51")
 NOISES, WINDOW, SEEDS = (0.0, 1e-5, 1e-4, 1e-3), 40.0, 3
@@ -140,8 +133,8 @@ def _picture(cases: Sequence[Case]) -> Figure:
             axes.plot(noise, np.median(errors, axis=1), color=colour, marker="o", label=method)
         axes.axhline(1.0, color="black", linewidth=1.0, linestyle="--")
         axes.set(xscale="log", yscale="log")
-        plain_ticks(axes, [_FLOOR, *(n for n in NOISES if n)])
-        styled(axes, "noise over the step (1e-6: none)", "", name)
+        ticks = [_FLOOR, *(n for n in NOISES if n)]
+        styled(axes, "noise over the step (1e-6: none)", "", name, ticks=ticks)
     panels[0].set_ylabel("relative error of $a_1$ to $a_5$, $b_1$")
     panels[0].legend(title="median, and range over the six")
     figure.suptitle(f"Coefficients of eq. (15) from a step of {WINDOW:g} slowest time constants")

@@ -115,18 +115,20 @@ def bench(name: str, of: str = "run") -> Any:
     return getattr(found, (function or of) if of == "run" else of, None)
 
 
-def styled(axes: Axes, x: str = "", y: str = "", title: str = "", *, size: float = 10.5) -> None:
-    """Give axes labels and a title, a light grid below the curves, and small numbers."""
+def styled(
+    axes: Axes, x: str = "", y: str = "", title: str = "", *, size: float = 10.5,
+    ticks: Iterable[float] = (),
+) -> None:  # fmt: skip
+    """Give axes labels and a title, a light grid below the curves, and small numbers.
+
+    Where there are `ticks`, a logarithmic axis below has these alone.
+    """
     axes.set_xlabel(x, fontsize=size)
     axes.set_ylabel(y, fontsize=size)
     axes.set_title(title, loc="left", fontsize=size)
     axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
     axes.set_axisbelow(True)
+    if places := sorted(ticks):
+        axes.set_xticks(places, [f"{v:g}" for v in places])
+        axes.xaxis.set_minor_formatter(NullFormatter())
     axes.tick_params(labelsize=size - 2)
-
-
-def plain_ticks(axes: Axes, x: Iterable[float]) -> None:
-    """Give a logarithmic axis ticks at these values alone."""
-    ticks = sorted(x)
-    axes.set_xticks(ticks, [f"{v:g}" for v in ticks])
-    axes.xaxis.set_minor_formatter(NullFormatter())
