@@ -14,6 +14,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from math import inf
 from typing import Any
+from unittest.mock import patch
 
 import casadi as ca
 import numpy as np
@@ -22,7 +23,7 @@ from scipy.optimize import least_squares
 
 import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.records import multisine, time_grid
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.phrases import number
@@ -98,45 +99,60 @@ def _record(samples: int) -> psa.Record:
     return noisy(clean, _NOISE * clean.range_m, np.random.default_rng(1))
 
 
-def _fitted(record: psa.Record) -> tuple[Fit, float]:
-    """Fit a record from the wrong values; return the processor time as well [s]."""
-    model, began = psa.stack_model(_STACK), time.process_time()
+#: Time [s] and cost of every evaluation.
+Trace = list[tuple[float, float]]
+
+
+def _fitted(record: psa.Record) -> tuple[int, float, Trace]:
+    """Fit a record from the wrong values; return simulations, processor time [s] and trace."""
+    model, began, trace = psa.stack_model(_STACK), time.process_time(), Trace()
+    made: Any = fitting.Objective
+
+    def traced(*given: Any) -> Callable[[FloatArray], Any]:
+        evaluate = made(*given)
+
+        def wrapped(theta: FloatArray) -> Any:
+            found = evaluate(theta)
+            if found is not None:
+                trace.append((time.process_time() - began, float(found[0] @ found[0])))
+            return found
+
+        return wrapped
+
     start = {name: factor * model.values[name] for name, factor in _WRONG.items()}
-    found = fit(model, [whole(record)], FREE, sigma=[_NOISE * record.range_m], start=start)
-    return found, time.process_time() - began
+    with patch.object(fitting, "Objective", traced):
+        sigma = [_NOISE * record.range_m]
+        found = fitting.fit(model, [whole(record)], FREE, sigma=sigma, start=start)
+    return found.evaluations, time.process_time() - began, trace
 
 
 def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
     record = _record(samples)
-    sigma = _NOISE * record.range_m
     _fitted(record)  # compiles the model once, as on any first use
-    found, ours = _fitted(record)
-    cost = float(np.sum((found.residuals / sigma) ** 2))
+    runs, _, ours = _fitted(record)
     progress(f"least_squares with solve_ivp on {samples} samples (minutes)")
-    trace = _scipy(record, sigma)
-    lowest = min(c for _, c in trace)
-    target = _REACHED * max(cost, lowest)
-    theirs = next(t for t, c in trace if c <= target)
-    ways = {
-        "psa_casadi, fit": (ours, found.evaluations, cost),
-        "scipy, least_squares with solve_ivp": (theirs, len(trace), lowest),
-    }
+    theirs = _scipy(record, _NOISE * record.range_m)
+    ways = {"psa_casadi, fit": (runs, ours),
+            "scipy, least_squares with solve_ivp": (len(theirs), theirs)}  # fmt: skip
+    lowest = [min(c for _, c in trace) for _, trace in ways.values()]
+    target = _REACHED * max(lowest)
+    spent = [next(t for t, c in trace if c <= target) for _, trace in ways.values()]
     rows = [
-        {"who": who, "CPU time to the final cost [s]": f"{spent:.3g}", "simulations": runs,
-         "lowest cost": f"{least:.1f}"}
-        for who, (spent, runs, least) in ways.items()
+        {"who": who, "CPU time to the final cost [s]": f"{t:.3g}", "simulations": n,
+         "lowest cost": f"{c:.1f}"}
+        for (who, (n, _)), t, c in zip(ways.items(), spent, lowest, strict=True)
     ]  # fmt: skip
     return TitledTable(
         f"One fit of {len(FREE) + 1} parameters to {samples} samples",
         rows,
-        f"The fit here takes 1/{theirs / ours:.0f} of the time: all of its own, beside scipy's"
-        f" until it first has the cost that both reach. Both search the offset and"
-        f" {', '.join(FREE)} from one start, in one process of one run; a cost of {samples} is pure"
-        " noise. Compiling the model once (cached afterwards) is not counted.",
+        f"The fit here takes 1/{spent[1] / spent[0]:.0f} of the time, until each first has the cost"
+        f" that both reach. Both search the offset and {', '.join(FREE)} from one start, in one"
+        f" process of one run; a cost of {samples} is pure noise. Compiling the model once (cached"
+        " afterwards) is not counted.",
     )
 
 
-def _scipy(record: psa.Record, sigma: float) -> list[tuple[float, float]]:
+def _scipy(record: psa.Record, sigma: float) -> Trace:
     """Return time and cost of every step of least_squares with finite differences."""
     values, y = psa.stack_model(_STACK).values, np.asarray(record.displacement)
     reference = np.array([values[n] for n in FREE])
@@ -147,7 +163,7 @@ def _scipy(record: psa.Record, sigma: float) -> list[tuple[float, float]]:
     atol = 1e-7 * np.array(
         [values["u_rated"], values["h_ref"], force, stroke, speed, stroke, speed]
     )
-    began, trace = time.process_time(), list[tuple[float, float]]()
+    began, trace = time.process_time(), Trace()
 
     def residual(z: FloatArray) -> FloatArray:
         ratios = np.where(positive, np.exp(np.where(positive, z[:-1], 0.0)), z[:-1])
@@ -166,10 +182,10 @@ def _growth(lengths: tuple[int, ...], progress: Progress) -> TitledTable:
     rows = []
     for samples in lengths:
         progress(f"fit to {samples} samples")
-        found, spent = _fitted(_record(samples))
-        each = 1e6 * spent / found.evaluations / samples
+        runs, spent, _ = _fitted(_record(samples))
+        each = 1e6 * spent / runs / samples
         rows.append({
-            "samples": samples, "CPU time [s]": f"{spent:.2f}", "simulations": found.evaluations,
+            "samples": samples, "CPU time [s]": f"{spent:.2f}", "simulations": runs,
             "each, per sample [us]": f"{each:.1f}",
         })  # fmt: skip
     return TitledTable(
