@@ -333,7 +333,7 @@ def test_names_that_stacks_have_are_free(tmp_path: Path) -> None:
         {"x": [force, v], "u": pull, "p": k, "y": v, "ode": [v, pull - k * force - v]},
         name="any", outputs=["velocity"], values={"tip_force": 4.0},
     )  # fmt: skip
-    t = 0.02 * np.arange(201)
+    t = 0.02 * np.arange(201.0)
     u = np.sin(2.0 * t)
     shown = psa.run(model, t, u[:, None], np.zeros(2), rtol=1e-9, hold="zero").y[:, 0]
     path = tmp_path / "any.fmu"
