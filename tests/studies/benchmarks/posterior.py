@@ -63,7 +63,9 @@ def evidence(task: Task) -> tuple[dict[str, float], float]:
     known = task.unknowns.prior[kept]
     low, high = (edge[kept] / known for edge in task.unknowns.bounds())
     counts = sum(b.count for b in blocks)
-    level = counts * float(np.log(task.levels[0]))  # residuals are weighted by a fit's own
+    level = counts * float(
+        np.log(task.density.blocks[0].level)
+    )  # residuals are weighted by a fit's own
     constant = float(np.linalg.slogdet(density.factor)[1]) - level
     constant -= float(np.sum(np.log(known * np.sqrt(2.0 * np.pi))))
     constant -= float(np.sum(np.log(norm.cdf(high) - norm.cdf(low))))  # cut at the bounds
@@ -191,7 +193,7 @@ def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replic
     apart = np.abs(below.mean(axis=0) - 0.5)
     inside = tuple(tuple(bool(a <= 0.5 * level) for level in LEVELS) for a in apart)
     ranks = tuple(below[::THIN].sum(axis=0).tolist())
-    return Replica(ranks, inside, chains.divergences, task.inflation[0])
+    return Replica(ranks, inside, chains.divergences, task.density.blocks[0].alike)
 
 
 def _ranks(found: Sequence[Replica]) -> TitledTable:
