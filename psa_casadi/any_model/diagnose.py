@@ -7,6 +7,7 @@ from functools import wraps
 from inspect import signature
 from typing import Any, overload
 
+from psa_casadi.any_model.effects.attached import of_ones_own
 from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.identify import (
     OdeIdentification,
@@ -46,7 +47,7 @@ from psa_casadi.simulation.start import is_stack
 
 #: The steps of a search that are a stack's: they need its voltage, its loop or its resonances.
 _OF_STACKS = frozenset(
-    {"one clock", "fits afresh", "all afresh", "resonances", "several modes", "between samples"}
+    {"one clock", "fits afresh", "resonances", "several modes", "between samples"}
 )
 
 
@@ -61,6 +62,7 @@ def diagnose_ode(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
+    effects: Sequence[Component] = (),
     progress: Callable[[str], None] = lambda _: None,
 ) -> OdeDiagnosis:
     """Find what a model gets wrong on its records, name the cause and its place, measure the gain.
@@ -68,7 +70,9 @@ def diagnose_ode(
     The model is fitted as by `identify`; then generic effects at its inputs, outputs and rates are
     searched by the score of a stack's diagnosis: evidence less 8 nats for every cause, confirmed by
     held-out samples. These are the records `holdout`, else a quarter of every record in blocks.
-    `leave_out` names effects, or beginnings of their names such as "zero_of", that cannot be.
+    `leave_out` names effects, or beginnings of their names such as "zero_of", that cannot be;
+    `effects` are components of your own, which are searched beside these: each has a gain and adds
+    a term to a port (`applied_u` of an input u, `rate_x` of a state x, `shown_y` of an output y).
     Other words are those of `identify`.
 
     Raises InputError for records or names that do not fit, SimulationError where the model cannot
@@ -91,7 +95,8 @@ def diagnose_ode(
         raise KeyboardInterrupt
     sizes = sizes_of(base.model, runs, base.starts())
     gone = (*leave_out, *(f"zero_of_{n}" for n in shifted))
-    every = effects_of(base.model, sizes)
+    own_ones = [of_ones_own(base.model, c) for c in effects]
+    every = [*effects_of(base.model, sizes), *own_ones]
     known_names = [e.name for e in every]
     for name in leave_out:
         if not any(n.startswith(name) for n in known_names):
@@ -101,12 +106,12 @@ def diagnose_ode(
                 f" {len(known_names)} there are, the nearest are {', '.join(near)}."
             )
     table = {e.name: e for e in every if not e.name.startswith(gone)}
-    effects = tuple(e.component for e in table.values())
+    searched = tuple(e.component for e in table.values())
 
     def search(base: Fit, experiments: tuple[Experiment, ...]) -> Known:
         opened = replace(base, model=with_ports(base.model))
         method = Method(without=_OF_STACKS)
-        return best_first(opened, Task(experiments, effects, Pack(), method, progress))
+        return best_first(opened, Task(experiments, searched, Pack(), method, progress))
 
     known = search(base, runs)
     told = with_noise(known.answer.fit, runs)
@@ -186,6 +191,7 @@ def diagnose(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
+    effects: Sequence[Component] = ...,
     progress: Progress = ...,
 ) -> OdeDiagnosis: ...
 @_told_of(diagnose_ode)

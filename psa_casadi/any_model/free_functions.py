@@ -8,7 +8,7 @@ or up to the fifth of a signal, each over its size. They have no memory and no t
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from math import prod
 
@@ -127,9 +127,9 @@ def _along(free: Free, experiments: Sequence[Experiment], name: str) -> FloatArr
         ]
         return np.concatenate(rows)
     (component,) = model.effects
-    none = model.with_values(dict.fromkeys(free.law.coefficients(component.name), 0.0))
+    none = fit.at(dict.fromkeys(free.law.coefficients(component.name), 0.0))
     k = model.output_names.index(name)
-    return np.concatenate([y[:, k] for y in replace(fit, model=none).outputs(experiments)])
+    return np.concatenate([y[:, k] for y in none.outputs(experiments)])
 
 
 def free_functions(known: Known, view: View, base: Model) -> tuple[Free, ...]:

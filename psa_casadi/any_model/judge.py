@@ -1,7 +1,7 @@
 """From what a search found in any model to a verdict, by the rules of a stack's diagnosis."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -136,7 +136,7 @@ def changes(effect: Component, fit: Fit, experiments: Sequence[Experiment]) -> t
     """
     names = [o.channel.outputs[0] for o in fit.channels]
     columns = [fit.model.output_names.index(n) for n in names]
-    without = replace(fit, model=fit.model.with_values({effect.gain or "": 0.0}))
+    without = fit.at({effect.gain or "": 0.0})
     try:
         pairs = zip(fit.outputs(experiments), without.outputs(experiments), strict=True)
         most = np.max([np.ptp(a - b, axis=0)[columns] for a, b in pairs], axis=0)

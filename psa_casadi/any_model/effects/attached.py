@@ -4,9 +4,10 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from psa_casadi.component import Component, Equations, Expression, Remedy, Symbols
+from psa_casadi.component import Component, Equations, Expression, OnDemand, Remedy, Symbols
+from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import Port, with_ports
+from psa_casadi.model.ports import Port, ports_of, with_ports
 from psa_casadi.variables import Parameter, State
 
 #: An ordinary size of an effect over what it acts on, and the largest that a fit may reach.
@@ -89,6 +90,23 @@ def at_port(
         remedy=Remedy(_KIND.split(name)[0], "record"),
     )
     return Attached(component, port, reads)
+
+
+def of_ones_own(model: Model, component: Component) -> Attached:
+    """Return an effect that a user wrote, with the ports of a model that its equations add to.
+
+    Raises InputError for one without a gain, or that adds to no port.
+    """
+    symbols, ports = OnDemand(), {p.balance: p for p in ports_of(model)}
+    added = [ports[name] for name in component.equations(symbols).add if name in ports]
+    if component.gain is None or not added:
+        lacks = "adds to no port" if component.gain else "has no gain that removes it at 0"
+        raise InputError(
+            f"The effect '{component.name}' {lacks} of the model '{model.name}'; let its equations"
+            f" add to one of {', '.join(ports)}, and name a parameter as its gain."
+        )
+    reads = tuple(p for name, p in ports.items() if name in symbols.made and p not in added)
+    return Attached(component, added[0], (*added[1:], *reads))
 
 
 def extended(base: Model, effects: Iterable[Attached]) -> Model:

@@ -22,8 +22,8 @@ from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magn
 from psa_casadi.units import rate_unit
 from psa_casadi.variables import Parameter, State
 
-#: Ordinary sizes at which a memory is looked for: of one that acts in full the derivative at 0 tells
-#: little.
+#: Ordinary sizes at which a memory is looked for: the derivative at 0 tells little of one that acts
+#: in full.
 _IN_FULL = (0.0, 2.0, -2.0)
 #: A rate below this share of its size has no direction.
 _STILL = 1e-3

@@ -202,7 +202,7 @@ def with_causes_afresh(
         size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), side * gain)
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
-    ordinary = ordinary_values(before.fit.model, [e.record for e in fitted(experiments)])
+    ordinary = _ordinary_base(before.fit, experiments)
     states = tuple(before.fit.starts())
     quick = fit_with_all(before.fit, experiments, added, states, ordinary, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
@@ -399,13 +399,20 @@ def _from_ordinary(
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
     values = _ordinary_form(effect, known)
-    ordinary = ordinary_values(before.model, [e.record for e in fitted(experiments)])
+    ordinary = _ordinary_base(before, experiments)
 
     def begun(share: float) -> Fit | None:
         added, states = [(effect, values, share * size)], tuple(before.starts())
         return fit_with_all(before, experiments, added, states, ordinary, QUICK)
 
     return [f for f in side_by_side(begun, sizes) if f is not None]
+
+
+def _ordinary_base(before: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
+    """Return the values of an ordinary stack; any other model goes on from its own."""
+    if not is_stack(before.model):
+        return {}
+    return ordinary_values(before.model, [e.record for e in fitted(experiments)])
 
 
 def _best_continued(

@@ -389,6 +389,12 @@ class Fit:
         """Root mean square of the residuals [m]."""
         return float(np.sqrt(np.mean(self.residuals**2)))
 
+    def at(self, values: Mapping[str, float]) -> "Fit":
+        """Return the fit with other values of some parameters, which it predicts with."""
+        model, theta = self.model.with_values(values), self.theta.copy()
+        theta[: len(self.unknowns.names)] = self.unknowns.coordinates(model.values)
+        return replace(self, model=model, theta=theta)
+
     def start(self, record: int) -> dict[str, float]:
         """Deviations of one record's initial state from where its voltage and rate put it."""
         return self.unknowns.start(self.theta, record)

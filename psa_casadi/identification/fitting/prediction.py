@@ -168,7 +168,8 @@ def traced_by_theta(
     start_slopes = unknowns.place_slopes(theta, index)[0]
     by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
     by_theta[:count, :count] = slopes
-    return Traced(found.y, found.sensitivity @ by_theta, found.way)
+    flat = found.sensitivity.reshape(-1, len(by_theta)) @ by_theta  # one product, not one a sample
+    return Traced(found.y, flat.reshape(*found.y.shape, unknowns.size), found.way)
 
 
 def outputs_of(channels: Sequence[Channel]) -> tuple[str, ...]:
