@@ -72,6 +72,7 @@ if TYPE_CHECKING:
         Record,
         read_record,
         read_records,
+        read_signals,
         record_from,
         write_record,
     )
@@ -97,7 +98,7 @@ if TYPE_CHECKING:
 
 #: Where the public names live, by the modules of this package.
 _HOMES = {
-    "records": "Record read_record read_records record_from write_record",
+    "records": "Record read_record read_records read_signals record_from write_record",
     "records.signals": "Signals",
     "components": "BASE SIMPLIFIED COMPONENTS",
     "effects": "EFFECTS",
@@ -145,7 +146,8 @@ _HOMES = {
 _HOME_OF = {n: f"psa_casadi.{home}" for home, names in _HOMES.items() for n in names.split()}
 
 __all__ = [
-    "Record", "Signals", "read_record", "read_records", "record_from", "write_record",
+    "Record", "Signals", "read_record", "read_records", "read_signals", "record_from",
+    "write_record",
     "two_clocks", "BASE", "SIMPLIFIED", "COMPONENTS", "EFFECTS", "Component", "Equations",
     "Symbols", "own_effects", "patched_model", "STACKS", "stack_model", "Model", "compose",
     "PARTS", "part_model", "compensator_for", "controller_for", "margins_of", "System", "connect",

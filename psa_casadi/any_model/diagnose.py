@@ -22,7 +22,7 @@ from psa_casadi.any_model.identify import (
 )
 from psa_casadi.any_model.judge import judged
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import runs_of, told_of_columns
+from psa_casadi.any_model.runs import given_to, runs_of, told_of_columns
 from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import diagnose as stacks
@@ -40,7 +40,7 @@ from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.read.reading import Records
-from psa_casadi.records.signals import Hold, signals_given
+from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 from psa_casadi.simulation.start import is_stack
@@ -84,9 +84,9 @@ def diagnose_ode(
         raise InputError(
             f"The model '{model.name}' has effects already ({names}); diagnose it without them."
         )
-    given = signals_given(records, hold)
+    given = given_to(model, records, hold)
     none = isinstance(holdout, tuple | list) and not holdout
-    held = [] if none else signals_given(holdout, hold, len(given) + 1)
+    held = [] if none else given_to(model, holdout, hold, len(given) + 1)
     shifted = known_zeros(model, zeros)
     runs = runs_of(model, given, held, zeros=shifted, known_start=known_start)
     progress("fitting from several starts")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.runs import noise_share, runs_of, told_of_columns
+from psa_casadi.any_model.runs import given_to, noise_share, runs_of, told_of_columns
 from psa_casadi.any_model.sizes import sized
 from psa_casadi.diagnosis.colour import Colour, noise_rms, uncertain
 from psa_casadi.errors import InputError, PsaError
@@ -16,7 +16,7 @@ from psa_casadi.identification.refitting import relevelled_all, weighted
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise import filtered, first_order_noise
-from psa_casadi.records.signals import Hold, signals_given
+from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.stepper import SimulationError
@@ -195,7 +195,7 @@ def identify_ode(
     """
     refuse_unfit(model)
     runs = runs_of(
-        model, signals_given(records, hold), judged=False, zeros=known_zeros(model, zeros),
+        model, given_to(model, records, hold), judged=False, zeros=known_zeros(model, zeros),
         known_start=known_start,
     )  # fmt: skip
     fit, runs, costs = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)

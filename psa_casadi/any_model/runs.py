@@ -10,9 +10,12 @@ import numpy.typing as npt
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
+from psa_casadi.records.read.reading import signals_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.signals import Signals, stairs, unit_hint
+from psa_casadi.records.signals import Hold, Signals, stairs
 from psa_casadi.records.split import Channel, Experiment, divided, whole
+from psa_casadi.records.suspects import suspects_of
+from psa_casadi.units import convert, parse_unit, si_unit
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -46,6 +49,11 @@ def counted(experiments: Sequence[Experiment], channel: int) -> list[BoolArray]:
     return judged if some else [e.at(channel) for e in experiments]
 
 
+def given_to(model: Model, records: Any, hold: Hold | None, first: int = 1) -> list[Signals]:
+    """Return the records that a user gave to a model (`signals_given`). Raises InputError."""
+    return signals_given(records, model.input_names, model.output_names, hold=hold, first=first)
+
+
 def runs_of(
     model: Model,
     given: Sequence[Signals],
@@ -58,14 +66,17 @@ def runs_of(
     """Return the experiments of a model; some samples of them are held out if they are `judged`.
 
     Those of `holdout`, but for the tenth that finds their state; without such a record a quarter of
-    every one in blocks, as `split` chooses them along the input that moves most. Their channels are
-    the outputs that move; those of `zeros` have an offset of their own in every record.
+    every one in blocks, as `split` chooses them along the input that moves most. Columns are
+    converted to the model's units; samples that an output's sensor has made are masked. Channels
+    are the outputs that move; those of `zeros` have an offset of their own in every record.
 
-    Raises InputError for inputs that are missing or have gaps, and where no output was measured.
+    Raises InputError for inputs that are missing or have gaps, for units that measure something
+    else, and where no output was measured.
     """
     problems = Problems()
     fitted = {s.sha256: s.name for s in given}
-    for s in (*given, *holdout):
+    parts = [[_in_units(model, s, problems) for s in part] for part in (given, holdout)]
+    for s in (s for part in parts for s in part):
         _check(model, s, problems)
     for s in [s for s in holdout if s.sha256 in fitted]:
         problems.add(
@@ -73,11 +84,13 @@ def runs_of(
             " fitted; held-out samples must be others."
         )
     problems.raise_if_any()
-    shadows = [[_shadow(model, s) for s in part] for part in (given, holdout)]
+    clean = [[_cleaned(model, s) for s in part] for part in parts]
+    shadows = [[_shadow(model, s) for s, _ in part] for part in clean]
     split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
-    records = cast("Sequence[Any]", (*given, *holdout))
+    records = cast("Sequence[Any]", [own for part in clean for own in part])
     found = [
-        replace(e, record=r, known_start=known_start) for e, r in zip(split, records, strict=True)
+        replace(e, record=s, known_start=known_start, remarks=said)
+        for e, (s, said) in zip(split, records, strict=True)
     ]
     channels = []
     for o in model.structure.outputs:
@@ -85,13 +98,25 @@ def runs_of(
             o.name, o.unit, (o.name,), straight=STRAIGHT, offset=o.name in zeros, factors=False
         )
         own = [replace(e, channels=(channel,)) for e in found]
-        parts = [e.measured(0)[e.at(0)] for e in own]
-        spread = float(np.std(np.concatenate(parts))) if any(p.size for p in parts) else 0.0
+        fitted_ones = np.concatenate([e.measured(0)[e.at(0)] for e in own])
+        spread = float(np.std(fitted_ones)) if fitted_ones.size else 0.0
         if spread > 0.0:
             channels.append(replace(channel, level=_FIRST_LEVEL * spread))
     if not channels:
         raise InputError("No output moves in these records; there is nothing to fit.")
     return tuple(replace(e, channels=tuple(channels)) for e in found)
+
+
+def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note, ...]]:
+    """Return signals without the samples that an output's sensor has made, and what these are."""
+    inputs = {n: s.columns[n] for n in model.input_names}
+    columns, said = dict(s.columns), list[Note]()
+    for o in model.structure.outputs:
+        if o.name in columns:
+            found = suspects_of(o.name, columns[o.name], o.unit, inputs)
+            columns[o.name] = np.where(found.mask, np.nan, columns[o.name])
+            said += found.notes(f"{o.name} of {s.name}")
+    return replace(s, columns=columns), tuple(said)
 
 
 def varied(model: Model, e: Experiment) -> str | None:
@@ -102,15 +127,57 @@ def varied(model: Model, e: Experiment) -> str | None:
 
 
 def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note, ...]:
-    """Return which inputs look held between samples and are read as lines, which outputs lack."""
+    """Return which inputs look held between samples and are read as lines, which outputs lack.
+
+    And what units were not stated, and which samples are masked.
+    """
     records = cast("Sequence[Any]", [e.record for e in experiments])
     lines = [r for r in records if r.hold == "linear"]
     held = {n: tuple(s.name for s in lines if n in stairs(s, (n,))) for n in model.input_names}
     absent = [n for n in model.output_names if all(r.column(n) is None for r in records)]
+    stated, units = [n for n, unit in _units(model).items() if unit != "1"], list[Note]()
+    for r in records:
+        bare = tuple(n for n in stated if r.units.get(n) == "")
+        units += [note("no_unit", record=r.name, names=bare)] if bare else []
     return (
-        *(note("stairs", input=n, records=records) for n, records in held.items() if records),
+        *(note("stairs", input=n, records=names) for n, names in held.items() if names),
         *(note("no_column", output=n) for n in absent),
+        *units,
+        *(said for e in experiments for said in e.remarks),
     )
+
+
+def _units(model: Model) -> dict[str, str]:
+    inputs, outputs = model.structure.inputs, model.structure.outputs
+    return {**{v.name: v.unit for v in inputs}, **{v.name: v.unit for v in outputs}}
+
+
+def _in_units(model: Model, s: Signals, problems: Problems) -> Signals:
+    """Return the same samples in the units of a model; where that states none, in SI units."""
+    columns, units, where = dict(s.columns), dict(s.units), s.source or s.name
+    for name, own in _units(model).items():
+        unit = s.units.get(name)
+        if not unit or name not in columns:
+            continue
+        try:
+            read = parse_unit(unit)
+            if own != "1" or read.dimension == parse_unit(own).dimension:
+                columns[name], units[name] = convert(columns[name], unit, own), own
+            elif read.ratio != 1 or read.offset:
+                problems.add(
+                    f"{where}: column '{name}' is in '{unit}', of which the model '{model.name}'"
+                    f" states no unit; declare it, as psa.{_kind(model, name)}('{name}',"
+                    f" '{si_unit(unit)}', ''), or give the column without a unit, in the model's."
+                )
+        except InputError as error:
+            problems.add(
+                f"{where}: column '{name}': {error} The model '{model.name}' has it in '{own}'."
+            )
+    return replace(s, columns=columns, units=units)
+
+
+def _kind(model: Model, name: str) -> str:
+    return "Input" if name in model.input_names else "Output"
 
 
 def _check(model: Model, s: Signals, problems: Problems) -> None:
@@ -118,7 +185,7 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
         if name not in s.columns:
             problems.add(
                 f"signals '{s.name}' lack the input '{name}' of the model '{model.name}'; they have"
-                f" {sorted(s.columns)}. Name the column so.{unit_hint(s.columns)}"
+                f" {sorted(s.columns)}. Name the column so."
             )
         elif not np.isfinite(s.columns[name]).all():
             problems.add(
@@ -129,24 +196,19 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
     if not any(np.isfinite(s.columns[n]).sum() >= 8 for n in there):
         problems.add(
             f"signals '{s.name}' have no output of the model '{model.name}' with eight samples or"
-            f" more; the model's are {model.output_names}.{unit_hint(s.columns)}"
+            f" more; the model's are {model.output_names}."
         )
-
-
-def _outputs(model: Model, s: Signals) -> FloatArray:
-    missing = np.full(s.n, np.nan)
-    return np.column_stack([s.columns.get(n, missing) for n in model.output_names])
 
 
 def _shadow(model: Model, s: Signals) -> Record:
     """Return the record of one input and of what was measured, along which samples are held out."""
     moving = max(model.input_names, key=lambda n: _moves(s.columns[n]), default=None)
-    there = np.isfinite(_outputs(model, s)).any(axis=1)
+    there = [np.isfinite(s.columns[n]) for n in model.output_names if n in s.columns]
     return Record(
         name=s.name,
         time=s.time,
         voltage=np.zeros(s.n) if moving is None else s.columns[moving],
-        displacement=np.where(there, 0.0, np.nan),
+        displacement=np.where(np.any(there, axis=0), 0.0, np.nan),
     )
 
 

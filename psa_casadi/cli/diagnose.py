@@ -12,6 +12,7 @@ import psa_casadi as psa
 from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given, meant
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
+from psa_casadi.cli.own_model import Fitting, diagnosed_own
 from psa_casadi.cli.screen import show, show_table, tell_written, width, working
 from psa_casadi.cli.steps import DIAGNOSE, events_to
 
@@ -38,16 +39,18 @@ def diagnose(
     junit: Path | None = None,
     still: bool = False,
     reading: Reading,
+    fitting: Fitting,
     origin: Origin = "measured",
     given: Given,
 ) -> None:
     """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
 
     The exit code is 0 for every verdict; with --expect or --max-error it is 1 where the result is
-    not as they say.
+    not as they say. Of a model of your own, --model FILE.py:FUNCTION or an FMU, it searches the
+    effects at its inputs, rates and outputs.
 
     Options:
-        model: MODEL.json whose values the fits start from.
+        model: MODEL.json whose values the fits start from, or a model of your own.
         holdout: Record kept for judging only (repeat the option for several); without it, a quarter
             of every record, in blocks.
         output: MODEL.json of the extended model.
@@ -59,7 +62,7 @@ def diagnose(
             by default next to the JSON file or the page.
         timings: Print what each stage took: time, processor time, simulations.
         leave_out: Effect that is not to be looked for, as one that cannot be there; repeat the
-            option for several.
+            option for several. Of a model of your own, how the names of such effects begin.
         events: File that gets a line of JSON for every fit of the search while it runs: its causes,
             evidence, score and errors.
         expect: Verdicts of which one must come out, with commas between, else exit code 1:
@@ -69,6 +72,16 @@ def diagnose(
     """
     from psa_casadi.simulation.timings import stage, timed
 
+    if diagnosed_own(
+        model, records, holdout or (), fitting, reading, given, leave_out=leave_out or (),
+        expect=expect, files={"--json": json, "--report": report, "--junit": junit},
+        others={
+            "--output": output, "--patch": patch, "--figure": figure, "--next": next_,
+            "--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis,
+            "--events": events, "--max-error": max_error, "--timings": timings,
+        },
+    ):  # fmt: skip
+        return
     outputs = {
         "--output": output, "--patch": patch, "--json": json, "--report": report,
         "--figure": figure,
@@ -110,8 +123,9 @@ def diagnose(
     if timings:
         show("", given.quiet)
         show_table(timings_table(spent.stages), given.quiet)
-        took = clock.process_time()
-        show(f"\nprocessor time with the start of Python: {took:.2f} s", given.quiet)
+        show(
+            f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", given.quiet
+        )
     subject = ", ".join(p.name for p in records)
     judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
 

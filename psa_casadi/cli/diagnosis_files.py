@@ -153,16 +153,21 @@ def expected(
     return wanted, None if max_error is None else largest
 
 
+def verdict_case(verdict: str, sentence: str, wanted: Sequence[str]) -> Case:
+    """Return a verdict as a test, failed where it is none of those wanted."""
+    wrong = f"The verdict is {verdict}; expected {listing(wanted, 'or')}."
+    failed = bool(wanted) and verdict not in wanted
+    return Case("verdict", f"{verdict}: {sentence}", wrong if failed else "")
+
+
 def cases(d: result.Diagnosis, verdicts: tuple[str, ...], max_error: float | None) -> list[Case]:
     """Return verdict and held-out error of the extended model as tests, failed or passed."""
-    wrong = large = ""
-    if verdicts and d.verdict not in verdicts:
-        wrong = f"The verdict is {d.verdict}; expected {listing(verdicts, 'or')}."
+    large = ""
     error = d.extended_errors.holdout_nrmse_percent
     shown = f"{number(error)} % of the range"
     if max_error is not None and not error <= max_error:
         large = f"The extended model's held-out error is {shown}; expected {max_error:g} % at most."
     return [
-        Case("verdict", f"{d.verdict}: {verdict_sentence(d)}", wrong),
+        verdict_case(d.verdict, verdict_sentence(d), verdicts),
         Case("held-out error", f"{shown} by the extended model", large),
     ]

@@ -8,6 +8,7 @@ import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
+from psa_casadi.cli.own_model import Fitting, identified_own
 from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.cli.steps import IDENTIFY
 from psa_casadi.files import atomic_write
@@ -30,13 +31,17 @@ def identify(
     report: Path | None = None,
     still: bool = False,
     reading: Reading,
+    fitting: Fitting,
     origin: Origin = "measured",
     given: Given,
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine.
 
+    Of a model of your own, --model FILE.py:FUNCTION or an FMU, it fits the parameters that are
+    free; columns are found by the names of its inputs and outputs.
+
     Options:
-        model: MODEL.json whose values the fits start from.
+        model: MODEL.json whose values the fits start from, or a model of your own.
         output: MODEL.json to write.
         method: How the parameters are found.
         profile: Parameter whose profile likelihood is wanted; may be repeated.
@@ -48,6 +53,15 @@ def identify(
     from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
+    if identified_own(
+        model, records, fitting, reading, given, report=report,
+        others={
+            "--output": output, "--stack": stack, "--stiffness": stiffness,
+            "--hysteresis": hysteresis, "--method": method != "prediction-error",
+            "--profile": profile, "--json": json,
+        },
+    ):  # fmt: skip
+        return
     if method == "paper" and profile:
         given.add("--method paper has no likelihood; leave --profile or --method out.")
     if method == "paper" and (model, stack) != (None, None):

@@ -50,7 +50,7 @@ from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
-from psa_casadi.notes import Note, note
+from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
@@ -349,10 +349,11 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
     refuse_other_time(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
-    saturation = [s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)]
-    refuse_few(records, clean, saturation)
+    both = list(zip(records, found, strict=True))
+    saturation = tuple(s for r, own in both for s in own.saturation(r.name))
+    refuse_few(records, clean, texts(saturation))
     said: list[Note | str] = [*saturation]
-    for r, own in zip(records, found, strict=True):
+    for r, own in both:
         if own.quantum is not None and r.range_m < COARSE * own.quantum:
             said.append(note("coarse", record=r.name, steps=r.range_m / own.quantum))
     saturated = sum(own.counts["saturated"] for own in found)

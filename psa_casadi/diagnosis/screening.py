@@ -27,7 +27,8 @@ import numpy.typing as npt
 from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
-from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR, Fitted
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -92,7 +93,7 @@ class Screening:
 
 
 def screen(
-    fit: Fitted,
+    fit: Fit,
     trials: Sequence[Direction],
     lengths: Sequence[int],
     known: Sequence[FloatArray | None] | None = None,
@@ -162,17 +163,17 @@ def _of_span(own: Sequence[Direction], span: Span, t: FloatArray) -> Score:
     )
 
 
-def whitened_residuals(fit: Fitted, colour: Colour) -> FloatArray:
+def whitened_residuals(fit: Fit, colour: Colour) -> FloatArray:
     """Return the whitened residuals (samples,), those of the further columns below."""
     return colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])
 
 
-def whitened_jacobian(fit: Fitted, colour: Colour) -> FloatArray:
+def whitened_jacobian(fit: Fit, colour: Colour) -> FloatArray:
     """Return the whitened derivatives by theta (samples, size), the further columns' below."""
     return colour.whiten_all(fit.jacobian, [f.jacobian for f in fit.further])
 
 
-def further_columns(fit: Fitted, trials: Sequence[Direction]) -> list[FloatArray]:
+def further_columns(fit: Fit, trials: Sequence[Direction]) -> list[FloatArray]:
     """Return for every further column what the directions change in it (samples, directions)."""
     return [
         np.hstack([np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)])
@@ -194,7 +195,7 @@ class Copy:
 
 
 def copies(
-    fit: Fitted,
+    fit: Fit,
     added: FloatArray,
     trials: Sequence[Direction],
     colour: Colour,
@@ -349,7 +350,7 @@ def _together(
 
 
 def best_sets(
-    fit: Fitted,
+    fit: Fit,
     trials: Sequence[Direction],
     colour: Colour,
     size: int,
@@ -397,7 +398,7 @@ def best_sets(
     return list(best_of.values())
 
 
-def evidence(before: Fitted, after: Fitted, colour: Colour) -> float:
+def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     """Return ln B of a fit with one more effect over the fit without it.
 
     The log-likelihoods of displacement and further columns add up, each with its own noise level.
@@ -426,7 +427,7 @@ def evidence(before: Fitted, after: Fitted, colour: Colour) -> float:
     return gained - 0.5 * float(penalty)
 
 
-def further_gains(before: Fitted, after: Fitted, colour: Colour) -> dict[str, float]:
+def further_gains(before: Fit, after: Fit, colour: Colour) -> dict[str, float]:
     """Return what every further column adds to the log-likelihood of a fit over another one."""
     rows = zip(colour.further, before.further, after.further, strict=True)
     return {
@@ -446,7 +447,7 @@ def _level(residual: FloatArray, colour: Colour, straight: float) -> float:
     return float(np.hypot(np.sqrt(np.mean(colour.whiten(residual) ** 2)), straight))
 
 
-def estimated(before: Fitted, screening: Screening) -> dict[str, float]:
+def estimated(before: Fit, screening: Screening) -> dict[str, float]:
     """Return every effect's ln B as its trial directions tell it, without a full fit.
 
     Linear in the gain g with prior N(0, s^2), s = `LINEAR_PRIOR` ordinary sizes, and estimated to

@@ -34,7 +34,7 @@ def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
     """
     found = suspects(record)
     clean, clocks = on_one_clock(masked(record, found))
-    said: tuple[Note | str, ...] = (*found.sentences(record.name), *clocks)
+    said: tuple[Note | str, ...] = (*found.notes(record.name), *clocks)
     shorter, averages = _averaged(clean)
     return shorter, (*said, *averages)
 

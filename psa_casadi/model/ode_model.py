@@ -7,7 +7,7 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import BALANCES, Component, Equations, Expression, OnDemand, Symbols
+from psa_casadi.component import Component, Equations, Expression, OnDemand, Symbols
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.units import parse_unit
@@ -266,11 +266,6 @@ def _declared(
         problems.add(f"`values` has '{unknown}', which is no parameter; there are {[*known]}.")
     for variable in [v for rows in found.values() for v in rows]:
         check_variable(variable, {**known, **values}, problems)
-        if variable.name == "time" or variable.name in BALANCES:
-            problems.add(
-                f"'{variable.name}' is the name of time or of a sum that models of this package"
-                " share; choose another name."
-            )
     if f.numel_out("y") == 0:
         found["y"] = [
             Output(f"{s.name}_out", s.unit, s.description, s.nominal, s.display_unit)
@@ -279,11 +274,6 @@ def _declared(
     every_name = [v.name for rows in found.values() for v in rows]
     for twice in sorted({n for n in every_name if every_name.count(n) > 1}):
         problems.add(f"Two variables are named '{twice}'; rename one.")  # as in FMI and Modelica
-    if "velocity" in [output.name for output in found["y"]]:
-        problems.add(
-            "An output is named 'velocity', which models of this package derive from"
-            " 'displacement'; choose another name."
-        )
     problems.raise_if_any()
     return found
 
@@ -312,7 +302,7 @@ def _is_identifier(name: str) -> bool:
 
 
 def check_variable(variable: Any, values: Mapping[str, float], problems: Problems) -> None:
-    """Note where a name is no identifier, a unit is unknown, or a number is not finite.
+    """Note a name that is no identifier or `time`, an unknown unit, a number that is not finite.
 
     A usual size may be a function of parameters; those must be parameters of this model.
     """
@@ -321,6 +311,8 @@ def check_variable(variable: Any, values: Mapping[str, float], problems: Problem
         problems.add(
             f"'{name}' cannot name a variable; use letters, digits, underscores, no digit first."
         )
+    if name == "time":
+        problems.add("'time' is the name of time; choose another name.")
     for unit in filter(None, (variable.unit, variable.display_unit)):
         try:
             parse_unit(unit)

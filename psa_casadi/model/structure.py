@@ -29,7 +29,7 @@ def refuse_duplicates(components: tuple[Component, ...], symbols: list[str]) -> 
     own = [b.name for c in components for b in c.balances]
     for name in sorted({n for n in own if n in BALANCES or own.count(n) > 1}):
         problems.add(f"The balance '{name}' is declared more than once; rename one.")
-    for name in sorted({*BALANCES, *own, "time"}.intersection(symbols)):
+    for name in sorted({*own, "time"}.intersection(symbols)):
         problems.add(f"A component declares '{name}', the name of a balance or of time; rename it.")
     problems.raise_if_any()
 
@@ -66,7 +66,8 @@ def sample_period(components: tuple[Component, ...]) -> str | None:
 
 def check_declarations(component: Component, equations: Equations) -> None:
     """A component gives what it declares and nothing else; velocity follows from displacement."""
-    outputs = {o.name for o in component.outputs} - {"velocity"}
+    derived = {"velocity"} - set(equations.out)
+    outputs = {o.name for o in component.outputs} - derived
     problems = Problems()
     for kind, declared, given in (
         ("derivative of the state", {s.name for s in component.states}, set(equations.der)),
@@ -140,7 +141,7 @@ class Structure:
     @cached_property
     def balance_table(self) -> dict[str, Balance]:
         """The sums that components may add to, by name: those of every model, then its own."""
-        return {**BALANCES, **{b.name: b for c in self.components for b in c.balances}}
+        return _balance_table(self.components)
 
     @cached_property
     def foreign(self) -> tuple[Foreign, ...]:
@@ -207,7 +208,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     refuse_duplicates(components, names)
     period = sample_period(components)
     table = {n: ca.SX.sym(n) for n in (*names, "time")}
-    sums = {n: ca.SX.sym(n) for n in (*BALANCES, *(b.name for c in components for b in c.balances))}
+    sums = {n: ca.SX.sym(n) for n in _balance_table(components)}
     parts = [_equations_of(c, Symbols({**table, **sums})) for c in components]
     balances: dict[str, Expression] = {}
     for component, part in zip(components, parts, strict=True):
@@ -230,7 +231,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
 
     x = _column(table[s.name] for s in states)
     xdot = resolved(der[s.name] for s in states)
-    if "displacement" in balances:
+    if "displacement" in balances and "velocity" not in out:
         shown = full[list(sums).index("displacement")]
         out["velocity"] = ca.jtimes(shown, x, xdot) + ca.jacobian(shown, table["time"])
     return Structure(
@@ -257,6 +258,14 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
         next=following,
         znext=resolved(following[s.name] for s in sampled),
     )
+
+
+def _balance_table(components: tuple[Component, ...]) -> dict[str, Balance]:
+    """Return the sums of every model, but for names that components declare otherwise, and own."""
+    groups = ("parameters", "states", "sampled", "inputs")
+    symbols = {v.name for c in components for kind in groups for v in getattr(c, kind)}
+    shared = {n: b for n, b in BALANCES.items() if n not in symbols}
+    return shared | {b.name: b for c in components for b in c.balances}
 
 
 def _composed(components: tuple[Component, ...], starts: Mapping[str, float]) -> Structure:

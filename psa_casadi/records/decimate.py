@@ -57,7 +57,7 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
     while record.n // (2 * factor) >= FEWEST:
         q = 2 * factor
         columns: dict[str, Any]
-        columns = {n: _blocks(v, q).mean(axis=1) for n, v in record.recorded.items()}
+        columns = {n: _blocks(v, q).mean(axis=1) for n, v in record.columns.items()}
         time = _blocks(record.time, q).mean(axis=1)
         if record.displacement is not None:
             columns["displacement"] = _valid_means(record, time, q)

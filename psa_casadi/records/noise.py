@@ -118,6 +118,19 @@ def last_place_of(signal: FloatArray) -> float:
     return 0.0
 
 
+#: Samples of a block in which the standard deviation around a sample is taken.
+BLOCK = 32
+
+
+def local_scale(away: FloatArray) -> FloatArray:
+    """Return the robust standard deviation around every sample: the largest of three blocks'."""
+    count = max(1, away.size // BLOCK)
+    blocks = np.array_split(np.abs(away), count)
+    each = np.array([1.4826 * np.median(b) for b in blocks])
+    each = np.maximum(scipy.ndimage.maximum_filter1d(each, 3, mode="nearest"), np.median(each))
+    return np.repeat(each, [b.size for b in blocks])
+
+
 def runs_of(found: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the first sample of every run of True in (n,), and the one behind its last."""
     edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8))).tolist()

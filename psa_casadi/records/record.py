@@ -1,16 +1,16 @@
 """One experiment: its columns, what must hold for their numbers, and the record of them."""
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.shown import Plotted, frame, with_units
+from psa_casadi.records.signals import Hold, Signals, frozen
 from psa_casadi.units import FloatArray
 
 #: Fewer samples than this describe no experiment, and judge none.
@@ -161,7 +161,7 @@ _HASHED = ("time", "voltage", "displacement", "load_force", "current", "temperat
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Record(Plotted):
+class Record(Signals):
     """Samples of one experiment in SI units; the arrays have shape (n,) and cannot be changed.
 
         Record(name="loop", time=t, voltage=v, displacement=1e-6 * x_um)
@@ -180,21 +180,19 @@ class Record(Plotted):
     Units that no stack has (micrometres given as metres) are told by `identify` and `diagnose`.
     """
 
-    name: str
-    time: FloatArray
+    columns: Mapping[str, FloatArray] = field(init=False)
+    units: Mapping[str, str] = field(init=False)
+    hold: Hold = field(default="linear", init=False)
     voltage: FloatArray
     displacement: FloatArray | None = None
     load_force: FloatArray | None = None
     current: FloatArray | None = None
     temperature: FloatArray | None = None
-    sha256: str = ""
-    source: str = ""
     displacement_unit: Literal["m", "counts"] = "m"
     monitor_voltage: FloatArray | None = None
     charge: FloatArray | None = None
     displacement_2: FloatArray | None = None
     strain: FloatArray | None = None
-    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         problems, where = Problems(), f"record '{self.name}'"
@@ -202,7 +200,7 @@ class Record(Plotted):
             given = getattr(self, column)
             if given is None and column in _OPTIONAL:
                 continue
-            array = _frozen(given)
+            array = frozen(given)
             object.__setattr__(self, column, array)
             if array.ndim != 1 or array.size != self.time.size:
                 problems.add(
@@ -210,9 +208,14 @@ class Record(Plotted):
                     " samples; give one value for each instant."
                 )
         problems.raise_if_any()
+        there = {c: getattr(self, c) for c in ("voltage", *_OPTIONAL)}
+        columns = {name: values for name, values in there.items() if values is not None}
+        units = {name: column.unit for name, column in COLUMNS.items()}
+        object.__setattr__(self, "columns", columns)
+        object.__setattr__(self, "units", {**units, "displacement": self.displacement_unit})
         numbers, unreported = np.arange(self.n, dtype=np.int64), np.zeros(self.n, dtype=np.bool_)
         checks: dict[str, Check] = {"time": check_time, "displacement": check_finite}
-        for column, values in {"time": self.time, **self.recorded}.items():
+        for column, values in {"time": self.time, **columns}.items():
             located = Located(where, column, values, numbers, unreported, "sample")
             checks.get(column, check_complete)(located, problems)
         problems.raise_if_any()
@@ -237,40 +240,14 @@ class Record(Plotted):
         )
 
     @property
-    def hold(self) -> Literal["linear", "zero"]:
-        """What inputs do between samples: they are linear."""
-        return "linear"
-
-    def column(self, name: str) -> FloatArray | None:
-        """Return the samples (n,) of a column by its name, None where it was not recorded."""
-        values: FloatArray | None = getattr(self, name, None) if name in COLUMNS else None
-        return values
-
-    @property
-    def recorded(self) -> dict[str, FloatArray]:
-        """The columns that were recorded beside the time, by name, shape (n,) each."""
-        there = {c: getattr(self, c) for c in ("voltage", *_OPTIONAL)}
-        return {name: values for name, values in there.items() if values is not None}
-
-    @property
-    def units(self) -> dict[str, str]:
-        """The units of all columns."""
-        units = {name: column.unit for name, column in COLUMNS.items()}
-        return {**units, "displacement": self.displacement_unit}
+    def recorded(self) -> Mapping[str, FloatArray]:
+        """The `columns`."""
+        return self.columns
 
     @property
     def shown(self) -> str:
         """The column to show: the displacement, or the voltage where there is none."""
         return "voltage" if self.displacement is None else "displacement"
-
-    def to_frame(self) -> Any:
-        """Return the columns as a pandas DataFrame, which `record_from` reads: `time [s]`, ..."""
-        return frame(with_units({"time": self.time, **self.recorded}, self.units))
-
-    @property
-    def n(self) -> int:
-        """Number of samples."""
-        return self.time.size
 
     @property
     def mask(self) -> NDArray[np.bool_]:
@@ -278,16 +255,6 @@ class Record(Plotted):
         if self.displacement is None:
             return np.zeros(self.n, dtype=np.bool_)
         return np.isfinite(self.displacement)
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last sample [s]."""
-        return float(self.time[-1] - self.time[0])
-
-    @cached_property
-    def sample_time(self) -> float:
-        """Median distance between samples [s]."""
-        return float(np.median(np.diff(self.time)))
 
     @property
     def range_m(self) -> float:
@@ -319,11 +286,3 @@ class Record(Plotted):
         arrays = {c: a[part] for c in _OPTIONAL if (a := getattr(self, c)) is not None}
         name = f"{self.name}[{first}:{last}]"
         return replace(self, name=name, time=self.time[part], voltage=self.voltage[part], **arrays)
-
-
-def _frozen(values: ArrayLike) -> FloatArray:
-    array = np.asarray(values, dtype=np.float64)
-    if array.flags.writeable or not array.flags.c_contiguous:
-        array = array.copy()
-        array.flags.writeable = False
-    return array

@@ -1,20 +1,16 @@
 """The samples of one experiment on any model: a time and columns by name."""
 
-import csv
 import hashlib
-import os
-import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError, Problems
-from psa_casadi.files import why_not_read
+from psa_casadi.errors import Problems
+from psa_casadi.shown import Plotted, frame, with_units
 from psa_casadi.units import FloatArray
 
 #: What an input does between two samples.
@@ -22,18 +18,18 @@ Hold = Literal["linear", "zero"]
 #: So many jumps, and such a share of all moves, make a staircase.
 _JUMPS, _NEARLY_ALL = 2, 0.8
 
-_WITH_UNIT = re.compile(r"[^\[]+\[[^\]]*\]\s*")
-
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Signals:
-    """Samples of one experiment in the units of a model; the arrays have shape (n,).
+class Signals(Plotted):
+    """Samples of one experiment on any model; the arrays have shape (n,) and cannot be changed.
 
-        Signals(name="sweep", time=t, columns={"voltage": u, "speed": w})
+        Signals(name="sweep", time=t, columns={"voltage": u, "speed": w}, units={"speed": "rpm"})
 
     `time` [s] increases strictly and need not be uniform. `columns` are inputs and outputs by the
-    names that the model gives them; nan marks a missing sample of an output. Between samples the
-    inputs are linear (`hold="linear"`) or constant (`hold="zero"`). `sha256` is that of the arrays.
+    names that the model gives them, in `units`, where one is missing in the model's; nan marks a
+    missing sample of an output. Between samples the inputs are linear (`hold="linear"`) or constant
+    (`hold="zero"`). `sha256` is that of the file at `source`, or of the arrays where there is no
+    file. `notes` are sentences on what the reader took for what.
 
     Raises:
         InputError: fewer than eight samples; a time that stands still or goes back; a column of
@@ -43,12 +39,15 @@ class Signals:
     name: str
     time: FloatArray
     columns: Mapping[str, FloatArray]
+    units: Mapping[str, str] = field(default_factory=dict)
     hold: Hold = "linear"
     sha256: str = ""
+    source: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        time = _frozen(self.time)
-        columns = {str(n): _frozen(v) for n, v in self.columns.items()}
+        time = frozen(self.time)
+        columns = {str(n): frozen(v) for n, v in self.columns.items()}
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "columns", columns)
         problems, where = Problems(), f"signals '{self.name}'"
@@ -84,44 +83,32 @@ class Signals:
         return self.time.size
 
     @property
-    def mask(self) -> npt.NDArray[np.bool_]:
-        """True for every sample, shape (n,); missing readings of an output are nan."""
-        return np.ones(self.n, dtype=np.bool_)
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
 
     @cached_property
     def sample_time(self) -> float:
         """Median distance between samples [s]."""
         return float(np.median(np.diff(self.time)))
 
+    @property
+    def mask(self) -> npt.NDArray[np.bool_]:
+        """True for every sample, shape (n,); missing readings of an output are nan."""
+        return np.ones(self.n, dtype=np.bool_)
+
     def column(self, name: str) -> FloatArray | None:
         """Return the samples (n,) of a column by its name, None where it was not recorded."""
         return self.columns.get(name)
 
     @property
-    def duration(self) -> float:
-        """Time from the first to the last sample [s]."""
-        return float(self.time[-1] - self.time[0])
+    def shown(self) -> str:
+        """The column to show: the last one."""
+        return [*self.columns][-1]
 
-
-def signals_given(given: Any, hold: Hold | None = None, first: int = 1) -> list[Signals]:
-    """Return the experiments that a user gave: one or several of `Signals`, tables, CSV files.
-
-    A table (a mapping of arrays, a data frame) has a column `time`, and so has a CSV file with its
-    names in the first line; all in the units of the model. `hold` is what inputs do between samples
-    (None: what `Signals` say, else "linear"), `first` the number of the first one without a name.
-    Raises InputError.
-    """
-    if _is_one(given):
-        given = [given]
-    if not isinstance(given, Iterable):
-        raise InputError(
-            f"A {type(given).__name__} is no record; give Signals, a mapping with 'time', a data"
-            " frame, the path of a CSV file, or several of these."
-        )
-    found = [_one(g, k) for k, g in enumerate(given, first)]
-    if not found:
-        raise InputError("There are no records; give one or more.")
-    return found if hold is None else [replace(s, hold=hold) for s in found]
+    def to_frame(self) -> Any:
+        """Return the columns as a pandas DataFrame, `time [s]` first, each with its unit."""
+        return frame(with_units({"time": self.time, **self.columns}, {"time": "s", **self.units}))
 
 
 def stairs(signals: Signals, names: Iterable[str]) -> tuple[str, ...]:
@@ -141,74 +128,10 @@ def stairs(signals: Signals, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _is_one(given: Any) -> bool:
-    table = hasattr(given, "columns") and hasattr(given, "__getitem__")
-    return table or isinstance(given, Signals | Mapping | str | os.PathLike)
-
-
-def _one(given: Any, number: int) -> Signals:
-    if isinstance(given, Signals):
-        return given
-    if isinstance(given, str | os.PathLike):
-        return _read(Path(given))
-    if not _is_one(given):
-        raise InputError(
-            f"Record {number} is a {type(given).__name__}; give Signals, a mapping with 'time', a"
-            " data frame or the path of a CSV file."
-        )
-    names = list(given) if isinstance(given, Mapping) else [str(n) for n in given.columns]
-    return _of_table({n: given[n] for n in names}, f"record_{number}")
-
-
-def _of_table(table: Mapping[str, Any], name: str) -> Signals:
-    if "time" not in table:
-        raise InputError(
-            f"{name} has the columns {sorted(table)} and none named 'time'; name the times [s] so."
-            + unit_hint(table)
-        )
-    columns = {n: values for n, values in table.items() if n != "time"}
-    return Signals(name=name, time=table["time"], columns=columns)
-
-
-def unit_hint(names: Iterable[str]) -> str:
-    """Return what to do where names of columns hold units, such as "speed [rad/s]"; else ""."""
-    found = next((n for n in map(str, names) if _WITH_UNIT.fullmatch(n)), None)
-    if found is None:
-        return ""
-    return (
-        f" Write the names without units ('{found.split('[')[0].strip()}' for '{found}') and the"
-        " values in the units of the model."
-    )
-
-
-def _read(path: Path) -> Signals:
-    """Read a CSV file with names in its first line; an empty field is a missing sample."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path} cannot be read ({why_not_read(error)}); give a CSV file."
-        ) from error
-    if len(rows) < 2:
-        raise InputError(f"{path} holds no samples; give names in the first line, then numbers.")
-    names = [n.strip() for n in rows[0]]
-    problems = Problems()
-    values = np.full((len(rows) - 1, len(names)), np.nan)
-    for k, row in enumerate(rows[1:]):
-        if len(row) != len(names):
-            problems.add(f"{path}: row {k + 2} has {len(row)} fields for {len(names)} names.")
-            continue
-        for j, field in enumerate(row):
-            try:
-                values[k, j] = float(field) if field.strip() else np.nan
-            except ValueError:
-                problems.add(f"{path}: row {k + 2}: '{field}' is no number; write it as 1.5e-3.")
-    problems.raise_if_any()
-    return _of_table(dict(zip(names, values.T, strict=True)), path.stem)
-
-
-def _frozen(values: npt.ArrayLike) -> FloatArray:
-    array = np.array(values, dtype=np.float64)
-    array.flags.writeable = False
+def frozen(values: npt.ArrayLike) -> FloatArray:
+    """Return numbers that cannot be changed, copied where they could."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.flags.writeable or not array.flags.c_contiguous:
+        array = array.copy()
+        array.flags.writeable = False
     return array

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.notes import Note
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.repeats import held
@@ -185,7 +186,8 @@ class Experiment:
     A record that is held out whole has no used ones: see `judging`. `channels` are the columns that
     are fitted, the first one foremost; the same in all experiments of a fit, whether a record has
     them or not. `noise` is that of every channel over what is usual in all experiments, 1 where
-    nothing else is known. `known_start` says that the state at its start is the declared one.
+    nothing else is known. `known_start` says that the state at its start is the declared one,
+    `remarks` what was done to its samples.
     """
 
     record: Record
@@ -194,6 +196,7 @@ class Experiment:
     channels: tuple[Channel, ...] = (DISPLACEMENT,)
     noise: tuple[float, ...] | None = None
     known_start: bool = False
+    remarks: tuple[Note, ...] = ()
 
     @property
     def further(self) -> tuple[Channel, ...]:

@@ -4,6 +4,7 @@ They are recognised from the record alone and masked; nothing is put in their pl
 can do (ring after a step, follow a jump of the voltage, turn sharply) is not suspect.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,11 +12,22 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from psa_casadi.records.noise import high_frequency_noise, last_place_of, quantum_of, runs_of
+from psa_casadi.notes import Note, note
+from psa_casadi.records.noise import (
+    BLOCK,
+    high_frequency_noise,
+    last_place_of,
+    local_scale,
+    quantum_of,
+    runs_of,
+)
 from psa_casadi.records.record import Record
+from psa_casadi.records.spikes import spikes_in
 from psa_casadi.units import FloatArray
 
 BoolArray = NDArray[np.bool_]
+#: Signals (n,) by their names.
+Columns = Mapping[str, FloatArray]
 
 #: Samples that no spike exceeds, and standard deviations of its surroundings that make an outlier.
 SPIKE, LIMIT = 3, 8.0
@@ -108,19 +120,23 @@ def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None)
     it is sampled.
     """
     found = np.zeros(y.size, dtype=np.bool_)
-    span, noise, same = float(np.ptp(y)), high_frequency_noise(y), _repeated(y)
+    noise, same = high_frequency_noise(y), _repeated(y)
     same &= np.diff(voltage) != 0.0
     bands = np.array_split(np.unique(np.abs(y)), BANDS)
     digit = max((float(np.min(np.diff(b))) for b in bands if b.size > 1), default=0.0)
     chance = max(quantum or 0.0, digit) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
-    third, fourth = (float(np.median(np.abs(np.diff(y, k)))) for k in (3, 4))
-    is_rough = fourth > ROUGH * third > 0.0  # noise, not the bends of a smooth motion
-    if noise <= NOISY * span or not is_rough or not same.any():
+    if not _is_noisy(y) or not same.any():
         return found
     unlikely = scipy.special.pdtrc(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
     if chance < BY_NOISE and unlikely and np.mean(same) < RARELY:
         found[1:] = same
     return found
+
+
+def _is_noisy(y: FloatArray) -> bool:
+    """Whether a signal's fast part is noise, not the bends of a smooth motion."""
+    third, fourth = (float(np.median(np.abs(np.diff(y, k)))) if y.size > k else 0.0 for k in (3, 4))
+    return high_frequency_noise(y) > NOISY * float(np.ptp(y)) and fourth > ROUGH * third > 0.0
 
 
 def _repeated(y: FloatArray) -> BoolArray:
@@ -204,88 +220,126 @@ WINDOW = 13
 #: A sample is an outlier beyond `LIMIT` standard deviations of its surroundings, and beyond this
 #: share of the record's range, however quiet the sensor.
 SMALLEST = 1e-3
-#: Blocks in which the standard deviation of the surroundings is taken.
-BLOCK = 32
 _ROWS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class Suspects:
-    """Samples of a record that should not count: `mask` (n,) is True for them.
+    """Samples of an output that should not count: `mask` (n,) is True for them.
 
-    `counts` holds the number of samples by kind; `quantum` the sensor's step, in `unit` as the
-    record is ("m" or "counts"), None where it shows none. `ends` are the values at which the sensor
-    was saturated.
+    `counts` holds the number of samples by kind; `quantum` the sensor's step, in the output's
+    `unit`, None where it shows none. `ends` are the values at which the sensor was saturated.
+    `names` are what notes call the output, the input that moves it, and what that moves.
     """
 
     mask: BoolArray
     counts: dict[Kind, int]
     quantum: float | None
-    unit: Literal["m", "counts"] = "m"
+    unit: str
     ends: tuple[FlatEnd, ...] = ()
+    names: tuple[str, str, str] = ("the displacement", "the voltage", "the stack")
 
-    def sentences(self, name: str) -> tuple[str, ...]:
-        """Return what was found in the record of that name, one sentence for each kind."""
-        said = [
-            f"{name}: {count} sample{'s' * (count > 1)} {_WHAT[kind]}; masked, so that they count"
-            " for nothing."
-            for kind, count in self.counts.items()
-            if count and kind != "saturated"
-        ]
-        said += self.saturation(name)
+    def notes(self, where: str) -> tuple[Note, ...]:
+        """Return what was found in the column `where`, one note for each kind."""
+        counts = {kind: n for kind, n in self.counts.items() if n and kind != "saturated"}
+        said = [note("masked", where=where, count=n, kind=kind) for kind, n in counts.items()]
+        said += self.saturation(where)
         if self.quantum is not None:
-            scale, unit = (1e9, "nm") if self.unit == "m" else (1.0, self.unit)
-            step = f"{scale * self.quantum:.3g} {unit}"
-            said.append(f"{name}: the displacement is quantised in steps of {step}.")
+            step = (self.quantum, self.unit)
+            said.append(note("quantised", where=where, output=self.names[0], step=step))
         return tuple(said)
 
-    def saturation(self, name: str) -> tuple[str, ...]:
-        """Say at which values the sensor was saturated, one sentence for each."""
-        scale, unit = (1e6, "um") if self.unit == "m" else (1.0, self.unit)
+    def saturation(self, where: str) -> tuple[Note, ...]:
+        """Return at which values the sensor was saturated, one note for each."""
+        _, drive, moved = self.names
         return tuple(
-            f"{name}: {int(end.where.sum())} samples ({100.0 * float(end.where.mean()):.0f} %)"
-            f" stay at {scale * end.value:.6g} {unit}, the {'largest' if end.upper else 'smallest'}"
-            " value, while the voltage moves the stack: the sensor is saturated there; masked, so"
-            " that they count for nothing."
+            note(
+                "flat_end", where=where, count=int(end.where.sum()), value=(end.value, self.unit),
+                share=float(end.where.mean()), upper=end.upper, drive=drive, moved=moved,
+            )
             for end in self.ends
-        )
+        )  # fmt: skip
 
 
-_WHAT: dict[Kind, str] = {
-    "outlier": "stand out as spikes of at most three samples that return at once",
-    "drop-out": "belong to drop-outs, where the sensor jumps to one value and back",
-    "stuck": "repeat the last one to the last digit, as a stuck sensor does",
-}
+#: Which of some samples of an output are outliers: their places, values, and the sensor's step.
+Outliers = Callable[[NDArray[np.int64], FloatArray, float | None], BoolArray]
 
 
 def suspects(record: Record) -> Suspects:
-    """Return the samples of a record that the sensor, not the stack, has made.
+    """Return the samples of a stack's displacement that the sensor, not the stack, has made.
 
     A record without displacement has none. Work and memory grow with the number of samples.
     """
-    mask = np.zeros(record.n, dtype=np.bool_)
+
+    def outliers(places: NDArray[np.int64], y: FloatArray, quantum: float | None) -> BoolArray:
+        return _outliers(y, _explained(record)[places], quantum)
+
+    unmeasured = np.full(record.n, np.nan)
+    y = unmeasured if record.displacement is None else record.displacement
+    return _suspects(y, record.voltage, record.displacement_unit, outliers)
+
+
+def suspects_of(name: str, output: FloatArray, unit: str, inputs: Columns) -> Suspects:
+    """Return the samples of an output (n,), nan where there is none, that its sensor has made.
+
+    `inputs` (n,) by name; the one that the output correlates with most moves it. Outliers are the
+    spikes of `spikes_in`. Equal readings are a sensor's only where its noise makes others differ;
+    and where more than half of the samples would be suspect, none is.
+    """
+    there = np.isfinite(output)
+    alike = {n: _correlation(u[there], output[there]) for n, u in inputs.items()}
+    drive = max(alike, key=lambda n: alike[n], default="")
+    table = np.column_stack([np.empty((output.size, 0)), *inputs.values()])
+
+    def outliers(places: NDArray[np.int64], y: FloatArray, quantum: float | None) -> BoolArray:
+        known = np.full(output.size, np.nan)
+        known[places] = y
+        smallest = max(SMALLEST * float(np.ptp(y)), 0.5 * LIMIT * (quantum or 0.0))
+        return spikes_in(known, table, LIMIT, smallest, SPIKE)[places]
+
+    moving = inputs.get(drive, np.zeros(output.size))
+    found = _suspects(
+        output, moving, unit, outliers, equal=bool(there.any()) and _is_noisy(output[there])
+    )
+    if 2 * found.mask.sum() > there.sum():
+        found = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)
+    return replace(found, names=(name, drive, name))
+
+
+def _correlation(u: FloatArray, y: FloatArray) -> float:
+    """Return the size of the correlation of two signals (n,), 0 where one stands still."""
+    if not u.size or not np.ptp(u) > 0.0 or not np.ptp(y) > 0.0:
+        return 0.0
+    return abs(float(np.corrcoef(u, y)[0, 1]))
+
+
+def _suspects(
+    output: FloatArray, drive: FloatArray, unit: str, outliers: Outliers, *, equal: bool = True
+) -> Suspects:
+    """Return the outliers of an output, and where readings are `equal` as of a failing sensor."""
+    mask = np.zeros(output.size, dtype=np.bool_)
     counts: dict[Kind, int] = {"outlier": 0, "drop-out": 0, "stuck": 0, "saturated": 0}
-    valid = np.flatnonzero(record.mask)
-    if record.displacement is None or valid.size < 2 * BLOCK:
-        return Suspects(mask, counts, None)
-    y, voltage = record.displacement[valid], record.voltage[valid]
-    if float(np.ptp(y)) <= 0:
-        return Suspects(mask, counts, None)
+    valid = np.flatnonzero(np.isfinite(output))
+    if valid.size < 2 * BLOCK or float(np.ptp(output[valid])) <= 0:
+        return Suspects(mask, counts, None, unit)
+    y, moving = output[valid], drive[valid]
     quantum = quantum_of(y)
-    stuck, dropped = equal_runs(y, voltage, quantum)
-    again = missed_a_move(y, voltage, quantum) | repeated_in_noise(y, voltage, quantum)
-    stuck |= again & ~dropped
-    ends = flat_ends(y, voltage) if quantum is None else ()
-    flat = np.any([np.zeros(valid.size, dtype=np.bool_), *(e.where for e in ends)], axis=0)
-    stuck, dropped = stuck & ~flat, dropped & ~flat
+    ends: tuple[FlatEnd, ...] = ()
+    stuck, dropped, flat, outlying = (np.zeros(valid.size, dtype=np.bool_) for _ in range(4))
+    if equal:
+        stuck, dropped = equal_runs(y, moving, quantum)
+        again = missed_a_move(y, moving, quantum) | repeated_in_noise(y, moving, quantum)
+        stuck |= again & ~dropped
+        ends = flat_ends(y, moving) if quantum is None else ()
+        flat = np.any([flat, *(e.where for e in ends)], axis=0)
+        stuck, dropped = stuck & ~flat, dropped & ~flat
     rest = ~(stuck | dropped)
-    outlying = np.zeros(valid.size, dtype=np.bool_)
-    outlying[rest] = _outliers(record, valid[rest], y[rest], quantum)
+    outlying[rest] = outliers(valid[rest], y[rest], quantum)
     kinds = (outlying & ~flat, dropped, stuck, flat)
     for kind, found in zip(counts, kinds, strict=True):
         counts[kind] = int(found.sum())
         mask[valid[found]] = True
-    return Suspects(mask, counts, quantum, record.displacement_unit, ends)
+    return Suspects(mask, counts, quantum, unit, ends)
 
 
 def cleaned(record: Record) -> Record:
@@ -300,14 +354,15 @@ def masked(record: Record, found: Suspects) -> Record:
     return replace(record, displacement=np.where(found.mask, np.nan, record.displacement))
 
 
-def _outliers(
-    record: Record, valid: NDArray[np.int64], y: FloatArray, quantum: float | None
-) -> BoolArray:
-    """Return which of the valid samples are spikes: Hampel's rule with the scale around them."""
+def _outliers(y: FloatArray, explained: FloatArray, quantum: float | None) -> BoolArray:
+    """Return which samples are spikes: Hampel's rule with the scale around them.
+
+    Each may leave its surroundings as far as is `explained` (n,).
+    """
     away = _away_from_surroundings(y)
-    scale = np.maximum(_scale(away), 0.5 * (quantum or 0.0))
+    scale = np.maximum(local_scale(away), 0.5 * (quantum or 0.0))
     allowed = np.maximum(LIMIT * scale, SMALLEST * float(np.ptp(y)))
-    allowed = np.maximum(allowed, _explained(record)[valid])
+    allowed = np.maximum(allowed, explained)
     found = np.abs(away) > allowed
     for start, stop in runs_of(found):
         sign = np.sign(away[start])
@@ -337,15 +392,6 @@ def _away_from_surroundings(y: FloatArray) -> FloatArray:
     return away
 
 
-def _scale(away: FloatArray) -> FloatArray:
-    """Return the robust standard deviation around every sample: the largest of three blocks'."""
-    count = max(1, away.size // BLOCK)
-    blocks = np.array_split(np.abs(away), count)
-    each = np.array([1.4826 * np.median(b) for b in blocks])
-    each = np.maximum(scipy.ndimage.maximum_filter1d(each, 3, mode="nearest"), np.median(each))
-    return np.repeat(each, [b.size for b in blocks])
-
-
 def _explained(record: Record) -> FloatArray:
     """Return how far the displacement may leave its surroundings after a sudden change, (n,).
 
@@ -371,5 +417,5 @@ def _sudden(signal: FloatArray) -> FloatArray:
     """Return the size of a signal's bends where they stand out from those around them, else 0."""
     bend = np.zeros(signal.size)
     bend[1:-1] = np.abs(np.diff(signal, 2))
-    around = _scale(bend) / 1.4826
+    around = local_scale(bend) / 1.4826
     return np.where(bend > np.maximum(6.0 * around, 1e-6 * np.ptp(signal)), bend, 0.0)

@@ -16,7 +16,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Population
 from psa_casadi.posterior.sample import Posterior
-from psa_casadi.records.record import Record
+from psa_casadi.records.signals import Signals
 from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
 from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
@@ -68,7 +68,7 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
 
 def line(result: Plotted | Told) -> str:
     """Return a result in one line."""
-    if isinstance(result, OdeIdentification | Record):
+    if isinstance(result, OdeIdentification | Signals):
         return repr(result).partition("\n")[0]
     if isinstance(result, OwnModelFile | OdeDiagnosis):
         return f"<Diagnosis of an own model {result.verdict}{_causes(result)}>"
@@ -108,7 +108,7 @@ def cell(result: Plotted | Model | Told) -> str:
     buffer = io.BytesIO()
     plot(result).savefig(buffer, format="png", dpi=60)
     picture = base64.b64encode(buffer.getvalue()).decode("ascii")
-    if isinstance(result, Record):
+    if isinstance(result, Signals):
         return filled("cell.html", lines=[repr(result)], name=repr(result), picture=picture)
     words = line(result) if isinstance(result, Trajectory) else repr(result)
     for kind, tell in _WORDS.items():

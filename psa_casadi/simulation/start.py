@@ -100,9 +100,9 @@ def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, f
 
 
 def is_stack(model: Model) -> bool:
-    """Whether a model has a stack's voltage and displacement, and formulas of its own for both."""
-    shows = any(n in model.output_names for n in ("measured_displacement", "displacement"))
-    return "voltage" in model.input_names and shows and not model.structure.foreign
+    """Whether a model has a stack's voltage, and the sum that is its displacement."""
+    s = model.structure
+    return "voltage" in model.input_names and "displacement" in s.balances and not s.foreign
 
 
 def resting_states(structure: Structure) -> tuple[str, ...]:

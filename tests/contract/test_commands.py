@@ -13,10 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
+import numpy as np
 import pytest
 
 import psa_casadi as psa
-from tests.contract.helpers import DATA, command, done, refused
+from tests.contract.helpers import DATA, command, done, refused, write
 from tests.tiers import slow
 
 PSA = [sys.executable, "-m", "psa_casadi.cli"]
@@ -259,3 +260,75 @@ def test_a_command_of_another_process_keeps_its_exit_code_and_streams(tmp_path: 
     ended = command("export", "c", "--stack", "P-885.51", "--step", "10us", "-o", tmp_path / "code")
     assert ended.code == 0
     assert sorted(p.suffix for p in (tmp_path / "code").iterdir()) == [".c", ".h"]
+
+
+_MODEL = """
+import casadi as ca
+import psa_casadi as psa
+
+def make():
+    x, u, T, k = (ca.SX.sym(n) for n in ("s", "heater", "T", "k"))
+    bounds = (0.1, 100.0)
+    return psa.ode_model(
+        {"x": x, "u": u, "p": [T, k], "ode": (k * u - x) / T, "y": x}, name="oven",
+        inputs=[psa.Input("heater", "W", "heating power")],
+        outputs=[psa.Output("warmth", "K", "above the room")],
+        parameters=[
+            psa.Parameter("T", 3.0, "s", bounds, "time constant", log=True),
+            psa.Parameter("k", 1.0, "K/W", bounds, "gain", log=True),
+        ],
+    )
+"""
+
+
+def _oven(folder: Path) -> tuple[Path, Path]:
+    """Write a model of one's own, and a record whose sensor is bent, in other units."""
+    model, record = folder / "oven.py", folder / "oven.csv"
+    model.write_text(_MODEL, encoding="utf-8")
+    rng, step = np.random.default_rng(1), 0.1
+    power = np.repeat(rng.choice([0.0, 10.0, 20.0, 40.0], 60), 20)
+    warmth, x = np.zeros(power.size), 0.0
+    for k in range(power.size):  # exact for a held power
+        warmth[k] = x
+        x = 2.0 * power[k] + (x - 2.0 * power[k]) * np.exp(-step / 5.0)
+    shown = warmth + 2e-3 * warmth**2 + 0.05 * rng.standard_normal(power.size)
+    time = np.arange(power.size, dtype=np.float64) * step / 60.0
+    write(record, {"Time [min]": time, "heater [kW]": 1e-3 * power, "Warmth [mK]": 1e3 * shown})
+    return model, record
+
+
+def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
+    tmp_path: Path,
+) -> None:
+    model, record = _oven(tmp_path)
+    asked = ("--model", f"{model}:make", "--hold", "zero", "--known-start")
+    fit, page, told = (tmp_path / n for n in ("fit.html", "page.html", "told.json"))
+    said = done("identify", record, *asked, "--report", fit).out
+    assert "identified 'oven'" in said
+    assert "'warmth' is missed by" in said
+    assert "oven" in fit.read_text("utf-8")
+    words = ("--report", page, "--json", told, "--leave-out", "delay", "--leave-out", "satur")
+    said = done("diagnose", record, *asked, *words, "--expect", "cause_named").out
+    assert "cause named" in said
+    found = json.loads(told.read_text("utf-8"))
+    assert [cause["effect"] for cause in found["causes"]] == ["bend_of_warmth"]
+    assert found["values"]["T"] == pytest.approx(5.0, rel=0.01)
+    assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
+    ended = command("diagnose", record, *asked, *words, "--expect", "adequate")
+    assert ended.code == 1
+    assert "The verdict is cause_named; expected adequate." in ended.words
+
+
+def test_what_a_model_of_ones_own_does_not_have_is_told(tmp_path: Path) -> None:
+    model, record = _oven(tmp_path)
+    own = ("--model", f"{model}:make")
+    said = refused("identify", record, *own, "-o", tmp_path / "m.json", "--columns", "warmth=w")
+    assert "--output is not there for a model of your own" in said
+    assert "'w', which --columns names for 'warmth', is not in the header" in said
+    assert "oven.py has no function 'mak'" in refused("diagnose", record, "--model", f"{model}:mak")
+    assert "there is no file" in refused("diagnose", record, "--model", "none.py:make")
+    said = refused("identify", record, "--hold", "zero")
+    assert "--hold is said of a model of your own; add --model FILE.py:FUNCTION." in said
+    (tmp_path / "bad.py").write_text("1 / 0", encoding="utf-8")
+    said = refused("identify", record, "--model", tmp_path / "bad.py")
+    assert "bad.py cannot make a model (ZeroDivisionError: division by zero)" in said

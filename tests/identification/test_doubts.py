@@ -144,7 +144,7 @@ def test_a_saturated_sensor_is_named_and_masked(low: float, high: float, given: 
     assert np.mean(found.mask != flat) < 0.01
     assert [e.upper for e in found.ends] == [False] * (low > 0.0) + [True] * (high < 1.0)
     value = 1e6 * ends[1 if high < 1.0 else 0]
-    assert f"{value:.6g} um" in found.saturation("r")[-1]
+    assert f"{value:.6g} µm" in str(found.saturation("r")[-1])
 
 
 def test_a_saturated_record_is_diagnosed_without_its_flat_top(given: Record) -> None:

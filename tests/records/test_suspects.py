@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from psa_casadi.notes import texts
 from psa_casadi.records import Record, multisine, sine, steps, time_grid, triangle
 from psa_casadi.records.noise import quantum_of
 from psa_casadi.records.suspects import cleaned, suspects
@@ -121,7 +122,7 @@ def test_drop_outs_are_found(value: float, length: int) -> None:
     assert len(starts) >= 4
     np.testing.assert_array_equal(found.mask, lost)
     assert found.counts == {"outlier": 0, "drop-out": lost.sum(), "stuck": 0, "saturated": 0}
-    (sentence,) = found.sentences("a.csv")
+    (sentence,) = texts(found.notes("a.csv"))
     assert sentence.startswith(f"a.csv: {lost.sum()} samples belong to drop-outs")
 
 
@@ -148,7 +149,7 @@ def test_cleaned_masks_and_makes_nothing_up() -> None:
     assert cleaned(base) is base
     planned = Record(name="planned", time=T, voltage=VOLTAGES["sine"])
     assert cleaned(planned) is planned
-    assert suspects(spoilt).sentences("r")[0].startswith("r: 2 samples stand out as spikes")
+    assert str(suspects(spoilt).notes("r")[0]).startswith("r: 2 samples stand out as spikes")
 
 
 def test_the_quantum_is_the_step_of_the_sensor() -> None:
@@ -165,7 +166,7 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
     assert quantum_of(np.where(T < 0.5, 0.0, 1.0)) is None
     found = suspects(record("sine", "coarse steps"))
     assert found.quantum == pytest.approx(STEP["coarse steps"])
-    assert found.sentences("r") == ("r: the displacement is quantised in steps of 400 nm.",)
+    assert texts(found.notes("r")) == ("r: the displacement is quantised in steps of 400 nm.",)
     counts = np.round(np.asarray(record("sine", "white").displacement) / 1e-7)
     found = suspects(
         Record(
@@ -176,7 +177,7 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
             displacement_unit="counts",
         )
     )
-    assert found.sentences("c") == ("c: the displacement is quantised in steps of 1 counts.",)
+    assert texts(found.notes("c")) == ("c: the displacement is quantised in steps of 1 counts.",)
 
 
 def test_a_reading_repeated_shortly_while_the_stack_moves_is_masked() -> None:

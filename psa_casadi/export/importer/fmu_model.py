@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import BALANCES, Component, Equations, Expression, FmuUsed, Symbols
+from psa_casadi.component import Component, Equations, Expression, FmuUsed, Symbols
 from psa_casadi.errors import InputError, Problems, PsaError
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.imported import (
@@ -176,7 +176,7 @@ def _name(name: str, taken: Iterable[str] = (), suffix: str = "_of_fmu") -> str:
     plain = plain_name(name)
     if name in taken:
         return plain + suffix
-    return plain + "_of_fmu" if plain == "time" or plain in BALANCES else plain
+    return plain + "_of_fmu" if plain == "time" else plain
 
 
 def _said(variable: Any) -> tuple[str, str]:

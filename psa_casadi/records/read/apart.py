@@ -20,7 +20,6 @@ import numpy as np
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
-from psa_casadi.records.read.choose import Choice
 from psa_casadi.records.read.columns import MARKS, Field, stated_unit
 from psa_casadi.records.read.file_bytes import check_there, read_text
 from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
@@ -75,7 +74,7 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -
         raise InputError(f"{path}: holds no header and no data; export the record again.")
     parts = parts_of_file(tables)
     one = parts.get(table, tables[0])
-    choice = Choice(one, Request().required, {}, Problems())
+    choice = Request().chosen(one, Problems())
     guess = dict(choice.fields)
     labels = list(one.labels)
     for name, source in choice.sources.items() if not one.headless else ():

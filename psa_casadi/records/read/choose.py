@@ -165,9 +165,9 @@ class Choice:
     def _take_own_names(self) -> None:
         """Take the cells with the columns' own names and units, and those that were asked for."""
         table, wanted = self.table, self.wanted
-        places = {_place(wanted[name].array, table): name for name in reversed(list(wanted))}
+        places = {place_of(wanted[name].array, table): name for name in reversed(list(wanted))}
         first = any(plain(label).replace("_", "") == "displacement1" for label in table.labels)
-        last = _last if table.sizes else str
+        last = last_name if table.sizes else str
         for index, text in enumerate(table.header):
             asked, (own, unit) = index in places, name_and_unit(text)
             name = places.get(index, plain(own))
@@ -182,7 +182,7 @@ class Choice:
                 )
             else:
                 place = f"column '{own if asked else name}'"
-                unit = unit or (unit_for(name, _last(own)) if asked else None)
+                unit = unit or (unit_for(name, last_name(own)) if asked else None)
                 if table.sizes and asked and wanted[name].unit:  # of an array it is often wrong
                     unit = None
                 is_unit = unit is not None and unit_named(unit, common=False) is not None
@@ -223,7 +223,7 @@ class Choice:
     def _complain(self) -> list[str]:
         """Complain of columns misspelled or not there; return the others that are missing."""
         for name, source in self.wanted.items():
-            if _place(source.array, self.table) is None:
+            if place_of(source.array, self.table) is None:
                 self.problems.add(
                     f"{self.table.where}: '{source.array}', which --columns names for '{name}', is"
                     f" not in the header (found: {self._listed(self.fields)}); correct --columns."
@@ -364,6 +364,18 @@ def _decided(column: str, cells: Sequence[Cell], *, by_unit: bool) -> tuple[list
     return [*alike, *rivals], len(alike) == 1 and not rivals
 
 
+def with_usual_units(table: Table) -> Table:
+    """Return a table of arrays in which those with a column's own name have its SI unit.
+
+    A displacement has none, nor has what states its unit.
+    """
+    header = list(table.header)
+    for k, text in enumerate(header if table.sizes else ()):
+        unit = SI_UNITS.get(text.rpartition(".")[2].lower())
+        header[k] = f"{text} [{unit}]" if unit else text
+    return replace(table, header=header) if table.sizes else table
+
+
 def rises(table: Table, index: int) -> bool:
     """Whether a column is one of instants, or of numbers each of which is larger than the last."""
     cells = table.glance[index]
@@ -385,10 +397,10 @@ def plain(name: str) -> str:
     return re.sub(r"\s+", "_", name.strip().lower())
 
 
-def _place(array: str, table: Table) -> int | None:
+def place_of(array: str, table: Table) -> int | None:
     """Return the index of the column that `--columns` names: by its name, its text, its number."""
     meant = plain(array)
-    for texts in (table.labels, table.header, [_last(label) for label in table.labels]):
+    for texts in (table.labels, table.header, [last_name(label) for label in table.labels]):
         found = [k for k, text in enumerate(texts) if plain(text) == meant]
         if found:
             return found[0]
@@ -396,7 +408,7 @@ def _place(array: str, table: Table) -> int | None:
     return k if 0 <= k < len(table.header) else None
 
 
-def _last(label: str) -> str:
+def last_name(label: str) -> str:
     """Return the name of an array without that of its group and its number in a matrix."""
     name = re.split(r"\.(?=[^\W\d])", label)[-1]
     return re.sub(r"(?<=\w\w)\.\d+(?=$| \[)", "", name)

@@ -3,7 +3,7 @@
 import difflib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from psa_casadi.errors import InputError, Problems
@@ -117,7 +117,6 @@ TABLE = "table"
 ALL = "all"
 #: What a name may not hold that `--columns` is to name.
 MARKS = re.compile(r"[,:=\[\]]+")
-_NAMES = ", ".join(COLUMNS)
 _PART = re.compile(
     r"(?P<name>[^=]*)=(?P<array>[^\[\]]*?)(?::(?P<unit>[^:\[\]]*)|\[(?P<in>[^]]*)\])?"
 )
@@ -126,7 +125,7 @@ _SCALED = re.compile(r"(?P<scale>[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)\s*(?P<un
 _FORM = "write NAME=ARRAY:UNIT, several joined by commas, such as time=t:ms,displacement=y:um"
 
 
-def parse_columns(text: str) -> ColumnMap:
+def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
     """Return what `NAME=ARRAY:UNIT,...` says (`NAME=ARRAY[UNIT]` is read too).
 
     NAME is a column of a record. ARRAY is a column's name in the header of a CSV or Parquet file,
@@ -135,13 +134,16 @@ def parse_columns(text: str) -> ColumnMap:
     guessed. A number before UNIT says what 1 in the file is, whatever the header says: `10um` for
     the volts of a sensor of 10 um/V. `FILE@NAME=ARRAY:UNIT` is said of one file by its name.
     `table=NAME` takes one of several tables of a file (sheets, groups, blocks, segments of time) by
-    its name or number, `table=all` each as a record.
+    its name or number, `table=all` each as a record. `names` are the columns of a record on any
+    model beside the time; without them it is one of a stack.
 
     Raises:
         InputError: every part that is not of this form, names no column or no unit of it.
     """
     found: dict[str, Source] = {}
     problems = Problems()
+    known = ["time", *names] if names else [*COLUMNS]
+    of_key = {_key(n): n for n in known} | {n: n for n in known}
     for part in text.split(","):
         where = f"--columns, '{part.strip()}'"
         match = _PART.fullmatch(part.strip())
@@ -149,22 +151,22 @@ def parse_columns(text: str) -> ColumnMap:
             problems.add(f"{where}: is not understood; {_FORM}.")
             continue
         file, at, own = match["name"].strip().rpartition("@")
-        name = re.sub(r"[\s-]+", "_", own.strip().lower())
+        name = of_key.get(own.strip()) or of_key.get(_key(own)) or _key(own)
         key = f"{file.strip()}{at}{name}"
         unit = match["unit"] if match["in"] is None else match["in"]
         if name == TABLE:
             found[key] = Source(part.partition("=")[2].strip(), None)
-        elif name not in COLUMNS:
-            near = difflib.get_close_matches(name, COLUMNS, n=1, cutoff=0.6)
+        elif name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
             meant = f"is '{near[0]}' meant? There are" if near else "there are"
-            problems.add(f"{where}: '{name}' is no column of a record; {meant} {_NAMES}.")
+            problems.add(f"{where}: '{name}' is no column of a record; {meant} {', '.join(known)}.")
         elif key in found:
             problems.add(f"{where}: '{key}' is given twice; remove one of the two.")
         else:
             scaled = _SCALED.fullmatch(unit.strip()) if unit else None
             scale = float(scaled["scale"]) if scaled else None
             unit = scaled["unit"] if scaled else unit
-            if unit is not None:
+            if unit is not None and not names:
                 check_unit(COLUMNS[name], unit, where, problems)
             if scale is not None and not 0.0 < abs(scale) < float("inf"):
                 problems.add(
@@ -310,6 +312,20 @@ def name_and_unit(text: str) -> tuple[str, str | None]:
     return (match["name"], match["unit"]) if match else (text.strip(), None)
 
 
+def names_and_units(text: str) -> Iterator[tuple[str, str | None]]:
+    """Yield what may be the name and the unit in a cell: the whole, then by every form that fits.
+
+    What stands in square brackets is a unit, known or not.
+    """
+    yield _unquoted(text), None
+    name, unit = name_and_unit(_unquoted(text))
+    if unit is not None:
+        bare = unit.strip()
+        yield name, "1" if bare in _NO_UNIT else unit_named(bare, common=False) or bare or None
+    for part in _parts(text):
+        yield part.name, part.unit
+
+
 def unit_for(column: str, text: str) -> str | None:
     """Return the unit that a cell states where it is known to be a column.
 
@@ -408,6 +424,10 @@ def units_row(cells: Sequence[str]) -> list[str] | None:
     if not any(map(unit_named, filled)) or None in [unit_named(c, common=False) for c in filled]:
         return None
     return [(unit_named(c, common=False) or "") if c else "" for c in bare]
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", name.strip().lower())
 
 
 def _plain(name: str) -> str:

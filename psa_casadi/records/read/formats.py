@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
     MARKS,
-    SI_UNITS,
     name_and_unit,
     name_without_unit,
     stated_unit,
@@ -57,7 +56,6 @@ class Series:
             if isinstance(values, np.ndarray) and len(values):
                 is_instant = values.dtype.kind in "mM"
                 unit = "s" if is_instant else unit_of_times(values.astype(np.float64))
-            unit = unit or SI_UNITS.get(own.lower())
         return f"{self.name} [{unit}]" if unit else self.name
 
 

@@ -9,12 +9,12 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard, cast
+from typing import Any, Protocol, TypeGuard, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +46,8 @@ from psa_casadi.records.read.table import (
     seconds_of,
 )
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
+from psa_casadi.records.signals import Hold, Signals
+from psa_casadi.shown import with_units
 from psa_casadi.units import FloatArray, parse_unit, to_si
 
 
@@ -154,7 +156,7 @@ def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, Ar
     """
     named: Any = columns
     if isinstance(columns, Record):
-        held = {"time": columns.time, **columns.recorded}
+        held = {"time": columns.time, **columns.columns}
         named = {f"{name} [{columns.units[name]}]": values for name, values in held.items()}
     arrays = {name: np.asarray(values, dtype=np.float64) for name, values in named.items()}
     problems = Problems()
@@ -181,6 +183,7 @@ def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, Ar
 
 
 AnyPath = str | os.PathLike[str]
+_Made = TypeVar("_Made", bound=Signals)
 
 
 class Frame(Protocol):
@@ -198,7 +201,7 @@ class Frame(Protocol):
 
 TableLike = Frame | Mapping[str, npt.ArrayLike]
 #: What stands for one record wherever records are asked for.
-OneRecord = Record | AnyPath | TableLike
+OneRecord = Signals | AnyPath | TableLike
 #: What stands for the records of one device.
 Records = OneRecord | Iterable[OneRecord]
 
@@ -226,10 +229,10 @@ def read_record(
             found, what was expected, what to do. At most 20 are listed, the others counted. An
             option that a sentence offers reads this file.
     """
-    request = _request(
-        columns, Path(path).name, sample_time, displacement=need_displacement,
-        excitation=need_excitation,
-    )  # fmt: skip
+    request = Request(
+        displacement=need_displacement, excitation=need_excitation, sample_time=sample_time
+    )
+    request = _said_of(request, columns, Path(path).name)
     return _record(str(path), *_read(str(path), request), table=request.table)
 
 
@@ -249,38 +252,79 @@ def read_records(
     Raises:
         InputError: the mistakes of all files together, or no file was named.
     """
-    wanted = parse_columns(columns) if isinstance(columns, str) else columns
+    request = Request(
+        displacement=need_displacement, excitation=need_excitation, sample_time=sample_time
+    )
+    return tuple(_several(paths, columns, request, _record))
+
+
+def read_signals(
+    paths: AnyPath | Iterable[AnyPath],
+    *,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    columns: str | ColumnMap | None = None,
+    sample_time: float | None = None,
+) -> tuple[Signals, ...]:
+    """Return the records on a model of one's own in files, each in the units of its file.
+
+    `inputs` and `outputs` are the model's: a column is found by the name, whatever its case, spaces
+    and unit, and so is `time`. Each input must be there. `columns` and `sample_time` are those of
+    `read_record`, as in `columns="u=CH1:mV,w=speed_2:rpm"`.
+
+        given = psa.read_signals("run.csv", inputs=model.input_names, outputs=model.output_names)
+
+    Raises:
+        InputError: as `read_records`.
+    """
+    several = [paths] if isinstance(paths, str | os.PathLike) else paths
+    request = replace(_request_of(inputs, outputs), sample_time=sample_time)
+    return tuple(_several(several, columns, request, _signals))
+
+
+def _request_of(inputs: Sequence[str], outputs: Sequence[str]) -> Request:
+    names = tuple(dict.fromkeys((*inputs, *outputs)))
+    return Request(names=names, needed=tuple(inputs))
+
+
+def _several(
+    paths: Iterable[AnyPath],
+    columns: str | ColumnMap | None,
+    request: Request,
+    make: Callable[..., _Made],
+) -> list[_Made]:
+    """Return what is made of files; those of one channel each are joined.
+
+    Raises InputError with the mistakes of all of them.
+    """
+    wanted = parse_columns(columns, request.names) if isinstance(columns, str) else columns
     places = [str(path) for path in paths]
-    records: list[Record] = []
+    records: list[_Made] = []
     problems: list[str] = []
     failed = 0
     for path in places:
-        request = _request(
-            wanted, Path(path).name, sample_time, displacement=need_displacement,
-            excitation=need_excitation,
-        )  # fmt: skip
+        own = _said_of(request, wanted, Path(path).name)
         try:
-            each = [request.table]
-            if request.table == ALL:
-                each = [*_read(path, replace(request, table=""))[0].tables] or [""]
+            each = [own.table]
+            if own.table == ALL:
+                each = [*_read(path, replace(own, table=""))[0].tables] or [""]
             for table in each:
-                found = _read(path, replace(request, table=table))
-                records.append(_record(path, *found, table=table))
+                found = _read(path, replace(own, table=table))
+                records.append(make(path, *found, table=table))
         except InputError as error:
             failed += 1
             problems.extend(error.problems)
     if failed == len(places) > 1:  # they may hold a channel each
-        request = _request(wanted, "", sample_time, displacement=True, excitation=need_excitation)
-        outcome = None
+        own, outcome = _said_of(request, wanted, ""), None
         with suppress(InputError):
-            outcome = joined([(p, *apart.text_of(p)) for p in places], request, alone=True)
+            outcome = joined([(p, *apart.text_of(p)) for p in places], own, alone=True)
         if outcome is not None:
-            return (_record("+".join(places), *outcome),)
+            return [make("+".join(places), *outcome)]
     if not places:
         problems.append("no record was named; name at least one CSV file.")
     if problems:
         raise InputError(problems)
-    return tuple(records)
+    return records
 
 
 def record_from(
@@ -300,7 +344,12 @@ def record_from(
     Raises:
         InputError: every mistake found, one sentence each.
     """
-    request = _request(columns, name, sample_time, displacement=need_displacement)
+    request = Request(displacement=need_displacement, sample_time=sample_time)
+    return _record(name, *_in_memory(table, name, _said_of(request, columns, name)), source="")
+
+
+def _in_memory(table: TableLike, name: str, request: Request) -> tuple[Outcome, str]:
+    """Return the samples of a table in memory, and a hash of them."""
     own = list(table if isinstance(table, Mapping) else table.columns)
 
     def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
@@ -314,7 +363,7 @@ def record_from(
     digest = hashlib.sha256()
     for (column, unit), values in zip(outcome.units.items(), outcome.values.T, strict=True):
         digest.update(f"{column} [{unit}]".encode() + np.ascontiguousarray(values).tobytes())
-    return _record(name, outcome, digest.hexdigest(), source="")
+    return outcome, digest.hexdigest()
 
 
 def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
@@ -336,19 +385,12 @@ def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArr
     return values.ravel()
 
 
-def _request(
-    columns: str | ColumnMap | None,
-    file: str,
-    sample_time: float | None,
-    *,
-    displacement: bool,
-    excitation: bool = False,
-) -> Request:
-    """Return what is wanted of a file, as far as it is said of this one."""
-    told = parse_columns(columns) if isinstance(columns, str) else columns or {}
+def _said_of(request: Request, columns: str | ColumnMap | None, file: str) -> Request:
+    """Return what is wanted of a file, with what `columns` say of this one."""
+    told = parse_columns(columns, request.names) if isinstance(columns, str) else columns or {}
     own = dict(columns_of(told, file))
     chosen = own.pop(TABLE, Source("", None)).array
-    return Request(own, sample_time, chosen, displacement, excitation)
+    return replace(request, columns=own, table=chosen)
 
 
 def _read(path: str, request: Request) -> tuple[Outcome, str]:
@@ -364,29 +406,77 @@ def records_given(given: Records) -> tuple[Record, ...]:
     Raises:
         InputError: the mistakes of all of them together.
     """
-    is_one = isinstance(given, Record | str | os.PathLike) or _is_table(given)
-    several = [given] if is_one else list(cast("Iterable[OneRecord]", given))
-    found: list[Record] = []
+
+    def one(given: Any, name: str) -> Record:
+        if isinstance(given, Signals):
+            return given if isinstance(given, Record) else record_from(_table(given), name=name)
+        return read_record(given) if _is_path(given) else record_from(given, name=name)
+
+    return tuple(_each(given, one, 1, "'voltage [V]': v"))
+
+
+def signals_given(
+    given: Any,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    hold: Hold | None = None,
+    first: int = 1,
+) -> list[Signals]:
+    """Return the records on a model that a user gave: `Signals`, paths of files, tables, records.
+
+    `hold` is what inputs do between samples (None: what `Signals` say, else "linear"), `first` the
+    number of the first record without a name.
+
+    Raises:
+        InputError: the mistakes of all of them together.
+    """
+    request = _request_of(inputs, outputs)
+
+    def one(given: Any, name: str) -> Signals:
+        if isinstance(given, Signals):
+            return Signals(**{f.name: getattr(given, f.name) for f in fields(Signals)})
+        if _is_path(given):
+            return _signals(str(given), *_read(str(given), request))
+        return _signals(name, *_in_memory(given, name, request), source="")
+
+    found = _each(given, one, first, f"'{(*inputs, *outputs)[0]}': u")
+    if not found:
+        raise InputError("There are no records; give one or more.")
+    return found if hold is None else [replace(s, hold=hold) for s in found]
+
+
+def _each(given: Any, one: Callable[[Any, str], _Made], first: int, example: str) -> list[_Made]:
+    """Return what `one` makes of every record that was given, with a name where it has none."""
+    is_one = isinstance(given, Signals) or _is_path(given) or _is_table(given)
+    if not is_one and not isinstance(given, Iterable):
+        given = [given]
+    several = [given] if is_one else list(given)
+    found: list[_Made] = []
     problems: list[str] = []
-    for k, one in enumerate(several, 1):
+    for k, each in enumerate(several, first):
+        if not (isinstance(each, Signals) or _is_path(each) or _is_table(each)):
+            problems.append(
+                f"{type(each).__name__} is no record; give the path of a file, a data frame, a"
+                f" mapping of arrays such as {{'time [s]': t, {example}, ...}}, Record or Signals."
+            )
+            continue
         try:
-            if isinstance(one, Record):
-                found.append(one)
-            elif isinstance(one, str | os.PathLike):
-                found.append(read_record(one))
-            elif _is_table(one):
-                name = f"record {k}" if several[1:] else "record"
-                found.append(record_from(one, name=name))
-            else:
-                problems.append(
-                    f"{type(one).__name__} is no record; give a Record, the path of a file, a data"
-                    " frame, or a mapping of arrays such as {'time [s]': t, 'voltage [V]': v, ...}."
-                )
+            found.append(one(each, f"record {k}" if several[1:] or first > 1 else "record"))
         except InputError as error:
             problems.extend(error.problems)
     if problems:
         raise InputError(problems)
-    return tuple(found)
+    return found
+
+
+def _is_path(given: object) -> TypeGuard[AnyPath]:
+    return isinstance(given, str | os.PathLike)
+
+
+def _table(signals: Signals) -> dict[str, Any]:
+    """Return the columns of signals with their units in the names."""
+    return with_units({"time": signals.time, **signals.columns}, {"time": "s", **signals.units})
 
 
 def _is_table(given: object) -> TypeGuard[TableLike]:
@@ -397,27 +487,46 @@ def _record(
     path: str, outcome: Outcome, digest: str, *, source: str | None = None, table: str = ""
 ) -> Record:
     """Return the record in SI units; one of several is named and hashed with its table."""
+    read, whence = _samples(path, outcome, digest, source, table)
+    columns = {name: to_si(values, outcome.units[name]) for name, values in read.items()}
+    for array in columns.values():
+        array.flags.writeable = False  # a record need not copy it
+    _check_instants(path, columns["time"])
+    in_counts = "displacement" in columns and parse_unit(outcome.units["displacement"]).counts
+    unit = "counts" if in_counts else "m"
+    return Record(**{**columns, **whence, "displacement_unit": unit})
+
+
+def _signals(
+    path: str, outcome: Outcome, digest: str, *, source: str | None = None, table: str = ""
+) -> Signals:
+    """Return the record on any model, its columns in the units of the file."""
+    columns, whence = _samples(path, outcome, digest, source, table)
+    time = to_si(columns.pop("time"), outcome.units["time"])
+    _check_instants(path, time)
+    units = {name: outcome.units[name] for name in columns}
+    return Signals(time=time, columns=columns, units=units, **whence)
+
+
+def _samples(
+    path: str, outcome: Outcome, digest: str, source: str | None, table: str
+) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+    """Return the columns that were read, and what says whence they are."""
     outcome.problems.raise_if_any()
     if not outcome.units:
         raise InputError(f"{path}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
-    columns = {
-        name: to_si(values, unit)
-        for (name, unit), values in zip(outcome.units.items(), outcome.values.T, strict=True)
+    stem = "+".join(Path(part).stem for part in parts_of(path)) if source is None else path
+    return dict(zip(outcome.units, outcome.values.T, strict=True)), {
+        "name": plain(f"{stem}_{table}" if table else stem),
+        "sha256": hashlib.sha256(f"{digest} {table}".encode()).hexdigest() if table else digest,
+        "source": path if source is None else source,
+        "notes": tuple(f"{path}: {note}" for note in outcome.notes),
     }
-    for array in columns.values():
-        array.flags.writeable = False  # a record need not copy it
-    if not (np.diff(columns["time"]) > 0.0).all():
+
+
+def _check_instants(path: str, time: FloatArray) -> None:
+    if not (np.diff(time) > 0.0).all():
         raise InputError(
             f"{path}: instants are the same in seconds; give the time from the start of"
             " the record, in a unit in which neighbours differ by more than the last digit."
         )
-    in_counts = "displacement" in columns and parse_unit(outcome.units["displacement"]).counts
-    stem = "+".join(Path(part).stem for part in parts_of(path)) if source is None else path
-    return Record(
-        name=plain(f"{stem}_{table}" if table else stem),
-        **columns,
-        sha256=hashlib.sha256(f"{digest} {table}".encode()).hexdigest() if table else digest,
-        source=path if source is None else source,
-        displacement_unit="counts" if in_counts else "m",
-        notes=tuple(f"{path}: {note}" for note in outcome.notes),
-    )

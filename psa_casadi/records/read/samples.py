@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.choose import ASK_UNIT, Choice, Question
+from psa_casadi.records.read.by_name import ByName
+from psa_casadi.records.read.choose import ASK_UNIT, Choice, Question, with_usual_units
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.table import (
@@ -25,10 +26,12 @@ from psa_casadi.records.read.table import (
 )
 from psa_casadi.records.record import (
     FEWEST_SAMPLES,
+    Check,
     Located,
     check_complete,
     check_displacement,
     check_excitation,
+    check_finite,
     check_length,
     check_time,
 )
@@ -48,6 +51,8 @@ class Request:
     `columns` says which column is which, `sample_time` [s] gives the time of samples without one,
     `table` takes one of several tables; `displacement` and `excitation` demand a displacement, and
     a voltage that changes. Without `voltage` it is a path to follow, which is checked elsewhere.
+    With `names`, those of a model's inputs and outputs, it is a record on that model, which must
+    have the inputs `needed`.
     """
 
     columns: ColumnMap = field(default_factory=dict)
@@ -56,16 +61,29 @@ class Request:
     displacement: bool = True
     excitation: bool = False
     voltage: bool = True
+    names: tuple[str, ...] = ()
+    needed: tuple[str, ...] = ()
 
     @property
     def required(self) -> tuple[str, ...]:
         """The columns that must be there."""
+        stack = {"voltage": self.voltage, "displacement": self.displacement}
         needed = {
             "time": self.sample_time is None,
-            "voltage": self.voltage,
-            "displacement": self.displacement,
+            **(dict.fromkeys(self.needed, True) if self.names else stack),
         }
         return tuple(name for name, is_needed in needed.items() if is_needed)
+
+    @property
+    def whole(self) -> tuple[str, ...]:
+        """The columns that may lack no sample."""
+        return ("time", *(self.needed if self.names else ("voltage",)))
+
+    def chosen(self, table: Table, problems: Problems) -> Choice | ByName:
+        """Return which column of a table is which."""
+        if self.names:
+            return ByName(table, self.names, self.required, self.columns, problems)
+        return Choice(with_usual_units(table), self.required, self.columns, problems)
 
 
 @dataclass
@@ -159,7 +177,7 @@ def _of_one(table: Table, request: Request, segment: str) -> Outcome:
 
 
 def _offer(
-    table: Table, request: Request, choice: Choice, segment: str
+    table: Table, request: Request, choice: Choice | ByName, segment: str
 ) -> tuple[tuple[ColumnMap, float | None] | None, str]:
     """Return the first options with which the table is read, and the part of it that they take."""
     given = request.sample_time
@@ -188,14 +206,14 @@ class _Try:
     def __init__(self, table: Table, request: Request, segment: str) -> None:
         self.table, self.segment, self.notes = table, segment, list[str]()
         self.outcome, self.problems = Outcome(), Problems()
-        self.choice = Choice(table, request.required, request.columns, self.problems)
+        self.choice = request.chosen(table, self.problems)
         if table.step and "time" not in self.choice.fields and request.sample_time is None:
             step = table.step
             self.notes.append(
                 f"the time is that of the sample time that the file states, {step:g} s."
             )
             request, self.problems = replace(request, sample_time=step), Problems()
-            self.choice = Choice(table, request.required, request.columns, self.problems)
+            self.choice = request.chosen(table, self.problems)
         self.request, self.open = request, self.choice.open
         if self.choice.fields:
             self._convert(dict(self.choice.fields))
@@ -274,7 +292,7 @@ class _Try:
             return self._located(name, values, lines, wrong)
         for k in np.flatnonzero(wrong):
             hint = "correct it, or leave the cell empty where the sample is missing"
-            if name in ("time", "voltage"):
+            if name in self.request.whole:
                 hint = f"correct it or remove the {table.place}"
             if is_number(texts[k]) and decimal_sign([texts[k]]) != point:
                 other = "comma" if point == "," else "point"
@@ -351,15 +369,19 @@ class _Try:
 
     def _check(self, found: Mapping[str, Located]) -> None:
         """Check the samples of a record; those of a path to follow are checked elsewhere."""
-        missing = found.get("displacement")
-        count = int((np.isnan(missing.values) & ~missing.reported).sum()) if missing else 0
-        if count:
-            self.notes.append(f"{count} readings of the displacement are missing; they are masked.")
+        outputs = [n for n in self.request.names if n not in self.request.whole]
+        for output in outputs or ["displacement"]:
+            missing = found.get(output)
+            count = int((np.isnan(missing.values) & ~missing.reported).sum()) if missing else 0
+            if count:
+                column = f"'{output}'" if outputs else "the displacement"
+                self.notes.append(f"{count} readings of {column} are missing; they are masked.")
         if not self.request.voltage:
             return
         check_length(self.table.path, len(next(iter(found.values())).lines), self.problems)
-        checks = {"time": check_time, "displacement": check_displacement}
-        for name, column in found.items():
-            checks.get(name, check_complete)(column, self.problems)
-            if name == "voltage" and self.request.excitation and not column.reported.any():
-                check_excitation(column, self.problems)
+        checks: dict[str, Check] = {"time": check_time, "displacement": check_displacement}
+        checks |= dict.fromkeys(outputs, check_finite)
+        for name, located in found.items():
+            checks.get(name, check_complete)(located, self.problems)
+            if name == "voltage" and self.request.excitation and not located.reported.any():
+                check_excitation(located, self.problems)

@@ -21,7 +21,7 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
 from psa_casadi.posterior.chains import columns_of_records
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
-from psa_casadi.records.record import Record
+from psa_casadi.records.signals import Signals
 from psa_casadi.report.plots import records
 from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
@@ -42,7 +42,7 @@ from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
 Compared = Diagnosis | Identification | OdeDiagnosis | OdeIdentification
-Plotted = Compared | Trajectory | Posterior | Record
+Plotted = Compared | Trajectory | Posterior | Signals
 
 #: What all pictures share.
 SIZE_INCHES, DPI = (16.0, 10.0), 100
@@ -100,7 +100,7 @@ def figure_of(result: Plotted) -> Figure:
         return response_figure(result.time, result.voltage, result.displacement)
     if isinstance(result, Posterior):
         return posterior_figure(result)
-    if isinstance(result, Record):
+    if isinstance(result, Signals):
         return one_output(result, None, None)
     return record_figure(most_telling(_series(result)))
 
@@ -236,9 +236,9 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         columns = {"voltage": result.voltage, **result.states, **result.outputs}
         name = _chosen(output, columns, result.shown)
         _curve(axes, result.time, columns[name], name, result.units.get(name, ""))
-    elif isinstance(result, Record):
-        name = _chosen(output, result.recorded, result.shown)
-        _curve(axes, result.time, result.recorded[name], name, result.units[name])
+    elif isinstance(result, Signals):
+        name = _chosen(output, result.columns, result.shown)
+        _curve(axes, result.time, result.columns[name], name, result.units.get(name, ""))
     elif isinstance(result, Posterior):
         by_name = {f.name: f for f in result.figures}
         _draw_parameter(axes, result, by_name[_chosen(output, by_name, next(iter(by_name)))])

@@ -8,7 +8,14 @@ from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
 from psa_casadi.report.words.own_words import OWN_MODELS
-from psa_casadi.report.words.phrases import are, listing, quantity, raised, with_unit
+from psa_casadi.report.words.phrases import (
+    are,
+    listing,
+    prefixed_scale,
+    quantity,
+    raised,
+    with_unit,
+)
 
 Probable = Sequence[tuple[str, float]]
 
@@ -74,6 +81,20 @@ def _steps(quantum: tuple[float, str], rounding: tuple[float, str]) -> str:
     )
 
 
+#: What marks samples that a sensor has made, by kind.
+_SUSPECT = {
+    "outlier": "stand out as spikes of at most three samples that return at once",
+    "drop-out": "belong to drop-outs, where the sensor jumps to one value and back",
+    "stuck": "repeat the last one to the last digit, as a stuck sensor does",
+}
+
+
+def _reading(value: tuple[float, str], digits: int) -> str:
+    size, unit = value
+    scale = prefixed_scale(abs(size), unit or "1")
+    return with_unit(f"{scale.factor * size:.{digits}g}", scale.unit)
+
+
 DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
     # what remains
     "noise_only": "What remains cannot be distinguished from noise.",
@@ -86,6 +107,18 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " something matters there that these do not show."
     ),
     # what was done to the records
+    "masked": lambda where, count, kind: (
+        f"{where}: {count} sample{'s' * (count > 1)} {_SUSPECT[kind]}; masked, so that they count"
+        " for nothing."
+    ),
+    "flat_end": lambda where, count, share, value, upper, drive, moved: (
+        f"{where}: {count} samples ({100.0 * share:.0f} %) stay at {_reading(value, 6)},"
+        f" the {'largest' if upper else 'smallest'} value, while {drive} moves {moved}: the sensor"
+        " is saturated there; masked, so that they count for nothing."
+    ),
+    "quantised": lambda where, output, step: (
+        f"{where}: {output} is quantised in steps of {_reading(step, 3)}."
+    ),
     "coarse": (
         "{record}: the sensor resolves {steps:.0f} steps over the whole range. They make up the"
         " model's error: nothing smaller can be distinguished from them."

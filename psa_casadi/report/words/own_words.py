@@ -252,6 +252,7 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         ' say so of these records: psa.Signals(..., hold="zero").'
     ),
     "no_column": "No record has a column '{output}'; that output is not compared.",
+    "no_unit": "{record} states no unit of {names: and }; the model's are taken.",
     # the fit
     "own_interrupted": "The search was interrupted; these are the best values so far.",
     "cut_off": "The fit was cut off before it converged; its values are not final.",

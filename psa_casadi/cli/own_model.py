@@ -1,0 +1,191 @@
+"""`--model` that is no stack: a function of a Python file, an FMU, the file of another model."""
+
+import re
+import runpy
+import sys
+import time as clock
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import psa_casadi as psa
+from psa_casadi.cli.failures import judge
+from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.options import Reading
+from psa_casadi.cli.screen import show, tell, tell_written, width, working
+from psa_casadi.errors import InputError
+from psa_casadi.files import atomic_write
+
+_PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitting:
+    """How a model of one's own is fitted: words of `psa.identify(model, records)`.
+
+    Options:
+        free: Parameter of a model of your own to fit, by default all that may be; repeat the option
+            for several.
+        zeros: Output of a model of your own whose zero is unknown in each record; repeat the option
+            for several.
+        hold: What the inputs of a model of your own do between samples, by default linear.
+        known_start: The records of a model of your own begin at its declared states.
+    """
+
+    free: list[str] | None = None
+    zeros: list[str] | None = None
+    hold: Literal["linear", "zero"] | None = None
+    known_start: bool = False
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """The words that were given."""
+        return {name: value for name, value in asdict(self).items() if value}
+
+
+def _own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | None:
+    """Return the model that a path names where it is no stack's; None for a stack's or none.
+
+    A model that cannot be made ends the command.
+    """
+    found = None if path is None else _model(given, path)
+    if found is None:
+        for name in fitting.words:
+            option = name.replace("_", "-")
+            given.add(f"--{option} is said of a model of your own; add --model FILE.py:FUNCTION.")
+    return found
+
+
+def _model(given: Given, path: Path) -> psa.Model | None:
+    match = _PYTHON.fullmatch(str(path))
+    if match is not None:
+        return _made(Path(match["file"]), match["name"] or "")
+    if path.suffix.lower() == ".fmu":
+        return psa.fmu_model(path)
+    try:
+        model = psa.load_model(path, given.own)
+    except InputError:  # which is told where a stack's file is read
+        return None
+    is_stack = "voltage" in model.input_names and "displacement" in model.output_names
+    return None if is_stack else model
+
+
+def _made(file: Path, name: str) -> psa.Model:
+    """Return the model that a function of a Python file returns, or that a variable of it is."""
+    if not file.is_file():
+        raise InputError(f"--model: there is no file {file}; check the name and the directory.")
+    sys.path.append(str(file.resolve().parent))  # what lies beside it can be imported
+    try:
+        held = runpy.run_path(str(file), run_name=file.stem)
+        made = held.get(name)
+        model = made() if callable(made) else made
+    except Exception as error:  # the user's own code may raise anything
+        raise InputError(
+            f"--model: {file} cannot make a model ({type(error).__name__}: {error}); correct it."
+        ) from error
+    if not isinstance(model, psa.Model):
+        own = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
+        there = f"; it has {', '.join(own)}" if own else ""
+        raise InputError(
+            f"--model: {file} has no function '{name}' that returns a model{there}. Name one that"
+            f" does, as {file}:{own[-1] if own else 'make'}."
+        )
+    return model
+
+
+def identified_own(
+    path: Path | None,
+    records: Sequence[Path],
+    fitting: Fitting,
+    reading: Reading,
+    given: Given,
+    *,
+    report: Path | None,
+    others: Mapping[str, object],
+) -> bool:
+    """Fit a model of one's own, show its parameters, and write the page.
+
+    False where the path names none. `others` are options that must be empty.
+    """
+    model = _own_model(given, path, fitting)
+    if model is None:
+        return False
+    _refuse(given, others)
+    given.outputs({"--report": report}, list(records))
+    measured = _read(given, model, records, reading)
+    given.check()
+    with working("identifying", given.quiet):
+        found = psa.identify(model, measured, **fitting.words)
+    if report is not None:
+        psa.write_fit_report(found, report)
+    show(repr(found), given.quiet)
+    tell_written(report, quiet=given.quiet)
+    return True
+
+
+def diagnosed_own(
+    path: Path | None,
+    records: Sequence[Path],
+    held_out: Sequence[Path],
+    fitting: Fitting,
+    reading: Reading,
+    given: Given,
+    *,
+    leave_out: Sequence[str],
+    expect: str | None,
+    files: Mapping[str, Path | None],
+    others: Mapping[str, object],
+) -> bool:
+    """Diagnose a model of one's own: `files` are --json, --report and --junit.
+
+    False where the path names none. `others` are options that must be empty.
+    """
+    model = _own_model(given, path, fitting)
+    if model is None:
+        return False
+    from psa_casadi.cli.diagnosis_files import expected, verdict_case
+    from psa_casadi.report.words.own_words import own_verdict_sentence
+
+    began = clock.perf_counter()
+    _refuse(given, others)
+    given.outputs(files, [*records, *held_out])
+    measured, held = (_read(given, model, part, reading) for part in (records, held_out))
+    wanted, _ = expected(given, expect, None)
+    given.check()
+    with working("diagnosing", given.quiet) as progress:
+        d = psa.diagnose(
+            model, measured, holdout=held, leave_out=leave_out, progress=progress, **fitting.words
+        )
+    json, report, junit = files.values()
+    if json is not None:
+        atomic_write(json, d.to_json())
+    if report is not None:
+        psa.write_report(d, report)
+    show(psa.story(d, width=width()), given.quiet)
+    tell_written(json, report, quiet=given.quiet)
+    case = verdict_case(d.verdict, own_verdict_sentence(d), wanted)
+    judge("diagnose", ", ".join(p.name for p in records), [case], junit, began, tells=True)
+    return True
+
+
+def _refuse(given: Given, others: Mapping[str, object]) -> None:
+    """Refuse the options that a model of one's own does not take."""
+    for option in [name for name, value in others.items() if value]:
+        given.add(f"{option} is not there for a model of your own; leave it out.")
+
+
+def _read(
+    given: Given, model: psa.Model, paths: Sequence[Path], reading: Reading
+) -> tuple[psa.Signals, ...]:
+    if not paths:
+        return ()
+    found = given.attempt(
+        lambda: psa.read_signals(
+            paths, inputs=model.input_names, outputs=model.output_names,
+            columns=reading.columns, sample_time=reading.sample_time,
+        )
+    )  # fmt: skip
+    for note in [n for s in found or () for n in s.notes if not given.quiet]:
+        tell(f"Note: {note}")
+    return found or ()

@@ -1,0 +1,310 @@
+"""Records of a model of one's own in files and tables, in other units than the model's."""
+
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import savemat
+
+import psa_casadi as psa
+from psa_casadi.any_model.runs import given_to, runs_of
+from psa_casadi.records.split import Experiment
+from psa_casadi.units import FloatArray
+from tests.any_model import own_plants as plants
+from tests.any_model.own_models import cylinder, motor, oscillator
+
+N = 400
+T = np.arange(N, dtype=np.float64) * 2e-3
+RNG = np.random.default_rng(5)
+VALVE, FLOW, SPEED, WARM = (np.cumsum(RNG.standard_normal((4, N)), axis=1) + 3.0).round(6)
+
+
+def _pump() -> psa.Model:
+    w, h, valve, flow = (ca.SX.sym(n) for n in ("w", "h", "valve", "flow"))
+    return psa.ode_model(
+        {"x": [w, h], "u": [valve, flow], "ode": [valve - w, flow - h], "y": [w, h]},
+        name="pump",
+        inputs=[psa.Input("valve", "1", "opening"), psa.Input("flow", "m3/s", "flow")],
+        outputs=[psa.Output("Speed", "rad/s", "speed"), psa.Output("oil_temp", "K", "warmth")],
+    )
+
+
+#: The columns of a record in units that are not the model's.
+COLUMNS = {
+    "Time [ms]": 1e3 * T,
+    "valve [%]": 100.0 * VALVE,
+    "FLOW (l/min)": 6e4 * FLOW,
+    "speed (rpm)": SPEED * 30.0 / np.pi,
+    "Oil-Temp [°C]": WARM - 273.15,
+    "remark [V]": np.ones(N),
+}
+NAMES = [name.strip("])").replace("(", "[").partition("[") for name in COLUMNS]
+
+
+def _rows(mark: str, point: str, end: str = "\n") -> str:
+    table = np.column_stack([*COLUMNS.values()]).tolist()
+    return end.join(mark.join(repr(v).replace(".", point) for v in row) for row in table)
+
+
+def _csv(path: Path) -> Path:
+    path.write_text(",".join(COLUMNS) + "\n" + _rows(",", "."), "utf-8")
+    return path
+
+
+def _german(path: Path) -> Path:
+    """With a mark of UTF-8, a preamble, units in a row of their own, and decimal commas."""
+    head = "Prüfstand 3;;\r\n\r\nZeit;valve;flow;speed;Oil temp;remark\r\n"
+    head += "[ms];[%];[l/min];[rpm];[degC];[V]\r\n"
+    path.write_bytes(b"\xef\xbb\xbf" + (head + _rows(";", ",", "\r\n")).encode())
+    return path
+
+
+def _excel(path: Path) -> Path:
+    pd.DataFrame(COLUMNS).to_excel(path, index=False)
+    return path
+
+
+def _parquet(path: Path) -> Path:
+    pd.DataFrame(COLUMNS).to_parquet(path)
+    return path
+
+
+def _hdf5(path: Path) -> Path:
+    with h5py.File(path, "w") as file:
+        group = file.create_group("log")
+        for (name, _, unit), values in zip(NAMES, COLUMNS.values(), strict=True):
+            group.create_dataset(name.strip(), data=values).attrs["units"] = unit
+    return path
+
+
+def _matlab(path: Path) -> Path:
+    """Without units, which are then the model's; a current in amperes would be a stack's."""
+    log = {"valve": VALVE, "flow": FLOW, "speed": SPEED, "oil_temp": WARM}
+    savemat(path, {"time": T, "log": log})
+    return path
+
+
+def _run(given: Any) -> Experiment:
+    model = _pump()
+    (run,) = runs_of(model, given_to(model, given, None), judged=False)
+    return run
+
+
+def _columns(run: Experiment, names: Sequence[str]) -> FloatArray:
+    """Return columns of an experiment's record (n, names)."""
+    return np.column_stack([np.asarray(run.record.column(n)) for n in names])
+
+
+def _assert_is_the_record(given: Any) -> None:
+    run = _run(given)
+    np.testing.assert_allclose(run.record.time - run.record.time[0], T, atol=1e-12)
+    np.testing.assert_allclose(
+        _columns(run, _pump().input_names), np.column_stack([VALVE, FLOW]), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        _columns(run, _pump().output_names), np.column_stack([SPEED, WARM]), 1e-12, 1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        ("a.csv", _csv),
+        ("a.txt", _german),
+        ("a.xlsx", _excel),
+        ("a.parquet", _parquet),
+        ("a.h5", _hdf5),
+        ("a.mat", _matlab),
+    ],
+)
+def test_a_file_is_read_in_the_units_of_the_model(
+    name: str, written: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    path = written(tmp_path / name)
+    _assert_is_the_record(path)
+    _assert_is_the_record([str(path)])
+
+
+def test_tables_and_signals_are_read_in_the_units_of_the_model() -> None:
+    _assert_is_the_record(COLUMNS)
+    _assert_is_the_record(pd.DataFrame(COLUMNS))
+    shown = {"valve": VALVE, "flow": 6e4 * FLOW, "Speed": SPEED, "oil_temp": WARM - 273.15}
+    units = {"flow": "l/min", "oil_temp": "degC"}
+    signals = psa.Signals(name="run", time=T, columns=shown, units=units)
+    _assert_is_the_record(signals)
+    _assert_is_the_record(signals.to_frame())
+    assert signals.plot(output="flow").axes[0].get_ylabel() == "flow [l/min]"
+
+
+def test_the_same_record_in_other_units_is_the_same_identification(tmp_path: Path) -> None:
+    record = plants.bouc_wen(1)
+    given = {
+        "t [ms]": 1e3 * record.time[:500],
+        "Force [kN]": 1e-3 * record.columns["force"][:500],
+        "position [mm]": 1e3 * record.columns["position"][:500],
+    }
+    path = tmp_path / "drive.csv"
+    np.savetxt(
+        path, np.column_stack([*given.values()]), "%.17g", ";", header=";".join(given), comments=""
+    )
+    columns = {n: v[:500] for n, v in record.columns.items()}
+    plain = psa.Signals(name="drive", time=record.time[:500], columns=columns)
+    expected = psa.identify(oscillator(), plain, starts=1).model.values
+    for one in (given, path):
+        assert psa.identify(oscillator(), one, starts=1).model.values == pytest.approx(expected)
+
+
+def test_a_stacks_record_drives_any_model_and_signals_a_stack() -> None:
+    u, x, k = ca.SX.sym("voltage"), ca.SX.sym("s"), ca.SX.sym("k")
+    model = psa.ode_model(
+        {"x": x, "u": u, "p": k, "ode": k * u - x, "y": x},
+        name="any",
+        inputs=[psa.Input("voltage", "kV", "voltage")],
+        outputs=[psa.Output("strain", "ppm", "strain")],
+        values={"k": 1.0},
+    )
+    record = psa.Record(name="r", time=T, voltage=10.0 * VALVE, strain=1e-6 * SPEED)
+    (run,) = runs_of(model, given_to(model, record, "zero"), judged=False)
+    np.testing.assert_allclose(_columns(run, model.input_names)[:, 0], 1e-2 * VALVE, rtol=1e-12)
+    np.testing.assert_allclose(_columns(run, model.output_names)[:, 0], SPEED, rtol=1e-12)
+    assert (run.record.hold, run.record.sha256) == ("zero", record.sha256)
+    columns = {"voltage": VALVE, "displacement": SPEED}
+    units = {"voltage": "V", "displacement": "um"}
+    told = psa.Signals(name="s", time=T, columns=columns, units=units)
+    (again,) = psa.records.records_given(told)
+    np.testing.assert_allclose(np.asarray(again.displacement), 1e-6 * SPEED, rtol=1e-12)
+
+
+def _refused(given: Any, model: psa.Model | None = None) -> str:
+    with pytest.raises(psa.InputError) as caught:
+        psa.identify(_pump() if model is None else model, given, starts=1)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            ("valve [%]", "valve [kV]"),
+            r"states no unit; declare it, as psa.Input\('valve', 'V', ''\)",
+        ),
+        (("valve [%]", "vavle [%]"), "'valve' is missing.*say which column it is: --columns valve"),
+        (("speed (rpm)", "speed [N]"), r"column 'Speed': cannot convert 'N' \(force\) to 'rad/s'"),
+        (("speed (rpm)", "speed [foo]"), "column 'Speed': the unit 'foo' is unknown"),
+        (("Time [ms]", "Time [mm]"), "column 'time': the unit 'mm' does not measure time"),
+        (("Time [ms]", "hours of work"), "'time' is missing.*--columns \"?time=hours of work:s"),
+        (("remark [V]", "Flow (m3/s)"), "column 6: 'flow' stands twice in the header"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_what_to_type(
+    change: tuple[str, str], said: str
+) -> None:
+    before, after = change
+    given = {after if name == before else name: values for name, values in COLUMNS.items()}
+    assert re.search(said, _refused(given), re.DOTALL)
+
+
+def test_all_mistakes_of_all_records_are_told_at_once(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.csv"
+    bad.write_text("time [s],valve,flow,speed\n" + "0,1,2,x\n" * 20)
+    said = _refused([bad, tmp_path / "none.csv", 5, {"time": T, "valve": VALVE}])
+    assert "bad.csv: line 2, column 'Speed': found 'x', expected a number" in said
+    assert "none.csv: there is no such file" in said
+    assert "int is no record; give the path of a file, a data frame" in said
+    assert "record 4: column names: the column 'flow' is missing (found: time, valve)" in said
+    said = _refused({"time": T, "valve": VALVE, "flow": FLOW})
+    assert "no output of the model 'pump' with eight samples or more; the model's are" in said
+
+
+def test_a_unit_that_is_not_stated_is_told() -> None:
+    found = psa.identify(motor(), plants.motor(2, friction=0.0), starts=1)
+    assert not found.warnings
+    record = plants.motor(2, friction=0.0)
+    found = psa.identify(motor(), {"time": record.time, **record.columns}, starts=1)
+    assert found.warnings == ("record states no unit of w and i; the model's are taken.",)
+
+
+def test_columns_are_named_where_the_header_does_not(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = np.column_stack([T, VALVE, FLOW, SPEED])
+    np.savetxt(path, rows, "%.17g", ",", header="a,b,c,CH 4", comments="")
+    read = partial(psa.read_signals, inputs=("valve", "flow"), outputs=("Speed", "oil_temp"))
+    said = "time=a:s,valve=b:1,flow=3:m3/s,speed=CH 4:2rpm"
+    (signals,) = read(path, columns=said)
+    assert (signals.units["flow"], signals.units["Speed"]) == ("m3/s", "rpm")
+    np.testing.assert_allclose(signals.columns["Speed"], 2.0 * SPEED, rtol=1e-12)
+    (again,) = read([path], columns="valve=b,flow=c,Speed=CH 4", sample_time=0.1)
+    assert again.time[-1] == pytest.approx(0.1 * (N - 1))
+    with pytest.raises(psa.InputError, match=r"'sped' is no column of a record; is 'Speed' meant"):
+        read(path, columns="sped=CH 4")
+
+
+def _spoilt(record: psa.Signals, outputs: tuple[str, ...], seed: int) -> dict[str, Any]:
+    """Return a record of which 1 % of the readings are far off, as columns."""
+    rng, columns = np.random.default_rng(seed), dict(record.columns)
+    for name in outputs:
+        y = np.array(columns[name])
+        places = rng.choice(y.size, y.size // 100, replace=False)
+        y[places] += (
+            rng.choice([-1, 1], places.size) * rng.uniform(0.05, 0.5, places.size) * np.ptp(y)
+        )
+        columns[name] = y
+    return {"time": record.time, **columns}
+
+
+def test_one_reading_in_a_hundred_that_is_far_off_is_masked_in_its_output_alone() -> None:
+    record = plants.cylinder(30)[0]
+    model = cylinder(dead_zone=0.6)
+    (clean,) = runs_of(model, [record], judged=False)
+    assert np.isfinite(_columns(clean, model.output_names)).all()
+    given = _spoilt(record, ("pressure",), 1)
+    (run,) = runs_of(model, given_to(model, given, None), judged=False)
+    off = given["pressure"] != record.columns["pressure"]
+    lost = np.isnan(_columns(run, model.output_names))
+    assert not lost[:, 0].any()
+    assert not (lost[:, 1] & ~off).any()
+    assert lost[off, 1].sum() >= 0.95 * off.sum()
+
+
+def test_a_clean_record_with_outliers_is_adequate() -> None:
+    given = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
+    d = psa.diagnose(motor(), given)
+    assert d.verdict == "adequate"
+    assert not d.causes
+    assert all(e.base < 1.1 * e.noise for e in d.errors)
+    for name in ("w", "i"):
+        assert any(
+            n.startswith(f"{name} of record: 30 samples stand out as spikes") for n in d.notes
+        )
+
+
+def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_told() -> None:
+    record = plants.motor(2, friction=0.0)
+    y = np.array(record.columns["w"])
+    y[700:760] = y[700]
+    top = float(np.quantile(y, 0.9))
+    given = {"time": record.time, **record.columns, "w": np.minimum(y, top)}
+    (run,) = runs_of(motor(), given_to(motor(), given, None), judged=False)
+    lost = np.isnan(_columns(run, motor().output_names)[:, 0])
+    assert np.mean(lost[y >= top]) > 0.99
+    assert lost[701:760].all()
+    assert np.isfinite(_columns(run, motor().output_names)[:, 1]).all()
+    told = psa.identify(motor(), given, starts=1).warnings
+    assert any("while voltage moves w: the sensor is saturated there" in n for n in told)
+    assert any("w of record: 59 samples repeat the last one to the last digit" in n for n in told)
+
+
+def test_what_moves_in_jumps_without_noise_is_no_sensor_that_fails() -> None:
+    """A valve that is open or not, and a mass at rest while its drive moves."""
+    u = np.sin(2.0 * np.pi * 2.0 * T * 5.0)
+    rest = np.maximum(u, 0.3)
+    given = {"time": T, "valve": u, "flow": u, "speed": 1.0 * (u > 0.2), "oil_temp": rest}
+    run = _run(given)
+    assert np.isfinite(_columns(run, _pump().output_names)).all()
