@@ -22,14 +22,6 @@ from psa_casadi.files import (
 )
 
 
-def test_text_and_bytes_are_written_as_given(tmp_path: Path) -> None:
-    atomic_write(tmp_path / "a.txt", "µm\n")
-    atomic_write(tmp_path / "b.bin", b"\r\n\0")
-    assert (tmp_path / "a.txt").read_bytes() == "µm\n".encode()
-    assert (tmp_path / "b.bin").read_bytes() == b"\r\n\0"
-    assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.bin"]
-
-
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     target = tmp_path / "model.json"
     target.write_text("old")
@@ -43,14 +35,6 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
         write_half()
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["model.json"]
-
-
-def test_the_temporary_file_keeps_the_suffix_that_writers_look_at(tmp_path: Path) -> None:
-    with atomic_path(tmp_path / "x.fmu") as path:
-        assert path.suffix == ".fmu"
-        assert path.parent == tmp_path
-        path.write_text("whole")
-    assert (tmp_path / "x.fmu").read_text() == "whole"
 
 
 def test_mode_of_an_old_file_and_the_target_of_a_link_are_kept(tmp_path: Path) -> None:

@@ -1,35 +1,51 @@
 """The version, and what goes on from the demonstration; `tests/contract` has the commands."""
 
+import os
 import re
 import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import fromstring
 
 import pytest
-from typer.testing import CliRunner, Result
+import typer
+from rich.console import Console
+from typer.testing import CliRunner
 
 import psa_casadi
+import psa_casadi as psa
 from build_scripts.page_commands import block_in_tests, run_block
+from psa_casadi.cli import steps
 from psa_casadi.cli.app import app
+from psa_casadi.cli.screen import show_table, working
+from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, Course, Told
+from psa_casadi.datasets import DATASETS
+from psa_casadi.diagnosis import diagnose
+from psa_casadi.effects import EFFECTS
+from psa_casadi.examples.index import examples
+from psa_casadi.export.check.check import CheckReport, CheckRow
+from psa_casadi.identification import identify
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.model.model_file import load_model
+from psa_casadi.model.model_file import load_model, save_model
+from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record
 from psa_casadi.records.split import whole
+from psa_casadi.report.documents.junit import check_cases, junit_text
+from psa_casadi.report.page import playground
+from psa_casadi.report.words.tables import Table, effects_table
+from tests.contract.helpers import command, done
 from tests.identification.identified_plants import same_as_the_named_stack
+from tests.records.record_files import HEADER, ROWS, write
+from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
 
 
-def psa(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-def done(*arguments: str | Path) -> Result:
-    result = psa(*arguments)
-    assert result.exit_code == 0, result.output
-    return result
-
-
 def test_the_version_is_one() -> None:
-    assert done("--version").stdout == f"psa_casadi {psa_casadi.__version__}\n"
+    assert done("--version").out == f"psa_casadi {psa_casadi.__version__}\n"
     root = Path(__file__).parents[2]
     citation = (root / "CITATION.cff").read_text(encoding="utf-8")
     assert f"\nversion: {psa_casadi.__version__}\n" in citation
@@ -51,3 +67,270 @@ def test_the_page_goes_on_from_the_demo_whose_stack_is_what_its_record_gives(
     found = load_model(tmp_path / "psa_demo" / "model.json")
     rms = fit(found, [whole(record)], [], sigma=[1e-3 * record.range_m]).rms
     same_as_the_named_stack(rms, record, "demo")
+
+
+@pytest.mark.parametrize("way", [["--model"], []], ids=["option", "file alone"])
+def test_the_playground_and_a_posterior_take_a_model(
+    way: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, played = tmp_path / "model.json", []
+    save_model(stack_model("demo"), file)
+    monkeypatch.setattr(playground, "write_playground", lambda *given: played.append(given))
+    assert command("web", *way, file, "-o", tmp_path / "p.html").code == 0
+    ((path, model),) = played
+    assert path == tmp_path / "p.html"
+    assert model.values == stack_model("demo").values
+    twice = command("web", *way, file, file)
+    assert twice.code == 2
+    assert "is one file too many" in twice.words
+    words: list[str | Path] = [*way, file, tmp_path / "absent.csv"]
+    assert command("sample", *words).err.startswith(
+        f"Error: {tmp_path / 'absent.csv'}: there is no"
+    )
+    without = command("sample", tmp_path / "absent.csv")
+    assert "No model is given; add --model MODEL.json" in without.err
+
+
+def test_an_identification_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(identify, "identify", lambda *_, **__: identification())
+    monkeypatch.chdir(tmp_path)
+    record = write(tmp_path / "a.csv", HEADER, *ROWS)
+    shown = command("identify", record, "--stack", "P-885.51")
+    assert shown.code == 0, shown.words
+    assert "95 % interval" in shown.out
+    assert "written" not in shown.out
+    assert max(map(len, shown.out.splitlines())) <= 80
+    assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
+
+
+@pytest.mark.parametrize("width", [1, 8, 20, 26, 30, 80])
+def test_a_table_has_the_width_that_there_is(width: int) -> None:
+    table = Table(("name", "what it is"), (("a_long_name", "it goes on and on and on"), ("b", "")))
+    lines = table.fitted(width).splitlines()
+    # a column has one character at least, and two spaces part it from the next
+    assert max(map(len, lines)) <= max(width, 4)
+    if width >= 20:  # the longest words are whole
+        words = (w for line in lines for w in line.split() if "--" not in w)
+        whole = " ".join((*table.head, *(cell for row in table.rows for cell in row)))
+        assert sorted(words) == sorted(whole.split())
+    if width == 80:
+        assert str(table).splitlines() == lines
+        assert lines[2] == "a_long_name  it goes on and on and on"
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_table_on_a_terminal_is_neither_cut_nor_too_wide(
+    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
+    monkeypatch.setenv("COLUMNS", "80")
+    show_table(effects_table(EFFECTS.values()))
+    lines = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    words = {word for line in lines for word in line.split()}
+    assert set(EFFECTS) <= words
+    assert {w for e in EFFECTS.values() for w in e.looks_like.split()} <= words
+
+
+def cases_of(text: str) -> dict[str, str | None]:
+    """Return each case of a file with its failure."""
+    failures = ((c.attrib["name"], c.find("failure")) for c in fromstring(text).iter("testcase"))
+    return {name: None if f is None else f.attrib["message"] for name, f in failures}
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str | Path]:
+    """The command on a record whose diagnosis is known: its cause is named, 0.5 % is left."""
+    known = diagnosis("cause_named")
+    known = replace(
+        known, extended_errors=replace(known.extended_errors, holdout_nrmse_percent=0.5)
+    )
+    monkeypatch.setattr(diagnose, "diagnose", lambda *_, **__: known)
+    return ["diagnose", write(tmp_path / "a.csv", HEADER, *ROWS), "--quiet"]
+
+
+@pytest.mark.parametrize(
+    ("options", "wrong"),
+    [
+        ((), ""),
+        (("--expect", "adequate,cause_named", "--max-error", "0.5%"), ""),
+        (("--expect", "Cause named", "--max-error", "1 %"), ""),
+        (
+            ("--expect", "adequate,unexplained"),
+            "The verdict is cause_named; expected adequate or unexplained.",
+        ),
+        (
+            ("--max-error", ".4%"),
+            "The extended model's held-out error is 0.500 % of the range; expected 0.4 % at most.",
+        ),
+    ],
+)
+def test_a_result_that_is_not_as_expected_ends_with_1(
+    asked: list[str | Path], options: tuple[str, ...], wrong: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "tests.xml"
+    result = command(*asked, *options, "--junit", file)
+    assert result.code == bool(wrong), result.words
+    assert result.out + result.err == (f"Not as expected: {wrong}\n" if wrong else "")
+    cases = cases_of(file.read_text(encoding="utf-8"))
+    assert list(cases) == ["verdict", "held-out error"]
+    assert [f for f in cases.values() if f] == [wrong] * bool(wrong)
+
+
+def test_the_checks_of_an_fmu_are_tests() -> None:
+    rows = (
+        CheckRow("calls", 0.0, 0.0, True, ""),
+        CheckRow("agreement", 3e-3, 1e-4, False, 'at "0.1 s" & <\x1b>'),
+        CheckRow("states", float("nan"), 0.0, False, "the check stopped"),
+    )
+    report = CheckReport(Path("a.fmu"), rows, compared=True)
+    text = junit_text("check", "a.fmu", check_cases(report), 1.0)
+    counts = 'name="psa check a.fmu" tests="3" failures="2" errors="0" time="1.000"'
+    case, failed = (
+        '    <testcase classname="psa.check.a.fmu"',
+        "found not finite, allowed 0: the check",
+    )
+    lines = text.splitlines()
+    assert lines[1:3] == [f"<testsuites {counts}>", f'  <testsuite {counts} skipped="0">']
+    assert lines[3:6] == [
+        f'{case} name="calls">',
+        "      <system-out>found 0, allowed 0</system-out>",
+        "    </testcase>",
+    ]
+    assert lines[10:13] == [
+        f'{case} name="states">',
+        f'      <failure message="{failed} stopped" type="failure">{failed} stopped</failure>',
+        f"      <system-out>{failed} stopped</system-out>",
+    ]
+    assert cases_of(text) == {
+        "calls": None,
+        "agreement": 'found 0.00300, allowed 1.00e-4: at "0.1 s" & <\ufffd>',
+        "states": "found not finite, allowed 0: the check stopped",
+    }
+
+
+SOURCE = Path(steps.__file__).parents[1]
+
+
+class Clock:
+    """A clock that stands where it is set."""
+
+    now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    found = Clock()
+    monkeypatch.setattr(steps, "clock", found)
+    return found
+
+
+def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
+    told = Told("diagnosing", DIAGNOSE)
+    assert told.line() == "diagnosing, 0 s (most take up to 40 s)"
+    clock.now = 7.4
+    told.tell("screening effects")
+    step = "diagnosing, step 3 of 6 (screening the effects)"
+    assert told.line() == f"{step}, 7 s (most take up to 40 s): screening effects"
+    clock.now = 130.0
+    told.tell("base fit from zero")  # parts of the work come again; the step does not go back
+    assert told.line() == f"{step}, 2 min (longer than most: 40 s): base fit from zero"
+    assert told.line(drawn=False) == told.line()
+    console = Console(width=200)
+    with console.capture() as shown:
+        console.print(told)
+    assert shown.get().strip() == told.line()
+
+
+def test_lines_that_stay_tell_once_what_is_usual(
+    clock: Clock, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with working("diagnosing", False, DIAGNOSE) as progress:
+        clock.now = 3.0
+        progress("screening effects")
+        clock.now = 41.0
+        progress("judging")
+    first, early, late = capsys.readouterr().err.splitlines()
+    assert first == "diagnosing (most take up to 40 s) ..."
+    assert early == "  diagnosing, step 3 of 6 (screening the effects), 3 s: screening effects"
+    assert "(longer than most: 40 s)" in late
+
+
+@pytest.mark.parametrize(
+    ("course", "rooms"),
+    [
+        (IDENTIFY, ["identification/**/*.py"]),
+        (DIAGNOSE, ["identification/search.py", "diagnosis/**/*.py"]),
+    ],
+)
+def test_what_is_told_belongs_to_a_step(course: Course, rooms: list[str]) -> None:
+    texts = [p.read_text("utf-8") for r in rooms for p in SOURCE.glob(r)]
+    found = {m for t in texts for m in re.findall(r'progress\(f?"([^"{]{3,})', t)}
+    assert len(found) > 5
+    unknown = {told for told in found if not course.step_of(told)}
+    assert not unknown
+
+
+def commands(own: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield a command of click, which some versions of typer hold in a room of their own."""
+    yield path, own
+    for name, inner in getattr(own, "commands", {}).items():
+        yield from commands(inner, *path, name)
+
+
+EVERY = dict(commands(typer.main.get_command(app)))
+
+
+def written(own: Any) -> list[str]:
+    """Return the texts of a command's help, with single spaces."""
+    shown = (p for p in own.params if not getattr(p, "hidden", False))
+    texts = [own.help, own.epilog, *(getattr(p, "help", None) for p in shown)]
+    return [" ".join(text.replace("\b", "").split()) for text in texts if text]
+
+
+@pytest.mark.parametrize("path", EVERY, ids=" ".join)
+def test_the_help_shows_its_texts_whole_in_80_columns(path: tuple[str, ...]) -> None:
+    shown = CliRunner().invoke(app, [*path, "--help"], env={"COLUMNS": "80"}).output
+    joined = " ".join(shown.split())
+    assert "\\" not in shown
+    assert [text for text in written(EVERY[path]) if text not in joined] == []
+    assert [p.name for p in EVERY[path].params if not getattr(p, "help", "")] == []
+    lines = [line.strip() for line in shown.splitlines()]
+    if not hasattr(EVERY[path], "commands"):
+        (example,) = (line for line in lines if line.startswith("Example: "))
+        assert example.startswith(f"Example: psa {' '.join(path)} ")
+        assert f"\b\n{example}" == EVERY[path].epilog
+    assert [line for line in lines if len(line) > 78 and "Example: " not in line] == []
+    assert [line for line in lines if line.endswith("...") and "Usage: " not in line] == []
+
+
+@pytest.mark.parametrize(
+    ("line", "names"),
+    [
+        ("psa stacks ", psa.STACKS),
+        ("psa simulate --stack P", ["P-885.51", "PTBS200"]),
+        ("psa effects slow", ["slow_creep"]),
+        ("psa diagnose a.csv --leave-out ", psa.EFFECTS),
+        ("psa design experiment --separate sensor_r", ["sensor_ripple"]),
+        ("psa export fmu --part ", psa.PARTS),
+        (
+            "psa datasets steering_mirror_",
+            [n for n in DATASETS if n.startswith("steering_mirror_")],
+        ),
+        ("psa examples use_in_", [n for n in examples() if n.startswith("use_in_")]),
+        ("psa diagnose a.csv --expect adequate,cau", ["adequate,cause_named"]),
+    ],
+)
+def test_a_shell_completes_the_names_that_there_are(line: str, names: Any) -> None:
+    asked = {"_PSA_COMPLETE": "complete_bash", "COMP_WORDS": line}
+    shown = subprocess.run(
+        [sys.executable, "-m", "psa_casadi.cli"],
+        env=os.environ | asked | {"COMP_CWORD": str(len(line.split(" ")) - 1)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert set(shown.stdout.split()) == set(names)

@@ -14,23 +14,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
-from psa_casadi.effects import EFFECTS
 from psa_casadi.export.importer import masters
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import identify
 from psa_casadi.interruption import interruptible_work
-from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import load_model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record, write_record
 from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
-from psa_casadi.simulation.simulate import input_samples, simulate
-from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.units import FloatArray
 from tests.report.report_cases import diagnosis
 from tests.studies.plants.make import make_record
@@ -38,7 +32,7 @@ from tests.tiers import slow
 
 TIME: FloatArray = np.arange(600, dtype=float) * 5e-3
 VOLTAGE = 50.0 - 50.0 * np.cos(4 * np.pi * TIME)
-TABLE = [EFFECTS["slow_creep"], EFFECTS["offset_drift"]]
+TABLE = [psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]]
 
 
 @pytest.fixture(autouse=True)
@@ -48,12 +42,12 @@ def _threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def record() -> Record:
+def record() -> psa.Record:
     """A stack with a drift that the base does not have."""
-    y = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
+    y = psa.simulate(psa.stack_model("P-885.51"), TIME, VOLTAGE).displacement
     noise = 3e-9 * np.random.default_rng(2).standard_normal(TIME.size)
     drifting = y + noise + 2e-7 * (TIME / TIME[-1]) ** 2
-    return Record(name="drifting", time=TIME, voltage=VOLTAGE, displacement=drifting)
+    return psa.Record(name="drifting", time=TIME, voltage=VOLTAGE, displacement=drifting)
 
 
 def at(word: str) -> Callable[[str], None]:
@@ -70,8 +64,8 @@ def cut(*given: object, **options: object) -> None:
     raise KeyboardInterrupt
 
 
-WAYS: dict[str, Callable[[Model, FloatArray, FloatArray, FloatArray], object]] = {
-    "stepper": lambda model, t, u, x0: run(model, t, u, x0, rtol=1e-9),
+WAYS: dict[str, Callable[[psa.Model, FloatArray, FloatArray, FloatArray], object]] = {
+    "stepper": lambda model, t, u, x0: psa.run(model, t, u, x0, rtol=1e-9),
     "exact": lambda model, t, u, x0: run_exact(
         model, t, u, x0, tolerance=1e-12, coarsest=9, outputs=("measured_displacement",)
     ),
@@ -80,7 +74,7 @@ WAYS: dict[str, Callable[[Model, FloatArray, FloatArray, FloatArray], object]] =
 
 @pytest.mark.parametrize("way", WAYS)
 def test_another_thread_ends_a_long_run_in_c(way: str) -> None:
-    model, n = stack_model("P-885.51"), 400_000
+    model, n = psa.stack_model("P-885.51"), 400_000
     t: FloatArray = np.arange(n, dtype=float) * 1e-4
     u = input_samples(model, n, {"voltage": 50.0 - 50.0 * np.cos(300.0 * t)})
     x0 = np.zeros(len(model.state_names))
@@ -94,31 +88,33 @@ def test_another_thread_ends_a_long_run_in_c(way: str) -> None:
 
 def test_an_interrupt_ends_the_other_threads_too() -> None:
     """The one who waits has the interrupt; the other would go on simulating for minutes."""
-    model = stack_model("P-885.51")
+    model = psa.stack_model("P-885.51")
 
     def work(item: int) -> None:
         if item == 0:
             raise KeyboardInterrupt
         while True:
-            simulate(model, TIME, VOLTAGE)
+            psa.simulate(model, TIME, VOLTAGE)
 
     with pytest.raises(KeyboardInterrupt):
         side_by_side(work, [0, 1])
 
 
 @pytest.mark.parametrize(("word", "effects"), [("screening effects", 0), ("judging", 1)])
-def test_a_diagnosis_keeps_the_best_model_so_far(word: str, effects: int, record: Record) -> None:
+def test_a_diagnosis_keeps_the_best_model_so_far(
+    word: str, effects: int, record: psa.Record
+) -> None:
     with pytest.raises(DiagnosisInterrupted) as stop:
         diagnose([record], effects=TABLE, progress=at(word))
     model = stop.value.model
     assert model.provenance.interrupted
     assert len(model.effects) == effects
-    error = simulate(model, TIME, VOLTAGE).displacement - measured(record)
+    error = psa.simulate(model, TIME, VOLTAGE).displacement - measured(record)
     assert np.std(error) < 0.1 * record.range_m
     assert ("not judged" in str(stop.value)) == bool(effects)
 
 
-def test_the_base_fit_is_not_swallowed(record: Record) -> None:
+def test_the_base_fit_is_not_swallowed(record: psa.Record) -> None:
     with pytest.raises(KeyboardInterrupt) as stop:
         diagnose([record], effects=TABLE, progress=at("base fit from"))
     assert not isinstance(stop.value, DiagnosisInterrupted)  # nothing was fitted yet
@@ -129,7 +125,7 @@ def test_the_base_fit_is_not_swallowed(record: Record) -> None:
 @pytest.mark.parametrize(
     ("word", "search"), [("to the end", True), ("what further records", False)]
 )
-def test_an_identification_keeps_its_fit(word: str, search: bool, record: Record) -> None:
+def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Record) -> None:
     found = identify([record], progress=at(word))
     assert found.interrupted
     assert found.fit.interrupted == found.model.provenance.interrupted == search
@@ -148,7 +144,7 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: Record
     ],
 )
 def test_a_command_says_what_it_kept(
-    command: str, word: str, told: str, record: Record, tmp_path: Path,
+    command: str, word: str, told: str, record: psa.Record, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     for home in ("diagnose", "identify"):
@@ -158,7 +154,7 @@ def test_a_command_says_what_it_kept(
         finished = diagnosis("cause_named")
         module = sys.modules["psa_casadi.diagnosis.diagnose"]
         monkeypatch.setattr(module, "diagnose", lambda *given, **options: finished)
-    write_record(tmp_path / "r.csv", record)
+    psa.write_record(tmp_path / "r.csv", record)
     m, j, r = (tmp_path / n for n in ("m.json", "d.json", "r.html"))
     given = [command, str(tmp_path / "r.csv"), "-o", str(m), "--report", str(r), "--still"]
     if command == "diagnose":
@@ -170,7 +166,7 @@ def test_a_command_says_what_it_kept(
     assert not r.exists()
     if m.exists():
         cut = "finished" not in told
-        assert load_model(m).provenance.interrupted == cut
+        assert psa.load_model(m).provenance.interrupted == cut
 
 
 def test_a_solver_does_not_take_an_interrupt_for_its_own_failure() -> None:
@@ -178,7 +174,7 @@ def test_a_solver_does_not_take_an_interrupt_for_its_own_failure() -> None:
     with interruptible_work() as work:
         work.stop()
         with pytest.raises(KeyboardInterrupt):
-            design_mechanism(stack_model("PTBS200"), damping=0.7, starts=2)
+            psa.design_mechanism(psa.stack_model("PTBS200"), damping=0.7, starts=2)
 
 
 def test_a_designed_voltage_is_kept_without_its_check(
@@ -187,7 +183,7 @@ def test_a_designed_voltage_is_kept_without_its_check(
     monkeypatch.setattr(masters, "played_on_fmu", cut)
     time = np.arange(40) * 1e-3
     path = {"time [s]": time, "displacement [um]": 5.0 - 5.0 * np.cos(150.0 * time)}
-    write_record(tmp_path / "path.csv", path)
+    psa.write_record(tmp_path / "path.csv", path)
     voltage = tmp_path / "v.csv"
     given = ["design", "input", "--fast", "--stack", "P-885.51", "-o", str(voltage)]
     ended = CliRunner().invoke(app, [*given, "--target", str(tmp_path / "path.csv")])
@@ -197,10 +193,10 @@ def test_a_designed_voltage_is_kept_without_its_check(
 
 
 def test_files_that_stand_are_named_however_late_the_interrupt(
-    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    record: psa.Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.modules["psa_casadi.cli.simulate"], "tell_written", cut)
-    write_record(tmp_path / "r.csv", record)
+    psa.write_record(tmp_path / "r.csv", record)
     out = tmp_path / "out.csv"
     given = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]
     ended = CliRunner().invoke(app, given)

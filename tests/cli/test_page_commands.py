@@ -8,7 +8,7 @@ from typer.main import get_command
 
 from build_scripts import copied_pages
 from build_scripts.measured_data import ROOT
-from build_scripts.page_commands import Block, blocks_of, find_blocks, pages, run_blocks
+from build_scripts.page_commands import blocks_of, find_blocks, pages, run_blocks
 from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 
@@ -48,15 +48,6 @@ IN_TESTS = ["README.md", "docs/fmu.md", "docs/howto/own_model.md"]
 
 def run_text(text: str) -> list[str]:
     return run_blocks(find_blocks(text))
-
-
-def test_blocks_and_their_marks_are_found() -> None:
-    first, second, third = find_blocks(TEXT)
-    assert first == Block(6, ("exit 7",), frozenset({"skip"}))
-    assert second.marks == set()
-    assert len(second.commands) == 3
-    assert second.commands[1] == "echo one > file; \\\n  echo two >> file"
-    assert third.marks == {"continue"}
 
 
 def test_commands_run_in_an_empty_directory_that_the_next_block_may_share() -> None:
@@ -196,5 +187,8 @@ def test_links_to_recipes_and_notebooks_lead_to_their_pages_in_the_site() -> Non
     assert recipes <= set(copied_pages.RECIPES)
 
 
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+def test_the_readme_is_short_and_its_badges_are_of_workflows() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    badges = set(re.findall(r"\.\./\.\./actions/workflows/([\w.]+)/badge\.svg", text))
+    assert badges <= {path.name for path in (ROOT / ".github" / "workflows").iterdir()}

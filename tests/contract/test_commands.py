@@ -62,23 +62,43 @@ def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
     [
         (("identfy",), "identfy"),
         (("simulate", "--stack", "demo"), "--input"),
+        (("simulate", "--input", "{demo}", "-o", "{out}"), "No model is given; add --model"),
+        (("simulate", "--stack", "p885", "--input", "{demo}", "-o", "{out}"), "mean P-885.51?"),
+        (("simulate", "--model", "{bytes}", "--input", "x", "-o", "{out}"), "it is no text in"),
         (("diagnose",), "records"),
         (("identify", "{bytes}", "--method", "best"), "--method"),
         (("identify", "{absent}", "-o", "{out}"), "there is no such file"),
         (("compare", "{absent}", "b.json"), "absent.csv: cannot be read"),
         (("export", "fmu", "--stack", "P-1", "-o", "{out}"), "P-1"),
+        (("export", "fmu", "--stack", "xyzzy", "-o", "{out}"), "there are PTBS200, WYDS0808020"),
+        (("export", "fmu", "--stack", "demo", "--model", "m", "-o", "{out}"), "are both given"),
         (("export", "fmu", "--stack", "demo", "-o", "{out}", "--platforms", "vax"), "'vax'"),
         (("export", "fmu", "--stack", "demo", "-o", "{out}", "--name", "1st"), "'1st' cannot"),
         (("export", "fmu", "--stack", "demo", "-o", "{out}", "--fmi", "7"), "--fmi"),
         (("export", "fmu", "--stack", "demo", "-o", "{folder}/no/x.fmu"), "create it first"),
+        (("export", "ssp", "--model", "m", "--stack", "demo", "-o", "{out}"), "both given"),
+        (("export", "ssp", "--stack", "P-885.51", "--platforms", "vax", "-o", "{out}"), "vax"),
+        (("export", "ssp", "--stack", "P-1", "-o", "{folder}/no/x.ssp", "--picture", "w.gif"),
+         "3 problems"),
         (("export", "c", "--stack", "demo", "--step", "10", "-o", "{folder}/code"), "unit"),
+        (("export", "c", "--step", "10us", "--stack", "demo", "-o", "{bytes}"), "a file of"),
+        (("examples", "ci", "-o", "{bytes}"), "cannot be created, there is a file of that"),
+        (("datasets", "micromanipulator", "-o", "{bytes}"), "bytes: cannot be created"),
         (("check", "{bytes}"), "cannot be read as an FMU"),
+        (("check", "{bytes}", "--timeout", "inf"), "'--timeout'"),
         (("check", "{folder}"), "is a directory"),
         (("diagnose", "{demo}", "--expect", "adquate"), "'adequate'"),
         (("diagnose", "{demo}", "--max-error", "much"), "0.5%"),
         (("diagnose", "{demo}", "-o", "{out}", "--json", "{out}"), "both"),
         (("identify", "{demo}", "--method", "paper", "--model", "{absent}"), "absent.csv"),
+        (("identify", "{good}", "-o", "{good}"), "would overwrite an input"),
         (("design", "mechanism", "--stack", "demo", "--damping", "2", "-o", "{out}"), "2"),
+        (("design", "mechanism", "--stack", "PTBS200", "--poles", "fast", "-o",
+          "{folder}/no/m.json", "--max-stroke-loss", "much"), "3 problems with what was given"),
+        (("design", "mechanism", "--stack", "demo", "--damping", "0.5", "--max-force", "inf",
+          "-o", "{out}"), "The largest force is inf N; give a positive one"),
+        (("design", "experiment", "--stack", "demo", "--duration", "1", "--samples", "0",
+          "-o", "{out}"), "0 samples hold no experiment"),
         (("effects", "xyzzy"), "current_limit"),
         (("stacks", "P-885"), "P-885.51"),
         (("datasets", "micro"), "micromanipulator"),
@@ -88,11 +108,14 @@ def test_what_cannot_be_used_is_told_with_exit_code_2(
     words: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
     (tmp_path / "bytes").write_bytes(bytes(range(256)))
+    (tmp_path / "good").write_bytes((DATA / "demo.csv").read_bytes())
     places = {
         "folder": tmp_path, "out": tmp_path / "out", "bytes": tmp_path / "bytes",
-        "absent": tmp_path / "absent.csv", "demo": DATA / "demo.csv",
+        "absent": tmp_path / "absent.csv", "demo": DATA / "demo.csv", "good": tmp_path / "good",
     }  # fmt: skip
-    assert said in refused(*(w.format(**places) for w in words), folder=tmp_path)
+    told = refused(*(w.format(**places) for w in words), folder=tmp_path)
+    assert said in told
+    assert "Errno" not in told
 
 
 def test_a_message_is_one_sentence_on_stderr_of_a_process_of_its_own(tmp_path: Path) -> None:
@@ -218,12 +241,18 @@ def asked(
 @posix
 def test_the_page_that_diagnoses_answers_to_who_has_its_address_alone(tmp_path: Path) -> None:
     with served(tmp_path) as (place, token):
-        for path in ("/", "/state", "/?token=guess"):
+        guess = f"psa_{place.partition(':')[2]}=guess"
+        for path in ("/", "/state", "/report", "/?token=", "/?token=guess", "/files/report.html"):
             assert asked(place, "GET", path)[0] == 403
+        assert asked(place, "POST", "/start")[0] == 403
+        assert asked(place, "GET", "/", Cookie=guess)[0] == 403
         assert asked(place, "GET", f"/?token={token}", Host="psa.example")[0] in (400, 403, 421)
         status, headers, page = asked(place, "GET", f"/?token={token}")
         assert status == 200
-        assert "default-src 'none'" in headers["content-security-policy"]
+        policy = headers["content-security-policy"]
+        assert {"default-src 'none'", "frame-ancestors 'none'"} <= {*policy.split("; ")}
+        assert "unsafe" not in policy
+        assert b"http" not in page.replace(b"http://www.w3.org/2000/svg", b"")
         assert "httponly" in headers["set-cookie"].lower()
         assert token.encode() not in page
         cookie, origin = headers["set-cookie"].split(";")[0], f"http://{place}"

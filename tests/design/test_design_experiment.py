@@ -1,12 +1,18 @@
 """Designed experiments: within their limits, with right gradients, and better than a sine."""
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.cli import diagnose as command
+from psa_casadi.cli import diagnosis_files as files
+from psa_casadi.design.experiment import experiment
 from psa_casadi.design.experiment.criteria import (
     Criterion,
     Information,
@@ -14,25 +20,29 @@ from psa_casadi.design.experiment.criteria import (
     Rival,
     SensorNoise,
     Separation,
+    noise_of_fit,
+    rival_of_fit,
     rival_of_model,
 )
 from psa_casadi.design.experiment.experiment import (
+    Separated,
     informative_experiment,
     naming_probability,
     plays_of,
+    resolving_experiment,
     rival_of_effect,
     separating_experiment,
     usual_records,
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, draw, excess, rest_of
 from psa_casadi.design.experiment.search import Effort
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record
+from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.units import FloatArray
+from tests.contract.helpers import done, refused
+from tests.studies.plants.again import play_again
+from tests.studies.plants.make import make_record
+from tests.tiers import slow
 
 STACK = "P-885.51"
 FREE = ("k_L", "A", "delta", "tau", "R_s")
@@ -44,26 +54,26 @@ BRIEF = Effort(draws=2, starts=1, steps=3)
 def rivals(share: float = 0.2, bent: str = "sensor_nonlinearity") -> list[Rival]:
     """A bent sensor (or another effect) and creep, each of a share of its ordinary size."""
     found = []
-    for effect in (EFFECTS[n] for n in (bent, "slow_creep")):
-        model = stack_model(STACK).with_effect(effect)
+    for effect in (psa.EFFECTS[n] for n in (bent, "slow_creep")):
+        model = psa.stack_model(STACK).with_effect(effect)
         size = share * model.parameter(effect.gain or "").typical(model.values)
         found.append(rival_of_effect(model.with_values({effect.gain or "": size}), effect, FREE))
     return found
 
 
-def planned(kind: Kind, limits: Limits = LIMITS, seed: int = 3) -> Record:
+def planned(kind: Kind, limits: Limits = LIMITS, seed: int = 3) -> psa.Record:
     wave = draw(kind, limits, limits.steepest(None), np.random.default_rng(seed))
     time = limits.grid()
-    return Record(name=kind, time=time, voltage=wave.voltage(wave.start, time))
+    return psa.Record(name=kind, time=time, voltage=wave.voltage(wave.start, time))
 
 
 def test_all_that_is_wrong_with_limits_is_said_at_once() -> None:
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(psa.InputError) as caught:
         Limits(5.0, 5.0, -1.0, 3, rate=0.0)
     assert len(caught.value.problems) == 4
-    with pytest.raises(InputError, match="no whole cycle"):
+    with pytest.raises(psa.InputError, match="no whole cycle"):
         Limits(0.0, 100.0, 1.0, 100, bandwidth=0.5)
-    with pytest.raises(InputError, match="cannot be shown"):
+    with pytest.raises(psa.InputError, match="cannot be shown"):
         Limits(0.0, 100.0, 1.0, 100, bandwidth=80.0)
 
 
@@ -77,12 +87,12 @@ def test_voltages_keep_every_limit(kind: Kind, seed: int) -> None:
     rng = np.random.default_rng(seed)
     wave, time = draw(kind, limits, steepest, rng), limits.grid()
     voltage = wave.voltage(wave.start, time)
-    assert excess(Record(name=kind, time=time, voltage=voltage), limits, capacitance) == ()
+    assert excess(psa.Record(name=kind, time=time, voltage=voltage), limits, capacitance) == ()
     np.testing.assert_allclose(voltage[time <= rest_of(limits)], limits.low, atol=1e-9)
     assert np.ptp(voltage) > 0.1 * limits.span
     assert np.all(wave.slack(wave.start) >= -1e-9)
     quiet = Limits(-20.0, 100.0, 2.0, 1000, rate=1e2)
-    assert excess(Record(name=kind, time=time, voltage=voltage), quiet, None) != ()
+    assert excess(psa.Record(name=kind, time=time, voltage=voltage), quiet, None) != ()
     tones = np.abs(np.fft.rfft((voltage - voltage.mean()) * np.hanning(len(time)))) ** 2
     above = np.fft.rfftfreq(len(time), time[1]) > 4.0 * limits.band
     assert tones[above].sum() < 0.02 * tones.sum()
@@ -111,8 +121,8 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
         way[len(way) // 2 :] = 0.0
     p = np.clip(wave.start, wave.lower + 0.02, wave.upper - 0.02)
 
-    def at(share: float) -> Record:
-        return Record(name=kind, time=time, voltage=wave.voltage(p + share * way, time))
+    def at(share: float) -> psa.Record:
+        return psa.Record(name=kind, time=time, voltage=wave.voltage(p + share * way, time))
 
     frozen = criterion.at(at(0.0)).frozen
     told = (frozen(at(step)) - frozen(at(-step))) / (2.0 * step)
@@ -123,7 +133,7 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
 def test_standard_errors_are_those_of_the_papers_equations_in_plain_numpy() -> None:
     """Differences of the independent reference give the same covariance as exact sensitivities."""
     names, limits = ("k_L", "A", "delta"), Limits(0.0, 100.0, 1.0, 60)
-    model, record = stack_model(STACK), planned("triangles", limits)
+    model, record = psa.stack_model(STACK), planned("triangles", limits)
     rival = rival_of_model("base", model, names)
     criterion = Information(rival, names, "D", NOISE.on_grid(limits, limits.samples))
     told = criterion.standard_errors(record)
@@ -136,7 +146,7 @@ def test_standard_errors_are_those_of_the_papers_equations_in_plain_numpy() -> N
     np.testing.assert_allclose([told[n] for n in names], seen[: len(names)], rtol=0.02)
 
 
-def _slope(model: Model, record: Record, name: str, step: float) -> FloatArray:
+def _slope(model: psa.Model, record: psa.Record, name: str, step: float) -> FloatArray:
     def at(change: float) -> FloatArray:
         values = {**model.values}
         force = 0.0
@@ -190,7 +200,7 @@ def test_naming_is_as_sure_as_the_evidence_says() -> None:
 
 
 def test_coloured_noise_tells_less_of_slow_voltages() -> None:
-    rival = rival_of_model("base", stack_model(STACK), FREE)
+    rival = rival_of_model("base", psa.stack_model(STACK), FREE)
     record = planned("triangles")
     errors = []
     for correlation in (0.0, 0.8):
@@ -210,7 +220,7 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
     assert "plays" not in " ".join(sentences(told, None))
     assert "3 runs, each from rest" in " ".join(sentences(replace(told, plays=3), None))
     assert "look alike" in " ".join(sentences(replace(told, plays=None), None))
-    rival = rival_of_model("base", stack_model(STACK), FREE)
+    rival = rival_of_model("base", psa.stack_model(STACK), FREE)
     sharp = informative_experiment(rival, NOISE, limits, optimality="A", kinds=kinds, effort=BRIEF)
     assert excess(sharp.record, limits, None) == ()
     assert min(sharp.factor.values()) > 1.1
@@ -241,6 +251,143 @@ def test_the_usual_voltages_slow_down_where_the_rate_asks() -> None:
 
 
 def test_a_parameter_that_is_not_free_is_named() -> None:
-    rival = rival_of_model("base", stack_model(STACK), FREE)
-    with pytest.raises(InputError, match="stiffnes"):
+    rival = rival_of_model("base", psa.stack_model(STACK), FREE)
+    with pytest.raises(psa.InputError, match="stiffnes"):
         Information(rival, ("stiffnes",), "D", NOISE.on_grid(LIMITS, 200))
+
+
+@slow
+def test_the_command_fits_the_rivals_to_the_records_at_hand(tmp_path: Path) -> None:
+    effect = psa.EFFECTS["sensor_nonlinearity"]
+    model = psa.stack_model(STACK).with_effect(effect)
+    gain = effect.gain or ""
+    model = model.with_values({gain: 0.3 * model.parameter(gain).typical(model.values)})
+    plan = usual_records(Limits(0.0, 70.0, 0.8, 80), np.inf)["triangle"]
+    read = psa.simulate(model, plan.time, plan.voltage).outputs["displacement"]
+    read = read + 5e-9 * np.random.default_rng(2).standard_normal(plan.n)
+    measured, output = tmp_path / "measured.csv", tmp_path / "voltage.csv"
+    psa.write_record(
+        measured,
+        {"time [s]": plan.time, "voltage [V]": plan.voltage, "displacement [um]": 1e6 * read},
+    )
+    done(
+        "design", "experiment", "--stack", STACK, "--record", measured, "--family", "steps",
+        "--starts", "1", "--separate", "sensor_nonlinearity", "slow_creep", "-o", output,
+    )  # fmt: skip
+    record = psa.read_record(output, need_displacement=False)
+    assert (record.n, record.time[-1]) == (plan.n, pytest.approx(plan.time[-1]))
+    assert plan.voltage.min() - 1e-9 <= record.voltage.min()
+    assert record.voltage.max() <= plan.voltage.max() + 1e-9
+
+
+def test_the_command_tells_all_mistakes_at_once(tmp_path: Path) -> None:
+    told = refused(
+        "design", "experiment", "--separate", "creeping", "--noise", "-1", "--starts", "0",
+        "-o", tmp_path / "no" / "where.csv",
+    )  # fmt: skip
+    for part in ("creeping", "--noise", "--starts", "does not exist", "No model is given"):
+        assert part in told
+
+
+#: The loop from record to name is run once: with pytest-xdist by one process.
+pytestmark = pytest.mark.xdist_group("next-experiment")
+
+#: A gain that bends with the field, hidden in a triangle, where a bent sensor looks the same.
+HIDDEN, RIVAL, SEED = "field_dependent_gain", "sensor_nonlinearity", 7003
+SAMPLES = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    first: psa.Record
+    ambiguous: psa.Diagnosis
+    design: Separated
+    named: psa.Diagnosis
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory: pytest.TempPathFactory) -> Loop:
+    folder = tmp_path_factory.mktemp("loop")
+    effects = [psa.EFFECTS[HIDDEN], psa.EFFECTS[RIVAL]]
+    path = folder / "first.csv"
+    truth = make_record(HIDDEN, SEED, path, excitation="triangle", visible=(0.3, 2.0))
+    first = psa.read_record(path).slice(0, SAMPLES)
+    ambiguous = diagnose([first], effects=effects)
+    design = resolving_experiment(ambiguous, effort=Effort(draws=3, starts=1, steps=3))
+    played = folder / "next.csv"
+    play_again(truth, SEED, played, (design.record.time, design.record.voltage))
+    named = diagnose([first, psa.read_record(played)], effects=effects)
+    return Loop(first, ambiguous, design, named)
+
+
+@slow
+def test_the_first_record_leaves_two_causes_open(loop: Loop) -> None:
+    d = loop.ambiguous
+    assert d.verdict == "ambiguous"
+    assert {c.effect for c in d.contenders} == {HIDDEN, RIVAL}
+    assert set(d.next_experiment.separates) == {HIDDEN, RIVAL}
+    known = {c.effect: c.evidence for c in d.candidates}
+    for contender in d.contenders:
+        assert contender.evidence == pytest.approx(known[contender.effect])
+        assert contender.effect in {c.name for c in contender.fit.model.effects}
+
+
+@slow
+def test_a_rival_that_is_the_truth_has_a_standard_error_less_of_its_effect(loop: Loop) -> None:
+    d = loop.ambiguous
+    best = min(d.contenders, key=lambda c: c.fit.rms).fit
+    _, colour = noise_of_fit(best, d.experiments)
+    for contender in d.contenders:
+        rival = rival_of_fit(contender.effect, contender.fit, colour)
+        gain = psa.EFFECTS[contender.effect].gain or ""
+        model, start = rival.moved(rival.truth)
+        fitted = rival.model.values[gain]
+        assert 0.2 < model.values[gain] / fitted < 1.0
+        assert not any(start.values())
+        assert rival.less is not None
+        # as likely as the data at hand make one standard error
+        assert 0.0 < rival.less @ rival.known @ rival.less < 1.001
+    base = rival_of_fit("base", d.base_fit, colour)
+    assert not np.any(base.truth)
+
+
+@slow
+def test_the_designed_record_is_like_the_first_and_tells_more_than_a_sine(loop: Loop) -> None:
+    design, first = loop.design, loop.first
+    assert design.record.n == first.n
+    assert design.record.sample_time == pytest.approx(first.sample_time)
+    assert excess(design.record, design.limits, None) == ()
+    assert design.record.voltage.min() >= first.voltage.min() - 1e-9
+    assert design.record.voltage.max() <= first.voltage.max() + 1e-9
+    assert design.factor("sine") > 2.0
+    assert design.factor("triangle") > 2.0
+    assert min(design.chance.values()) > 0.9
+
+
+@slow
+def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
+    d = loop.named
+    assert d.verdict in ("cause_named", "partly_explained")
+    assert d.causes[0].effect == HIDDEN
+    assert d.causes[0].cannot_be_told_from == ()
+    with pytest.raises(psa.InputError, match="nothing to tell apart"):
+        resolving_experiment(d)
+
+
+@slow
+def test_the_command_writes_the_record_and_says_so(
+    loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The design itself is the one above: here only what becomes of it."""
+    monkeypatch.setattr(experiment, "resolving_experiment", lambda d, **_: loop.design)
+    path = command._beside(tmp_path / "diagnosis.json")
+    assert path == tmp_path / "diagnosis_next.csv"
+    d = files.with_next(loop.ambiguous, path, lambda _: None)
+    said = json.loads(d.to_json())["next_experiment"]
+    assert said["voltage_csv"] == str(path)
+    assert set(said["separates"]) == set(said["chance"]) == {HIDDEN, RIVAL}
+    assert str(path) in " ".join(psa.story(d, width=400).split())
+    record = psa.read_record(path, need_displacement=False)
+    np.testing.assert_array_equal(record.voltage, loop.design.record.voltage)
+    assert files.with_next(loop.named, path, lambda _: None) is loop.named
+    assert files.with_next(loop.ambiguous, None, lambda _: None) is loop.ambiguous

@@ -8,10 +8,8 @@ import casadi as ca
 import fmpy
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.design.tracking.inversion import correct, invert
 from psa_casadi.design.tracking.minimum_time import quickest_move
 from psa_casadi.design.tracking.targets import (
@@ -31,6 +29,7 @@ from psa_casadi.design.tracking.tracking import (
     track,
 )
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
+from tests.contract.helpers import done, refused
 from tests.export.fmu_models import exported
 from tests.studies.benchmarks.design_tracking import (
     LIMITS,
@@ -164,21 +163,16 @@ def test_the_command_writes_voltage_and_page(tmp_path: Path) -> None:
     )
     arguments = ["design", "input", "--model", str(tmp_path / "m.json"), "-o", str(out)]
     more = ["--target", str(tmp_path / "p.csv"), "--report", str(tmp_path / "r.html"), "--still"]
-    found = CliRunner().invoke(app, [*arguments, *more])
-    assert found.exit_code == 0, found.output
-    rows = [line for line in found.output.splitlines() if line.startswith("designed")]
+    found = done(*arguments, *more)
+    rows = [line for line in found.out.splitlines() if line.startswith("designed")]
     simulated, fmu = (float(row.split()[-2]) for row in rows[:2])
     assert fmu == pytest.approx(simulated, rel=0.02)
     record = psa.read_record(out)
     assert on_reference(record.voltage) < 0.1
     assert "Limits and margins" in (tmp_path / "r.html").read_text(encoding="utf-8")
-    wrong = CliRunner().invoke(app, [*arguments, "--fast", "--minimax"])
-    assert wrong.exit_code == 2
-    cut = CliRunner().invoke(
-        app, [*arguments, *more, "--fast", "--max-voltage", "50", "--no-check-fmu"]
-    )
-    assert cut.exit_code == 0, cut.output
-    assert "The highest voltage, 50 V, is reached from" in cut.output
+    refused(*arguments, "--fast", "--minimax")
+    cut = done(*arguments, *more, "--fast", "--max-voltage", "50", "--no-check-fmu").words
+    assert "The highest voltage, 50 V, is reached from" in cut
     assert "Inverted input" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
@@ -226,15 +220,12 @@ def test_a_measured_trial_corrects_the_voltage(tmp_path: Path) -> None:
     psa.write_record(folder / "t.csv", {"time [s]": path.time, **measured})
     words = ["design", "input", "--model", str(folder / "m.json"), "-o", str(folder / "c.csv")]
     words += ["--target", str(folder / "p.csv"), "--measured", str(folder / "t.csv")]
-    found = CliRunner().invoke(app, [*words, "--report", str(folder / "c.html"), "--still"])
-    assert found.exit_code == 0, found.output
+    done(*words, "--report", folder / "c.html", "--still")
     again = creeping_displacement(values, path.time, psa.read_record(folder / "c.csv").voltage)
     assert error_of(path, again).rms < 0.5 * error_of(path, shown).rms
     assert "played in the trial" in (folder / "c.html").read_text(encoding="utf-8")
     psa.write_record(folder / "t.csv", {"time [s]": 0.1 * path.time, **measured})
-    short = CliRunner().invoke(app, words)
-    assert short.exit_code == 2
-    assert "record the whole path" in short.output
+    assert "record the whole path" in refused(*words)
 
 
 @slow

@@ -15,24 +15,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi import children
-from psa_casadi.cli.app import app
 from psa_casadi.devices import device, executors
-from psa_casadi.devices.batch import batch
 from psa_casadi.devices.executors import Processes, outcomes
-from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options, jobs_given
-from psa_casadi.errors import InputError, MachineError
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, jobs_given
 from psa_casadi.interruption import raise_if_stopped
-from psa_casadi.model.model_file import load_model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import write_record
 from psa_casadi.report.documents.files import identification_file
-from psa_casadi.report.documents.findings import read_findings
 from psa_casadi.simulation.side_by_side import threads
-from psa_casadi.simulation.simulate import simulate
 from psa_casadi.strict_json import json_text
+from tests.contract.helpers import command
 from tests.report.report_cases import identification
 from tests.tiers import slow
 
@@ -42,10 +35,10 @@ VOLTAGE = (50.0 - 50.0 * np.cos(4 * np.pi * TIME)) * np.exp(-0.2 * TIME)
 
 def write_device(path: Path, force: float = 1.0, seed: int = 1) -> None:
     """Write the record of a stack whose force per volt has a factor."""
-    model = stack_model("P-885.51")
-    y = simulate(model.with_values({"k_L": force * model.values["k_L"]}), TIME, VOLTAGE)
+    model = psa.stack_model("P-885.51")
+    y = psa.simulate(model.with_values({"k_L": force * model.values["k_L"]}), TIME, VOLTAGE)
     noise = 3e-9 * np.random.default_rng(seed).standard_normal(TIME.size)
-    write_record(
+    psa.write_record(
         path,
         {"time [s]": TIME, "voltage [V]": VOLTAGE, "displacement [m]": y.displacement + noise},
     )
@@ -84,7 +77,7 @@ def stand_in(
 def tasks(folder: Path, count: int) -> list[DeviceTask]:
     path = folder / "r.csv"
     path.touch()
-    return [DeviceTask(Job(f"d{k}", (str(path),)), Options(), "run") for k in range(count)]
+    return [DeviceTask(psa.Job(f"d{k}", (str(path),)), psa.Options(), "run") for k in range(count)]
 
 
 def test_few_are_submitted_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +111,7 @@ def test_every_device_has_one_thread_and_its_failure_is_its_result(
         if task.job.device == "d1":
             raise ZeroDivisionError("by hand")
         if task.job.device == "d2":
-            raise InputError(["one", "two"])
+            raise psa.InputError(["one", "two"])
 
     stand_in(monkeypatch, work)
     with ThreadPoolExecutor(2) as pool:
@@ -155,12 +148,12 @@ def test_an_interrupt_ends_the_threads_and_says_what_is_kept(
 
     out = tmp_path / "out"
     with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt, match="1 of 8 devices"):
-        batch(jobs, out, executor=pool, at_once=3, progress=progress)
+        psa.batch(jobs, out, executor=pool, at_once=3, progress=progress)
     assert ended.wait(2.0)
     assert len(seen) < 8
     stand_in(monkeypatch)
     with ThreadPoolExecutor(2) as pool:
-        assert batch(jobs, out, executor=pool).kept == 1
+        assert psa.batch(jobs, out, executor=pool).kept == 1
 
 
 def test_what_failed_is_tried_again_and_what_was_refused_is_not(
@@ -168,18 +161,18 @@ def test_what_failed_is_tried_again_and_what_was_refused_is_not(
 ) -> None:
     def work(task: DeviceTask) -> None:
         if task.job.device == "d0":
-            raise InputError("no record")
+            raise psa.InputError("no record")
         if task.job.device == "d1":
             raise MemoryError
 
     jobs = [t.job for t in tasks(tmp_path, 3)]
     stand_in(monkeypatch, work)
     with ThreadPoolExecutor(1) as pool:
-        batch(jobs, tmp_path / "out", executor=pool)
+        psa.batch(jobs, tmp_path / "out", executor=pool)
         seen = stand_in(monkeypatch)
-        batch(jobs, tmp_path / "out", executor=pool)
+        psa.batch(jobs, tmp_path / "out", executor=pool)
         assert seen == ["d1"]
-        batch(jobs, tmp_path / "out", executor=pool, options=Options(stiffness=5e7))
+        psa.batch(jobs, tmp_path / "out", executor=pool, options=psa.Options(stiffness=5e7))
     assert sorted(seen) == ["d0", "d1", "d1", "d2"]
 
 
@@ -196,15 +189,15 @@ def test_a_damaged_result_is_named_and_made_again(
     out, seen = tmp_path / "out", stand_in(monkeypatch, found)
     jobs = [t.job for t in tasks(tmp_path, 5)]
     with ThreadPoolExecutor(1) as pool:
-        assert len(batch(jobs, out, executor=pool).findings) == 5
+        assert len(psa.batch(jobs, out, executor=pool).findings) == 5
         whole = (out / "d1" / name).read_bytes()
         # cut, or a digit is another one: still a file that can be read
         other = whole.replace(b"1", b"2", 1) if name != "device.json" else b"{}"
         (out / "d1" / name).write_bytes(other if length is None else whole[:length])
-        told = CliRunner().invoke(app, ["compare", str(out), "-o", str(tmp_path / "p.html")])
-        assert f"d1: failed: {out / 'd1' / name}: is damaged" in told.stdout
+        told = command("compare", out, "-o", tmp_path / "p.html").out
+        assert f"d1: failed: {out / 'd1' / name}: is damaged" in told
         assert "d1" in (tmp_path / "p.html").read_text("utf-8")
-        again = batch(jobs, out, executor=pool)
+        again = psa.batch(jobs, out, executor=pool)
     assert (again.kept, again.counts, len(again.findings)) == (4, {"done": 5}, 5)
     assert seen[5:] == ["d1"]
     assert (out / "d1" / "identification.json").stat().st_size > 300
@@ -239,7 +232,7 @@ def test_a_table_of_jobs_is_read(records: Path) -> None:
 )
 def test_mistakes_in_a_table_are_told(table: str, told: str, records: Path) -> None:
     (records / "jobs.csv").write_text(table)
-    with pytest.raises(InputError) as error:
+    with pytest.raises(psa.InputError) as error:
         jobs_given(records / "jobs.csv")
     assert told in str(error.value)
 
@@ -247,7 +240,7 @@ def test_mistakes_in_a_table_are_told(table: str, told: str, records: Path) -> N
 def test_an_executor_that_takes_no_more_is_told(tmp_path: Path) -> None:
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
-    with pytest.raises(MachineError, match="takes no more work"):
+    with pytest.raises(psa.MachineError, match="takes no more work"):
         list(outcomes(tasks(tmp_path, 1), pool, 1))
 
 
@@ -267,11 +260,11 @@ def test_an_executor_that_is_lost_is_no_result_of_a_device(
             return future
 
     out = tmp_path / "out"
-    with Lost(1) as pool, pytest.raises(MachineError, match="executor was lost"):
-        batch(jobs, out, executor=pool, at_once=1)
+    with Lost(1) as pool, pytest.raises(psa.MachineError, match="executor was lost"):
+        psa.batch(jobs, out, executor=pool, at_once=1)
     assert [p.name for p in out.iterdir()] == ["d0"]
     with ThreadPoolExecutor(1) as other:
-        assert batch(jobs, out, executor=other).kept == 1
+        assert psa.batch(jobs, out, executor=other).kept == 1
 
 
 @slow
@@ -280,7 +273,7 @@ def test_an_address_of_no_scheduler_is_told_in_a_sentence(
     address: str, records: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed")
-    process = command(records, tmp_path / "out", "--dask", address)
+    process = batch_command(records, tmp_path / "out", "--dask", address)
     _, told = process.communicate(timeout=35)
     assert process.returncode == 1
     assert told.splitlines()[1:] == [told.splitlines()[-1]]
@@ -292,14 +285,14 @@ def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(executors, "import_module", missing)
-    with pytest.raises(InputError, match=r"pip install 'psa-casadi\[dask\]'"):
+    with pytest.raises(psa.InputError, match=r"pip install 'psa-casadi\[dask\]'"):
         executors.dask_client("local").__enter__()
 
 
 @slow
 def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
     job = next(j for j in jobs_given(records) if j.device == "first")
-    given = [DeviceTask(Job(f"d{k}", job.files), Options(), "run") for k in range(3)]
+    given = [DeviceTask(psa.Job(f"d{k}", job.files), psa.Options(), "run") for k in range(3)]
     own = Processes(1)
     try:
         found = {}
@@ -317,7 +310,7 @@ def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
 @slow
 def test_processes_of_the_standard_library_do_it_too(records: Path, tmp_path: Path) -> None:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        found = batch(records, tmp_path / "out", executor=pool)
+        found = psa.batch(records, tmp_path / "out", executor=pool)
     assert found.counts == {"done": 2, "refused": 1}
 
 
@@ -325,24 +318,24 @@ def test_processes_of_the_standard_library_do_it_too(records: Path, tmp_path: Pa
 def test_a_cluster_of_dask_does_it_too(records: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     with executors.dask_client("local", 2) as client:
-        found = batch(records, tmp_path / "out", executor=client)
+        found = psa.batch(records, tmp_path / "out", executor=client)
     assert found.counts == {"done": 2, "refused": 1}
-    assert load_model(tmp_path / "out" / "first" / "model.json").provenance.free
+    assert psa.load_model(tmp_path / "out" / "first" / "model.json").provenance.free
 
 
 @slow
 def test_devices_are_diagnosed(records: Path, tmp_path: Path) -> None:
     (records / "third.csv").unlink()
-    found = batch(records, tmp_path / "out", options=Options(work="diagnose"), workers=2)
+    found = psa.batch(records, tmp_path / "out", options=psa.Options(work="diagnose"), workers=2)
     assert found.counts == {"done": 2}
-    first, second = read_findings([tmp_path / "out" / n for n in ("first", "second")])
+    first, second = psa.read_findings([tmp_path / "out" / n for n in ("first", "second")])
     assert first.verdict == second.verdict == "adequate"
     assert first.trace is not None
     error = np.array(first.trace.measured) - np.array(first.trace.model)
     assert 2e-9 < np.nanstd(error) < 5e-9  # 3 nm were put in
 
 
-def command(folder: Path, out: Path, *more: str) -> "subprocess.Popen[str]":
+def batch_command(folder: Path, out: Path, *more: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [sys.executable, "-m", "psa_casadi.cli", "batch", str(folder), "-o", str(out),
          "--workers", "1", *more],
@@ -359,7 +352,7 @@ def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) ->
     folder.mkdir()
     for k in range(3):
         write_device(folder / f"d{k}.csv", 1.0 + 0.01 * k, seed=k)
-    process = command(folder, out)
+    process = batch_command(folder, out)
     assert process.stderr is not None
     for line in process.stderr:
         if "done)" in line:
@@ -370,7 +363,7 @@ def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) ->
     if number is signal.SIGINT:
         assert "of 3 devices are done. Kept: " in told
     before = stamps(out)
-    again = command(folder, out)
+    again = batch_command(folder, out)
     said, _ = again.communicate(timeout=120)
     assert again.returncode == 0
     assert "of them were there before" in said

@@ -23,7 +23,7 @@ from psa_casadi.report.words.text import story
 from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
-from tests.cli.test_cli import done
+from tests.contract.helpers import done
 from tests.report.report_cases import diagnosis
 from tests.tiers import slow, slow_but
 
@@ -150,7 +150,7 @@ def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) 
     said = done(
         "diagnose", tmp_path / "r.csv", "-o", paths["ext.json"], "--patch", paths["patched.json"],
         "--json", paths["d.json"], "--report", paths["r.html"], "--still", *left_out,
-    ).stdout  # fmt: skip
+    ).out  # fmt: skip
     told = json.loads(paths["d.json"].read_text(encoding="utf-8"))
     assert told["verdict"] == "unexplained"
     assert (told["patch"]["kind"], told["patch"]["port"]) == ("curve", "reading")

@@ -21,8 +21,7 @@ from psa_casadi.report.words.remedy_words import DO, RECORDS, size_text, what_no
 from psa_casadi.report.words.text import effect_page
 from psa_casadi.variables import Interval
 from tests.report.html_page import Page
-from tests.report.report_cases import ADDED, diagnosis
-from tests.report.test_report import VERDICTS
+from tests.report.report_cases import ADDED, VERDICTS, diagnosis
 
 #: A stack without hysteresis that moves 100 nm per volt and follows its voltage in microseconds.
 VALUES = {"A": 0.0, "delta": 0.0, "k_L": 5.0, "k_P": 1e8, "k_B": 1e8, "R_s": 0.1, "tau": 1e-6}

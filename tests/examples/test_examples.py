@@ -1,19 +1,24 @@
 """Every example runs and finds what it says; the command shows, copies and runs them."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
 
 import matplotlib.image
+import nbformat
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+import yaml  # type: ignore[import-untyped]
+from mkdocs.exceptions import PluginError
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
+from build_scripts.measured_data import ROOT
+from build_scripts.tutorial_pages import FOLDER, described, notebook_page
 from psa_casadi.examples import use_in_casadi, van_der_pol
 from psa_casadi.examples.index import examples, run_example
-from tests.tiers import slow_but
+from tests.contract.helpers import Ended, command
+from tests.tiers import slow, slow_but
 
 EXAMPLES = [e.name for e in examples().values() if e.kind == "example"]
 
@@ -104,33 +109,33 @@ def test_the_imported_fmu_is_not_the_symbolic_model(tmp_path: Path) -> None:
     assert "FmuFunction" not in use_in_casadi.symbolic(plant).class_name()
 
 
-def _run(*words: str) -> Any:
-    return CliRunner().invoke(app, ["examples", *words])
+def _run(*words: str | Path) -> Ended:
+    return command("examples", *words)
 
 
 def test_the_list_names_all() -> None:
     shown = _run()
-    assert shown.exit_code == 0
-    table, _, _ = shown.output.rpartition("\n\n")
+    assert shown.code == 0
+    table, _, _ = shown.out.rpartition("\n\n")
     head, _, *rows = re.split(r"\n(?=\S)", table)
     title = head.index("what it shows")
     for row, (name, example) in zip(rows, examples().items(), strict=True):
         assert row.split()[:2] == [name, example.kind]
         assert " ".join(line[title:] for line in row.splitlines()).split() == example.title.split()
-    assert _run("--quiet").output.split() == list(examples())
+    assert _run("--quiet").out.split() == list(examples())
 
 
 def test_a_recipe_is_shown_and_copied_with_its_scripts(tmp_path: Path) -> None:
-    assert _run("simulink").output == examples()["simulink"].text
+    assert _run("simulink").out == examples()["simulink"].text
     folder = tmp_path / "new" / "folder"
-    assert _run("Simulink.md", "-o", str(folder)).exit_code == 0
+    assert _run("Simulink.md", "-o", str(folder)).code == 0
     assert {p.name for p in folder.iterdir()} == {"simulink.md", "run_stack.m"}
     assert "add_block" in (folder / "run_stack.m").read_text(encoding="utf-8")
 
 
 def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copied = _run("van-der-pol", "-o", str(tmp_path), "--copy-only")
-    assert copied.exit_code == 0
+    assert copied.code == 0
     assert [p.name for p in tmp_path.iterdir()] == ["van_der_pol.py"]
 
     def main(folder: Path) -> dict[str, float]:
@@ -139,9 +144,9 @@ def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(van_der_pol, "main", main)
     ran = _run("van_der_pol", "-o", str(tmp_path))
-    assert ran.exit_code == 0
-    assert "amplitude [m]: 2\n" in ran.output
-    assert "left.txt" in ran.output
+    assert ran.code == 0
+    assert "amplitude [m]: 2\n" in ran.out
+    assert "left.txt" in ran.out
     assert (tmp_path / "left.txt").is_file()
 
 
@@ -155,10 +160,70 @@ def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
 )
 def test_mistakes_are_told(words: list[str], sentence: str) -> None:
     result = _run(*words)
-    assert result.exit_code == 2
-    assert sentence in result.output
+    assert result.code == 2
+    assert sentence in result.words
 
 
 def test_a_recipe_is_nothing_to_run(tmp_path: Path) -> None:
     with pytest.raises(psa.InputError, match="no example named 'ci' to run"):
         run_example("ci", tmp_path)
+
+
+NOTEBOOKS = sorted((ROOT / "docs" / FOLDER).glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_a_notebook_is_valid_and_holds_no_outputs(path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert len(code) >= 5
+    assert [c.source for c in code if c.outputs or c.execution_count is not None] == []
+    assert notebook.metadata.kernelspec.name == "python3"
+
+
+def test_every_notebook_is_in_the_menu() -> None:
+    menu = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
+    pages = next(section["Tutorials"] for section in menu if "Tutorials" in section)
+    assert sorted(pages) == [f"{FOLDER}/{path.stem}.md" for path in NOTEBOOKS]
+    assert len(pages) == 5
+
+
+def test_a_picture_is_described_by_the_heading_above_it() -> None:
+    page = "# One\n![png](a.png)\n## A step\ntext\n![png](b.png)\n![kept](c.png)\n"
+    assert described(page) == (
+        "# One\n![Figure: One](a.png)\n## A step\ntext\n![Figure: A step](b.png)\n![kept](c.png)\n"
+    )
+
+
+def _notebook(*sources: str) -> str:
+    code: dict[str, Any] = {
+        "cell_type": "code",
+        "execution_count": None,
+        "metadata": {},
+        "outputs": [],
+    }
+    cells: list[dict[str, Any]] = [
+        {"cell_type": "markdown", "metadata": {}, "source": "# A title\n\nWords."}
+    ]
+    cells += [code | {"source": source} for source in sources]
+    for k, cell in enumerate(cells):
+        cell["id"] = f"cell-{k}"
+    return json.dumps({"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5})
+
+
+@slow
+def test_a_page_holds_what_its_cells_print_and_draw() -> None:
+    drawn = "import matplotlib.pyplot as plt\nplt.plot([1, 2])\nplt.show()"
+    page, pictures = notebook_page("small.ipynb", _notebook("print(6 * 7)", drawn))
+    assert page.startswith("# A title\n\n*This page is a notebook: [download it](small.ipynb)")
+    assert "\n    42\n" in page
+    (name,) = pictures
+    assert pictures[name].startswith(b"\x89PNG")
+    assert f"![Figure: A title]({name})" in page
+
+
+@slow
+def test_a_cell_that_fails_ends_the_build() -> None:
+    with pytest.raises(PluginError, match=r"broken\.ipynb does not run:\n(?s:.*)ZeroDivisionError"):
+        notebook_page("broken.ipynb", _notebook("1 / 0"))

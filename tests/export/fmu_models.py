@@ -55,11 +55,16 @@ def exported(name: str, fmi: int = 2) -> Path:
     return export_fmu(model_named(name), Path(_FOLDER.name) / f"{name}_{fmi}.fmu", fmi=fmi)
 
 
+def files_inside(path: Path) -> dict[str, bytes]:
+    """Return the files of an archive by their place."""
+    with zipfile.ZipFile(path) as archive:
+        return {n: archive.read(n) for n in archive.namelist()}
+
+
 @cache
 def entries(name: str, fmi: int) -> dict[str, bytes]:
     """Return the files inside the FMU of a named model."""
-    with zipfile.ZipFile(exported(name, fmi)) as archive:
-        return {n: archive.read(n) for n in archive.namelist()}
+    return files_inside(exported(name, fmi))
 
 
 def assert_valid(text: str, *schema: str) -> None:
@@ -70,8 +75,7 @@ def assert_valid(text: str, *schema: str) -> None:
 
 def rewritten(source: Path, target: Path, changes: dict[str, Callable[[bytes], bytes]]) -> Path:
     """Copy an FMU with some entries changed; a change that changes nothing is an error."""
-    with zipfile.ZipFile(source) as archive:
-        entries = {n: archive.read(n) for n in archive.namelist()}
+    entries = files_inside(source)
     for name, change in changes.items():
         before = entries[name]
         entries[name] = change(before)

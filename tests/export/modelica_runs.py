@@ -3,35 +3,30 @@
 import re
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import rumoca
 from numpy.typing import NDArray
 
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
+import psa_casadi as psa
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Output, State
 
 FloatArray = NDArray[np.float64]
 
-#: Time to drive each stack once up and down [s]: slow beside its lags.
-SPANS = {"PTBS200": 0.02, "WYDS0808020": 0.02, "P-885.51": 0.02, "demo": 0.5, "micromanipulator": 2}
 _SAMPLES = 200
+#: The connectors and parts of Modelica's library that the wired example names, in our own words.
+STUB = Path(__file__).with_name("modelica_stub.mo").read_text("utf-8")
 
 
 @cache
-def model_named(name: str) -> Model:
+def model_named(name: str) -> psa.Model:
     """Return a stack by name, P-885.51 with an effect of its ordinary size, or "every_effect"."""
-    if name in STACKS:
-        return stack_model(name)
-    chosen = EFFECTS.values() if name == "every_effect" else (EFFECTS[name],)
-    base = {k: figure.value for k, figure in STACKS["P-885.51"].values.items()}
-    model = compose((*BASE, *chosen), base)
+    if name in psa.STACKS:
+        return psa.stack_model(name)
+    chosen = psa.EFFECTS.values() if name == "every_effect" else (psa.EFFECTS[name],)
+    base = {k: figure.value for k, figure in psa.STACKS["P-885.51"].values.items()}
+    model = psa.compose((*psa.BASE, *chosen), base)
     gains = {str(e.gain): model.parameter(str(e.gain)) for e in chosen}
     sizes = {g: p.typical({**model.values, g: 0.0}) for g, p in gains.items()}
     return model.with_values(sizes)
@@ -56,38 +51,12 @@ def simulated(text: str, name: str, span: float, rtol: float = 1e-11) -> Mapping
     return {**found, "time": np.asarray(result.time)}
 
 
-def triangle_error(model: Model, text: str, span: float) -> dict[str, float]:
-    """Return the largest difference from `run`, over the range, of every state and output.
-
-    The voltage rises to half its rating and falls. A velocity, which is small beside what the stack
-    can reach as it rings, is compared to its usual size.
-    """
-    peak = 0.5 * model.values["u_rated"]
-    slope = 2.0 * peak / span
-    inputs = model.structure.inputs
-    kept = "".join(f", {i.name}={i.start!r}" for i in inputs if i.name != "voltage")
-    voltage = f"if time < {span / 2!r} then {slope!r}*time else {slope!r}*({span!r} - time)"
-    harness = f"model Harness PiezoStack.Signal psa(voltage={voltage}{kept}); end Harness;"
-    got = simulated(text + harness, "Harness", span)
-    t = np.linspace(0.0, span, _SAMPLES + 1)
-    u = input_samples(model, len(t), {"voltage": peak * (1.0 - np.abs(2.0 * t / span - 1.0))})
-    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-11)
-    variables: list[State | Output] = [*model.structure.states, *model.structure.outputs]
-    nominals = [*model.state_nominals(), *model.output_nominals()]
-    errors = {}
-    for it, expected, nominal in zip(variables, [*steps.x.T, *steps.y.T], nominals, strict=True):
-        at = np.interp(t, got["time"], got[f"psa.{it.name}"])
-        size = nominal if it.unit == "m/s" else np.ptp(expected) or nominal
-        errors[it.name] = float(np.abs(at - expected).max() / size)
-    return errors
-
-
 def signal_class(text: str) -> str:
     """Return the lines of the class `Signal` without its annotation."""
     return text.partition("  model Signal ")[2].partition("annotation(")[0]
 
 
-def pure_ode(model: Model, text: str) -> str:
+def pure_ode(model: psa.Model, text: str) -> str:
     """Return a class with the states' equations, and each output as the rate of one more state.
 
     rumoca hands its reading of a class to CasADi only if all equations are of the form
@@ -119,7 +88,7 @@ def read_back(source: str) -> rumoca.SolveExport:
     return load(source, "Pure").to_casadi()
 
 
-def right_side_error(model: Model, text: str, points: int = 5) -> float:
+def right_side_error(model: psa.Model, text: str, points: int = 5) -> float:
     """Return the largest relative difference of derivatives and outputs at random points.
 
     At the last point the voltage is held: its rate is below `hold_rate`.

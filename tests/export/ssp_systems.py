@@ -7,9 +7,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from psa_casadi.export.ssp.archive import export_ssp
-from psa_casadi.model.nanopositioner import nanopositioner
-from psa_casadi.model.system import System
+import psa_casadi as psa
 from psa_casadi.units import FloatArray
 from tests.export.fmu_models import model_named
 
@@ -19,9 +17,9 @@ _FOLDER = TemporaryDirectory()
 STACK, END, RATE = "P-885.51", 4e-4, 2e5
 
 
-def pushed_stage() -> System:
+def pushed_stage() -> psa.System:
     """Return a stack that pushes on a flexure: two parts in a loop."""
-    return System(
+    return psa.System(
         name="pushed_stage",
         parts={"stack": model_named(STACK).plant(), "flexure": model_named("flexure")},
         wires=(
@@ -35,14 +33,14 @@ def pushed_stage() -> System:
 
 
 @cache
-def closed_loop() -> System:
-    return nanopositioner(STACK)
+def closed_loop() -> psa.System:
+    return psa.nanopositioner(STACK)
 
 
 @cache
 def archive_of(name: str) -> Path:
     system = pushed_stage() if name == "pushed_stage" else closed_loop()
-    return export_ssp(system, Path(_FOLDER.name) / f"{name}.ssp")
+    return psa.export_ssp(system, Path(_FOLDER.name) / f"{name}.ssp")
 
 
 def _voltage(t: float) -> float:

@@ -4,25 +4,31 @@ Beyond the rated voltage it is as good as it says, or limited and told.
 """
 
 import ctypes
+import json
 import re
+import zipfile
 from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from fmpy.validation import validate_fmu
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.cli.inputs import step_seconds
-from psa_casadi.component import Component
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
+from psa_casadi.examples.linearisation_trial import DriftingStack
 from psa_casadi.export.fixed_step.export import GOOD, FixedStep, fixed_step
 from psa_casadi.export.fixed_step.expressions import PRECISIONS
 from psa_casadi.export.fixed_step.probe import VOLTAGES, Probe, played_inputs
+from psa_casadi.export.fmu.archive import write_archive
+from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
+from psa_casadi.export.fmu.sources import FIXED_ENTRY
+from psa_casadi.export.fmu.sources import STRICT as AS_EXPORTED
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.files import temporary_folder
-from psa_casadi.model.compose import compose
-from psa_casadi.model.stacks import STACKS
+from psa_casadi.report.words.text import check_sentence
 from psa_casadi.simulation.compiler import (
     compiler_command,
     has_zig,
@@ -30,11 +36,11 @@ from psa_casadi.simulation.compiler import (
     shared_library,
     zig_command,
 )
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.stepper import run
+from tests.export.c_host.build import HEADERS
+from tests.export.fmu_models import files_inside, rewritten
 from tests.model.stack_models import stack
 from tests.simulation.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect
-from tests.tiers import slow
+from tests.tiers import slow, slow_but
 
 STEP = 1e-5
 STRICT = (
@@ -105,20 +111,20 @@ def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str
 
 
 def test_an_effect_that_does_not_fit_is_named() -> None:
-    model = compose((*BASE, JUMP), stack("P-885.51").values)
+    model = psa.compose((*psa.BASE, JUMP), stack("P-885.51").values)
     with pytest.raises(psa.InputError, match=r"'jump' does not fit.*equations jump"):
         fixed_step(model, name="stack", step=STEP)
 
 
 @pytest.mark.parametrize("component", [KINK, FEEDBACK], ids=lambda c: str(c.name))
 def test_what_kinks_or_feeds_back_to_the_hysteresis_is_stepped_as_a_whole(
-    component: Component,
+    component: psa.Component,
 ) -> None:
-    model = compose((*BASE, component), stack("P-885.51").values).plant()
+    model = psa.compose((*psa.BASE, component), stack("P-885.51").values).plant()
     found = fixed_step(model, name="stack", step=STEP, substeps=8)
     assert all(0.0 < e <= 1e-3 for e in errors(found).values())
     wave = 60.0 * (1.0 - np.cos(np.arange(901) / 70.0))
-    away = simulate(model.without([component.name]), STEP * np.arange(901), wave)
+    away = psa.simulate(model.without([component.name]), STEP * np.arange(901), wave)
     assert error(play(found, wave), away.outputs[OUTPUT][1:]) > 1e-2
 
 
@@ -174,8 +180,6 @@ def test_a_step_has_its_unit(text: str, seconds: float) -> None:
 def test_the_unit_of_a_step_is_never_guessed(text: str, said: str) -> None:
     with pytest.raises(psa.InputError, match=said):
         step_seconds(text)
-    arguments = ["export", "c", "--stack", "P-885.51", "-o", "x", "--step", text]
-    assert CliRunner().invoke(app, arguments).exit_code == 2
 
 
 def limit(name: str) -> float:
@@ -184,8 +188,8 @@ def limit(name: str) -> float:
 
 
 CASES = [
-    *(("base", name) for name in STACKS),
-    *((name, sorted(STACKS)[k % len(STACKS)]) for k, name in enumerate(EFFECTS)),
+    *(("base", name) for name in psa.STACKS),
+    *((name, sorted(psa.STACKS)[k % len(psa.STACKS)]) for k, name in enumerate(psa.EFFECTS)),
 ]
 
 
@@ -231,7 +235,7 @@ def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
     assert 1.25 * model.values["u_rated"] <= limit < 900.0
     jumps = limit * np.select([share < 0.1, share < 0.5, share < 0.8], [0.0, 1.0, -1.0], 1.0)
     t, u = LONG_STEP * np.arange(401, dtype=np.float64), np.column_stack([jumps, 0.0 * jumps])
-    true = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
+    true = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
     within = play(found, jumps)
     shown = true[1:, model.output_names.index(OUTPUT)]
     assert error(within, shown) <= max(GOOD, found.worst.error)
@@ -253,3 +257,240 @@ def test_the_step_tells_it_and_no_number_leaves_the_voltage(precision: str) -> N
     assert told(0.0, 100.0, 900.0, 100.0, -900.0)[0] == 0b00101
     assert told(60.0, 60.0, np.nan) == (0b001, told(60.0, 60.0, 60.0)[1])
     assert told(60.0, np.inf)[1] == told(60.0, found.plan.limit)[1]
+
+
+PERIOD, SAMPLES = 1e-4, 40_000
+#: A machine of double precision adds in another order; one of single has 24 bits.
+ROUNDING = {"double": 1e-9, "single": 1e-5}
+FRAMES = (*STRICT, "-Wframe-larger-than=4096")
+
+
+def code_of(model: psa.Model, precision: str) -> FixedStep:
+    step = model.values[model.structure.period] if model.structure.period else 1e-5
+    return fixed_step(model, name="part", step=step, precision=precision)
+
+
+def played(model: psa.Model, precision: str, inputs: FloatArray) -> FloatArray:
+    """Return the outputs (n, ny) of the code on inputs (n, nu), one call for each."""
+    found = code_of(model, precision)
+    return Probe(found.plan, found.texts).play(np.vstack([inputs[:1], inputs]))
+
+
+@cache
+def values() -> dict[str, float]:
+    """Return a stack's values; without delta, by which a slow ramp is told from its stairs."""
+    return psa.stack_values(psa.stack_model("P-885.51").with_values({"delta": 0.0}), PERIOD)
+
+
+def wanted() -> FloatArray:
+    """Return a displacement [m]: nested loops, a rest, a jump, and loops again."""
+    t = PERIOD * np.arange(SAMPLES)
+    w = 5e-6 * (1.0 - np.cos(19.0 * t)) * (0.6 + 0.4 * np.cos(2.3 * t))
+    w[SAMPLES // 3 : SAMPLES // 2] = w[SAMPLES // 3]
+    return np.asarray(w)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_feed_forward_and_observer_are_the_python_objects(precision: str) -> None:
+    forward, observer = psa.FeedForward(values()), psa.HysteresisObserver(values())
+    volts = np.array([forward.step(w) for w in wanted().tolist()])
+    force = np.array([observer.step(u) for u in volts.tolist()])
+    for block, given, expected in (
+        (forward, wanted(), volts),
+        (observer, volts, force),
+    ):
+        found = played(block.model, precision, given[:, None])[:, 0]
+        assert np.ptp(expected) > 20.0
+        assert np.abs(found - expected).max() <= ROUNDING[precision] * np.ptp(expected)
+
+
+@cache
+def closed_loop() -> tuple[psa.AdaptiveFeedForward, FloatArray, FloatArray]:
+    """Return a tracked feed-forward that has run, its inputs (n, 2) and its voltages (n,)."""
+    model = psa.stack_model("P-885.51").with_values({"delta": 0.0})
+    off = model.with_values({"A": 0.9 * model.values["A"], "k_L": 1.1 * model.values["k_L"]})
+    block = psa.AdaptiveFeedForward(psa.identifier_for(off, PERIOD, noise=2e-8).values)
+    plant, x, rows, voltage = DriftingStack(model.values, PERIOD), 0.0, [], []
+    path = wanted()[: SAMPLES // 3]
+    noise = 2e-9 * np.random.default_rng(0).normal(size=path.size)
+    for w, off_by in zip(path.tolist(), noise.tolist(), strict=True):
+        rows.append((w, x + off_by))
+        voltage.append(block.step(*rows[-1]))
+        x = plant.step(voltage[-1])
+    return block, np.array(rows), np.array(voltage)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_learning_blocks_are_the_python_objects(precision: str) -> None:
+    block, inputs, voltage = closed_loop()
+    limit = {"double": 1e-8, "single": 2e-4}[precision]
+    found = played(block.model, precision, inputs)
+    assert np.abs(found[:, 0] - voltage).max() <= limit * np.ptp(voltage)
+    learnt = np.array([block.estimate.parameters[n] for n in ("A", "n", "k_L")])
+    names = [f"{n}_hat" for n in ("A", "n", "k_L")]
+    at = [block.model.output_names.index(n) for n in names]
+    assert found[-1, at] == pytest.approx(learnt, rel=50.0 * limit)
+    online = psa.OnlineIdentification(block.model.values)
+    given = np.column_stack([voltage, inputs[:, 1]])
+    for row in given.tolist():
+        online.step(*row)
+    found = played(online.model, precision, given)
+    learnt = np.array([online.estimate.parameters[n] for n in ("A", "n", "k_L")])
+    at = [online.model.output_names.index(n) for n in names]
+    assert found[-1, at] == pytest.approx(learnt, rel=50.0 * limit)
+
+
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    slow_but(
+        [("hysteresis_compensator", "single"), ("adaptive_feed_forward", "double")],
+        [(name, precision) for name in psa.PARTS for precision in PRECISIONS],
+    ),
+)
+def test_every_part_is_c_of_small_frames_and_no_loop(name: str, precision: str) -> None:
+    found = code_of(psa.part_model(name), precision)
+    assert found.worst.error <= 1e-3
+    source = found.texts["part.c"]
+    code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+    assert found.plan.substeps > 1 or not re.search(r"\b(for|while|goto)\b", code)
+    with temporary_folder() as folder:
+        for file, text in found.texts.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        for level in ("-O0", "-O2"):
+            command = [*compiler_command(), *FRAMES, level, "-c", "part.c", "-o", "part.o"]
+            run_compiler(command, folder)
+
+
+def test_a_controller_acts_at_every_few_steps_of_its_plant() -> None:
+    """A sampled part called four times a period changes its command at the fourth call."""
+    part = psa.part_model("position_controller")
+    found = fixed_step(part, name="part", step=1.25e-5)
+    u = np.column_stack([np.linspace(0.0, 1e-6, 401), np.zeros(401)])
+    command = Probe(found.plan, found.texts).play(u)[:, 0]
+    moved = np.flatnonzero(np.diff(command)) + 2  # the number of the call that changes it
+    assert len(moved) > 90
+    assert not np.any(moved % 4)
+
+
+COUNT = 401
+VERSIONS = (2, pytest.param(3, marks=slow))
+
+
+@cache
+def archived(fmi: int) -> bytes:
+    """Return the file of an FMU of a stack with a fixed step."""
+    with temporary_folder() as folder:
+        path = psa.export_fmu(stack("P-885.51"), folder / "fixed.fmu", fmi=fmi, step=STEP)
+        return path.read_bytes()
+
+
+def written(fmi: int, folder: Path) -> Path:
+    """Return the path of a copy of `archived`."""
+    (folder / "fixed.fmu").write_bytes(archived(fmi))
+    return folder / "fixed.fmu"
+
+
+@cache
+def exported(fmi: int) -> Fmu:
+    """Return a loaded one; its file is gone."""
+    with temporary_folder() as folder:
+        return Fmu(written(fmi, folder))
+
+
+@pytest.mark.parametrize("every", [pytest.param(1, marks=slow), 5])
+def test_communication_steps_are_one_step_or_several(every: int) -> None:
+    """FMI 2 passes on the slope of the inputs."""
+    times = STEP * np.arange(COUNT, dtype=np.float64)[::every]
+    voltage = 100.0 * VOLTAGES["tones"][1](np.linspace(0.0, 1.0, COUNT))[::every]
+    inputs = Signals(("voltage",), times, voltage[:, None])
+    found = co_simulate(exported(2), times, inputs, ("displacement",))[:, 0]
+    model = stack("P-885.51").plant()
+    true = psa.simulate(model, times, voltage, as_exported=True, rtol=1e-8, hold="linear")
+    assert error(found, true.outputs["displacement"]) <= 5e-5
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_other_communication_steps_are_refused(fmi: int) -> None:
+    with exported(fmi).start(CO_SIMULATION) as slave:
+        slave.step(0.0, 3 * STEP)
+        for size in (0.5 * STEP, 1.5 * STEP, 1.01 * STEP):
+            with pytest.raises(FmuError, match="no multiple of 1e-05 s, the fixed step"):
+                slave.step(3 * STEP, size)
+        slave.step(3 * STEP, 0.3)
+        assert slave.get(["time"])[0] == pytest.approx(0.3 + 3 * STEP, abs=1e-12)
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_parameters_cannot_be_set(fmi: int) -> None:
+    with exported(fmi).start(CO_SIMULATION) as slave:
+        with pytest.raises(FmuError, match="'k_L' is constant"):
+            slave.set({"k_L": 5.0})
+        assert slave.get(["k_L"])[0] == stack("P-885.51").values["k_L"]
+
+
+@pytest.mark.parametrize("fmi", VERSIONS)
+def test_the_description_says_what_it_is(fmi: int, tmp_path: Path) -> None:
+    path = written(fmi, tmp_path)
+    again = psa.export_fmu(stack("P-885.51"), tmp_path / "again.fmu", fmi=fmi, step=STEP)
+    assert path.read_bytes() == again.read_bytes()
+    assert list(validate_fmu(str(path))) == []
+    with zipfile.ZipFile(path) as archive:
+        root = ET.fromstring(archive.read("modelDescription.xml"))
+        page = archive.read(DOCUMENTATION_ENTRY)
+        archive.extractall(tmp_path / "unpacked")
+    assert b"A communication step is a multiple of it" in page
+    assert b"Parameters are tunable" not in page
+    assert root.find("ModelExchange") is None
+    assert "fixed step of 1e-05 s" in root.attrib["description"]
+    stepping, variables = root.find("CoSimulation"), root.find("ModelVariables")
+    assert stepping is not None
+    assert stepping.get("fixedInternalStepSize") == ("1e-05" if fmi == 3 else None)
+    claimed = stepping.get("canHandleVariableCommunicationStepSize")
+    assert claimed == (None if fmi == 2 else "true")
+    assert variables is not None
+    constants = {v.get("name") for v in variables if v.get("variability") == "constant"}
+    assert constants == set(stack("P-885.51").plant().values)
+    sources = sorted((tmp_path / "unpacked" / "sources").glob("*.c"))
+    options = ["-std=c99", *AS_EXPORTED, f"-I{HEADERS}", f"-I{sources[0].parent}", "-c"]
+    for source in (s for s in sources if s.name in ("instance.c", "fmi_data.c", "values.c")):
+        run_compiler([*compiler_command(), *options, str(source), "-o", "object.o"], tmp_path)
+    with pytest.raises(psa.InputError, match="takes fixed steps of 1e-05 s and carries no evid"):
+        psa.check_fmu(path, evidence=True)
+
+
+@slow
+def test_the_check_finds_the_errors_that_it_states(tmp_path: Path) -> None:
+    """On the voltages behind them; what means nothing there is left out, and said."""
+    fmi = 3
+    path = written(fmi, tmp_path)
+    report = psa.check_fmu(path)
+    assert report.passed, report.failures
+    assert report.compared
+    figures = {row.name: row.figure for row in report.rows}
+    with zipfile.ZipFile(path) as archive:
+        errors: dict[str, float] = json.loads(archive.read(FIXED_ENTRY))["errors"]
+    for voltage, stated in errors.items():
+        assert figures[f"fixed step, {voltage}"] == pytest.approx(stated, rel=0.06, abs=1e-8)
+    names = {"life cycle", "snapshots", "line of the input", "start of a run", "settled start"}
+    assert names < figures.keys()
+    assert {"equations", "model exchange", "parameter changes"} < set(report.left_out)
+    assert ("adjoint derivatives" in report.left_out) == (fmi == 3)
+    assert figures.keys().isdisjoint(report.left_out)
+    assert "Left out, as its step is fixed: model exchange inst" in check_sentence(report)
+
+
+@slow
+def test_the_check_notices_smaller_errors_than_there_are(tmp_path: Path) -> None:
+    def boast(content: bytes) -> bytes:
+        stated = json.loads(content)
+        stated["errors"] = {name: 0.8 * error for name, error in stated["errors"].items()}
+        return json.dumps(stated).encode()
+
+    changed = rewritten(written(2, tmp_path), tmp_path / "b.fmu", {FIXED_ENTRY: boast})
+    failed = {row.name for row in psa.check_fmu(changed).failures}
+    assert {"reproducible", "fixed step, tones", "fixed step, jumps"} <= failed
+    assert "fixed step, ramps and holds, 10 at once" not in failed
+    for nothing in (b"{}", b'{"errors": {"sine": "x"}}', b"no JSON"):
+        write_archive(tmp_path / "c.fmu", {**files_inside(changed), FIXED_ENTRY: nothing})
+        with pytest.raises(psa.InputError, match=r"fixed_step\.json.*xport the FMU again"):
+            psa.check_fmu(tmp_path / "c.fmu")

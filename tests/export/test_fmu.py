@@ -3,34 +3,35 @@
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
+import fmpy
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.any_model.sizes import Sizes
-from psa_casadi.component import Component, Equations
 from psa_casadi.export.check.agreement import has_reference
-from psa_casadi.export.check.check import as_exported, check_fmu
+from psa_casadi.export.check.check import as_exported
 from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.ode_model import ode_model
-from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Input, Parameter, State
+from psa_casadi.reference import simulate
+from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import simulated
+from tests.export.ssp_systems import END, RATE, monolithic
+from tests.studies.benchmarks.coupling import load_ecos
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
 #: The two versions are two faces of one core: each kind of model in one of them, one in both. Other
-#: stacks are checked in `test_cli_commands` and played in `test_fmu_accuracy`.
+#: stacks are checked in `tests/contract` and played in `test_fmu_accuracy`.
 CHECKED = (
     (STACK, 3), ("flexure", 3), (STACK, 2), ("single_mass", 2), ("slow_creep", 2),
     ("every_effect", 3),
@@ -39,7 +40,7 @@ CHECKED = (
 
 @pytest.mark.parametrize(("name", "fmi"), slow_but(CHECKED[:1], CHECKED))
 def test_check_passes(name: str, fmi: int) -> None:
-    report = check_fmu(exported(name, fmi), model_named(name))
+    report = psa.check_fmu(exported(name, fmi), model_named(name))
     assert report.compared
     assert not report.failures, "\n".join(
         f"{r.name}: {r.figure} {r.remark}" for r in report.failures
@@ -62,26 +63,26 @@ def test_nominal_values_of_parameters_are_within_their_bounds(name: str) -> None
 _X, _U, _P, _T = (ca.SX.sym(name) for name in "xupt")
 
 
-def _ode(name: str, **ode: ca.SX) -> Model:
+def _ode(name: str, **ode: ca.SX) -> psa.Model:
     values = {"p": 2.0} if "p" in ode else {}
-    return ode_model({"x": _X, **ode}, name=name, values=values)
+    return psa.ode_model({"x": _X, **ode}, name=name, values=values)
 
 
 @cache
-def _without_outputs() -> Model:
-    tank = Component(
+def _without_outputs() -> psa.Model:
+    tank = psa.Component(
         name="tank",
         description="a state that follows an input, shown to nobody",
         source="a first-order lag",
-        equations=lambda s: Equations(der={"level": s.rate * (s.inflow - s.level)}),
-        parameters=(Parameter("rate", 2.0, "1/s", (0.0, 10.0), "rate of the lag"),),
-        states=(State("level", "m", "level", 1.0),),
-        inputs=(Input("inflow", "m", "what the level follows", 0.0, 1.0),),
+        equations=lambda s: psa.Equations(der={"level": s.rate * (s.inflow - s.level)}),
+        parameters=(psa.Parameter("rate", 2.0, "1/s", (0.0, 10.0), "rate of the lag"),),
+        states=(psa.State("level", "m", "level", 1.0),),
+        inputs=(psa.Input("inflow", "m", "what the level follows", 0.0, 1.0),),
     )
-    return compose([tank], name="tank")
+    return psa.compose([tank], name="tank")
 
 
-def _seen_late() -> Model:
+def _seen_late() -> psa.Model:
     """A first-order model whose output is seen through a lag."""
     model = _ode("late", u=_U, p=_P, ode=_P * (_U - _X), y=_X)
     ones = dict.fromkeys((*model.state_names, *model.input_names, *model.output_names), 1.0)
@@ -90,7 +91,7 @@ def _seen_late() -> Model:
     return extended(model, [lag]).with_values({f"{lag.name}_time": 0.05})
 
 
-MODELS: dict[str, Callable[[], Model]] = {
+MODELS: dict[str, Callable[[], psa.Model]] = {
     "neither input nor parameter": lambda: _ode("decay", ode=-_X),
     "no input": lambda: _ode("decay", p=_P, ode=-_P * _X),
     "at rest, parameter without effect": lambda: _ode("rest", u=_U, p=_P, ode=-_P * _X),
@@ -114,7 +115,7 @@ IN_TURN = [(n, 2 + k % 2) for k, n in enumerate(MODELS) if (n, 3) not in QUICK]
 @pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize(("name", "fmi"), slow_but(QUICK[:1], [*QUICK, *IN_TURN]))
 def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) -> None:
-    report = check_fmu(export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
+    report = psa.check_fmu(psa.export_fmu(MODELS[name](), tmp_path / "m.fmu", fmi=fmi))
     assert report.passed, report.failures
 
 
@@ -122,7 +123,7 @@ def test_a_sensors_effect_is_left_out_where_the_fmu_leaves_it_out(tmp_path: Path
     """It has no output of its own: its state and parameters tell."""
     whole = _seen_late()
     assert whole.state_names != ("x",)
-    with Archive(export_fmu(whole, tmp_path / "m.fmu")) as archive:
+    with Archive(psa.export_fmu(whole, tmp_path / "m.fmu")) as archive:
         chosen = as_exported(archive, whole)
         assert chosen.state_names == ("x",)
         assert list(wrong_start_values(archive, chosen)) == []
@@ -136,11 +137,11 @@ def test_a_model_without_outputs_runs_everywhere(tmp_path: Path) -> None:
     assert model.structure.y.shape == (0, 1)
     exact = 1.0 - np.exp(-2.0 * end)
     t = np.linspace(0.0, end, 11)
-    steps = run(model, t, np.ones((11, 1)), np.zeros(1), rtol=1e-9)
+    steps = psa.run(model, t, np.ones((11, 1)), np.zeros(1), rtol=1e-9)
     assert steps.x[-1, 0] == pytest.approx(exact, rel=1e-7)
     assert steps.y.shape == (11, 0)
     with (
-        Fmu(export_fmu(model, tmp_path / "m.fmu")) as fmu,
+        Fmu(psa.export_fmu(model, tmp_path / "m.fmu")) as fmu,
         fmu.start(CO_SIMULATION, tolerance=1e-9) as slave,
     ):
         slave.set({"inflow": 1.0})
@@ -149,3 +150,96 @@ def test_a_model_without_outputs_runs_everywhere(tmp_path: Path) -> None:
     harness = "model Harness Tank.Signal tank(inflow = 1.0); end Harness;"
     got = simulated(modelica_text(model, name="Tank") + harness, "Harness", end)
     assert got["tank.level"][-1] == pytest.approx(1.0 - np.exp(-2.0 * got["time"][-1]), rel=1e-4)
+
+
+VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
+
+
+def _jumps() -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    """Return a voltage with two jumps: rows of one time."""
+    rows = [(0.0, 0.0), (5e-3, 0.0), (5e-3, 100.0), (15e-3, 100.0), (15e-3, 20.0), (30e-3, 20.0)]
+    return np.array(
+        [(t, v, 0.0) for t, v in rows],
+        dtype=[(n, float) for n in ("time", "voltage", "load_force")],
+    )
+
+
+def _truth(times: FloatArray) -> FloatArray:
+    return simulate(
+        model_named(STACK).values,
+        lambda t: 0.0 if t < 5e-3 else 100.0 if t < 15e-3 else 20.0,
+        times,
+        breakpoints=(5e-3, 15e-3),
+    ).displacement
+
+
+def _error(result: Any) -> float:
+    """Return the largest error over the range of a result with repeated times at events."""
+    times, first = np.unique(result["time"], return_index=True)
+    truth = _truth(times)
+    return float(np.max(np.abs(result["displacement"][first] - truth)) / np.ptp(truth))
+
+
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+def test_fmpy_cvode(fmi: int) -> None:
+    errors = []
+    for tolerance in (1e-4, 1e-9):
+        result = fmpy.simulate_fmu(
+            str(exported(STACK, fmi)), stop_time=0.03, fmi_type="ModelExchange", solver="CVode",
+            relative_tolerance=tolerance, output_interval=1e-3, input=_jumps(),
+            output=["displacement"],
+        )  # fmt: skip
+        errors.append(_error(result))
+    assert errors[1] < 1e-6
+    assert errors[1] < 1e-2 * errors[0]
+
+
+@VERSIONS
+def test_fmpy_euler(fmi: int) -> None:
+    """Forward Euler at steps far below the fastest time constant: the error is of order one."""
+    errors = []
+    for step in (2e-6, 1e-6):
+        result = fmpy.simulate_fmu(
+            str(exported(STACK, fmi)), stop_time=7e-3, fmi_type="ModelExchange", solver="Euler",
+            step_size=step, output_interval=step, input=_jumps(), output=["displacement"],
+        )  # fmt: skip
+        errors.append(_error(result))
+    assert errors[1] < 0.03
+    assert 1.6 < errors[0] / errors[1] < 2.4
+
+
+def _coupled_by_ecos(ecos: Any, fmi: int, step: float) -> tuple[float, float]:
+    """Couple stack and flexure; return their displacements at the end [m].
+
+    All FMUs step in parallel with what the others gave at the point before (Jacobi iteration).
+    """
+    structure = ecos.EcosSimulationStructure()
+    structure.add_model("stack", exported(STACK, fmi))
+    structure.add_model("flexure", exported("flexure", fmi))
+    structure.make_real_connection("stack::displacement", "flexure::tip_position")
+    structure.make_real_connection("stack::velocity", "flexure::tip_velocity")
+    structure.make_real_connection("flexure::reaction_force", "stack::load_force")
+    simulation = ecos.EcosSimulation(step_size=step, structure=structure)
+    simulation.init()
+    for k in range(round(END / step)):
+        simulation.set_real("stack::voltage", RATE * (k + 0.5) * step)
+        simulation.step(1)
+    found = simulation.get_real("stack::x"), simulation.get_real("flexure::x_f")
+    simulation.terminate()
+    simulation.free()
+    structure.free()
+    return found
+
+
+@VERSIONS
+def test_ecos_couples_two_fmus(fmi: int) -> None:
+    """The error against one monolithic simulation falls with the step, to first order."""
+    ecos = load_ecos() or pytest.skip("ecospy, or the TBB library that it needs, is missing")
+    expected = monolithic()
+    errors = []
+    for step in (1e-6, 5e-7, 2.5e-7):
+        found = _coupled_by_ecos(ecos, fmi, step)
+        errors.append(max(abs(a - b) for a, b in zip(found, expected, strict=True)) / expected[0])
+    assert errors[0] / errors[1] > 1.6, errors
+    assert errors[1] / errors[2] > 1.6, errors
+    assert errors[2] < 1e-2

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psa_casadi.errors import InputError
+import psa_casadi as psa
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
@@ -21,7 +21,6 @@ from psa_casadi.export.importer.fmu import (
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, communicate
 from psa_casadi.reference import simulate
-from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.fmu_models import exported, model_named
@@ -173,7 +172,7 @@ def test_every_solver_step_gets_a_share_of_the_tolerance() -> None:
     model = model_named(name).plant()
     u = np.zeros((len(times), len(model.input_names)))
     u[:, model.input_names.index("voltage")] = inputs.at(times)[:, 0]
-    again = run(
+    again = psa.run(
         model, times, u, np.zeros(len(model.state_names)),
         rtol=max(STEP_SHARE * tolerance, TIGHTEST_STEP),
     )  # fmt: skip
@@ -276,5 +275,5 @@ def test_instants_that_cannot_be_counted_are_refused(fmi: int) -> None:
             assert model.get(["time"])[0] == 0.0
     plant = loop()
     t = 1e14 * PERIOD * (1.0 + np.array([0.0, 1e-9]))
-    with pytest.raises(InputError, match="cannot be counted up to"):
-        run(plant, t, np.zeros((2, len(plant.input_names))), np.zeros(len(plant.state_names)))
+    with pytest.raises(psa.InputError, match="cannot be counted up to"):
+        psa.run(plant, t, np.zeros((2, len(plant.input_names))), np.zeros(len(plant.state_names)))

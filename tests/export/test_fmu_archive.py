@@ -8,7 +8,7 @@ import io
 import re
 import shutil
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,29 +18,41 @@ import casadi as ca
 import fmpy
 import matplotlib.image
 import numpy as np
+import numpy.typing as npt
 import pytest
 from fmpy.validation import validate_fmu
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.component import Component, Equations
-from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.export.check.check import CheckRow, check_fmu
+import psa_casadi as psa
+from psa_casadi.export.check.agreement import expected_outputs
+from psa_casadi.export.check.check import CheckRow
+from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
 from psa_casadi.export.common.icon import ICONS, SIDE, png, svg
+from psa_casadi.export.common.publication import LICENSE_ENTRY
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu import sources
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.description import dependencies
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.fmu.platforms import PLATFORMS, compile_library
+from psa_casadi.export.fmu.reference_run import (
+    EXPERIMENTS,
+    FOLDER,
+    INPUTS,
+    NOTES,
+    OUTPUTS,
+    PARAMETERS,
+    reference_entries,
+)
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.importer.masters import Signals
+from psa_casadi.model.model_file import save_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
-from psa_casadi.variables import Input, Output, Parameter, State
-from tests.export.fmu_models import assert_valid, entries, model_named, rewritten
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.variables import Publication
+from tests.contract.helpers import done, refused
+from tests.export.fmu_models import assert_valid, entries, exported, model_named, rewritten
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
@@ -61,21 +73,21 @@ def test_sources_compile_alone_without_warnings(name: str, tmp_path: Path) -> No
 
 def test_impossible_exports_are_refused(tmp_path: Path) -> None:
     model = model_named(STACK)
-    with pytest.raises(InputError, match="cannot name an FMU"):
-        export_fmu(model, tmp_path / "a.fmu", name="P-885.51")
-    with pytest.raises(InputError, match="'amiga' is not known"):
-        export_fmu(model, tmp_path / "a.fmu", platforms=["host", "amiga"])
-    flexure = COMPONENTS["flexure"]
+    with pytest.raises(psa.InputError, match="cannot name an FMU"):
+        psa.export_fmu(model, tmp_path / "a.fmu", name="P-885.51")
+    with pytest.raises(psa.InputError, match="'amiga' is not known"):
+        psa.export_fmu(model, tmp_path / "a.fmu", platforms=["host", "amiga"])
+    flexure = psa.COMPONENTS["flexure"]
     twice = replace(
         flexure,
-        outputs=(Output("x_f", "m", "position"),),
+        outputs=(psa.Output("x_f", "m", "position"),),
         equations=lambda s: replace(flexure.equations(s), out={"x_f": s.x_f}),
     )
-    with pytest.raises(InputError, match="Two variables of 'psa' are named 'x_f'"):
-        variable_table(compose([twice]))
-    gain = Component("gain", "none", "none", lambda s: Equations())
-    with pytest.raises(InputError, match="has no state"):
-        variable_table(compose([gain]))
+    with pytest.raises(psa.InputError, match="Two variables of 'psa' are named 'x_f'"):
+        variable_table(psa.compose([twice]))
+    gain = psa.Component("gain", "none", "none", lambda s: psa.Equations())
+    with pytest.raises(psa.InputError, match="has no state"):
+        variable_table(psa.compose([gain]))
     assert not list(tmp_path.iterdir())
 
 
@@ -103,24 +115,20 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert len(found) == len(calls) == 7
 
 
-#: Two models in both versions, the others in one of them in turn.
-TWICE = ("P-885.51", "flexure")
-TRIED = [(name, fmi) for name in TWICE for fmi in (2, 3)]
-TRIED += [
-    (name, 2 + k % 2)
-    for k, name in enumerate((*STACKS, "every_effect", "single_mass")) if name not in TWICE
-]  # fmt: skip
-
-
 @pytest.mark.usefixtures("without_binary")
-@pytest.mark.parametrize(("name", "fmi"), slow_but(TRIED[:4], TRIED))
-def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", slow_but([STACK, "flexure"], [*psa.STACKS, "flexure", "single_mass", "every_effect"])
+)
+def test_archives_are_valid(name: str, tmp_path: Path) -> None:
     """What is checked are the description and the list of sources."""
-    path = export_fmu(model_named(name), tmp_path / "m.fmu", name="m", fmi=fmi, include_sensor=True)
-    assert validate_fmu(str(path)) == []
-    description = fmpy.read_model_description(str(path))
-    assert description.fmiVersion == f"{fmi}.0"
-    assert len(description.modelVariables) == len(variable_table(model_named(name)))
+    model = model_named(name)
+    for fmi in (2, 3):
+        path = tmp_path / f"{fmi}.fmu"
+        psa.export_fmu(model, path, name="m", fmi=fmi, include_sensor=True)
+        assert validate_fmu(str(path)) == []
+        description = fmpy.read_model_description(str(path))
+        assert description.fmiVersion == f"{fmi}.0"
+        assert len(description.modelVariables) == len(variable_table(model))
 
 
 @pytest.mark.usefixtures("without_binary")
@@ -128,7 +136,7 @@ def test_archives_are_valid(name: str, fmi: int, tmp_path: Path) -> None:
 def test_entries_are_sorted_and_have_no_date_and_a_binary_for_every_platform(
     fmi: int, tmp_path: Path
 ) -> None:
-    path = export_fmu(model_named("flexure"), tmp_path / "a.fmu", platforms=["all"], fmi=fmi)
+    path = psa.export_fmu(model_named("flexure"), tmp_path / "a.fmu", platforms=["all"], fmi=fmi)
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         assert names == sorted(names)
@@ -137,8 +145,8 @@ def test_entries_are_sorted_and_have_no_date_and_a_binary_for_every_platform(
     assert {n for n in names if n.startswith("binaries/")} == binaries
     known = {"linux64", "linux32", "win64", "win32", "darwin64"}  # all the names that FMI 2 has
     assert (known if fmi == 2 else set(PLATFORMS)) <= {n.split("/")[1] for n in binaries}
-    with pytest.raises(InputError, match="FMI 4 is not known"):
-        export_fmu(model_named("demo"), tmp_path / "c.fmu", fmi=4)
+    with pytest.raises(psa.InputError, match="FMI 4 is not known"):
+        psa.export_fmu(model_named("demo"), tmp_path / "c.fmu", fmi=4)
 
 
 XML = "modelDescription.xml"
@@ -162,11 +170,11 @@ def older(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(sources, "generate_c", generated)
         patch.setattr(sources, "c_code", lambda *args: _as_another_writes(derivatives(*args)))
         patch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
-        return export_fmu(model_named(STACK), tmp_path_factory.mktemp("fmu") / "older.fmu")
+        return psa.export_fmu(model_named(STACK), tmp_path_factory.mktemp("fmu") / "older.fmu")
 
 
 def _reproducible(path: Path) -> CheckRow:
-    return next(row for row in check_fmu(path).rows if row.name == "reproducible")
+    return next(row for row in psa.check_fmu(path).rows if row.name == "reproducible")
 
 
 @pytest.mark.usefixtures("code_runs_here")
@@ -196,15 +204,17 @@ def test_a_change_of_it_is_found(change: str, older: Path, tmp_path: Path) -> No
     assert said in row.remark
 
 
-flexure = compose([COMPONENTS["flexure"]], name="flexure")
-every_effect = compose((*BASE, *EFFECTS.values()), name="every_effect")
+flexure = psa.compose([psa.COMPONENTS["flexure"]], name="flexure")
+every_effect = psa.compose((*psa.BASE, *psa.EFFECTS.values()), name="every_effect")
 
 
 # Terminals
 
 
-@pytest.mark.parametrize("model", [stack_model(STACK), compose(SIMPLIFIED), flexure, every_effect])
-def test_terminals_are_valid_and_their_variables_exist(model: Model) -> None:
+@pytest.mark.parametrize(
+    "model", [psa.stack_model(STACK), psa.compose(psa.SIMPLIFIED), flexure, every_effect]
+)
+def test_terminals_are_valid_and_their_variables_exist(model: psa.Model) -> None:
     text = terminals_and_icons(model)
     assert_valid(text, "schema", "fmi3", "fmi3TerminalsAndIcons.xsd")
     known = {*model.input_names, *model.output_names}
@@ -219,7 +229,7 @@ def test_terminals_are_valid_and_their_variables_exist(model: Model) -> None:
 
 def test_a_stack_and_a_flexure_connect() -> None:
     """Equal names of members, an input on one side for each output on the other; forces opposed."""
-    stack = stack_model(STACK)
+    stack = psa.stack_model(STACK)
     near = next(t for t in terminals_of(stack) if t.name == "mechanical")
     (far,) = terminals_of(flexure)
     ours, theirs = ({m: (v, k) for v, m, k in t.members} for t in (near, far))
@@ -253,8 +263,8 @@ def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
 # Documentation
 
 
-@pytest.mark.parametrize("model", [stack_model(STACK), flexure, every_effect])
-def test_documentation_is_complete(model: Model) -> None:
+@pytest.mark.parametrize("model", [psa.stack_model(STACK), flexure, every_effect])
+def test_documentation_is_complete(model: psa.Model) -> None:
     page = documentation(model)
     said = html.unescape(re.sub(r"<[^>]*>", "\n", page))
     for component in model.components:
@@ -289,19 +299,159 @@ def test_documentation_escapes_what_users_write() -> None:
 
 def test_kinds_of_dependence() -> None:
     """q' = -a q + 2 v + q w: 2 is constant, -a + w depends on w, d/da = -q depends on q."""
-    part = Component(
+    part = psa.Component(
         "part", "part", "part",
-        lambda s: Equations(
+        lambda s: psa.Equations(
             der={"q": -s.a * s.q + 2.0 * s.v + s.q * s.w}, out={"y": s.a * s.v, "z": 3.0 * s.q}
         ),
-        parameters=(Parameter("a", 1.0, "1", (0.0, 2.0), "rate"),),
-        states=(State("q", "m", "position", 1.0),),
-        inputs=(Input("v", "V", "voltage"), Input("w", "1", "share")),
-        outputs=(Output("y", "V", "scaled"), Output("z", "m", "shown")),
+        parameters=(psa.Parameter("a", 1.0, "1", (0.0, 2.0), "rate"),),
+        states=(psa.State("q", "m", "position", 1.0),),
+        inputs=(psa.Input("v", "V", "voltage"), psa.Input("w", "1", "share")),
+        outputs=(psa.Output("y", "V", "scaled"), psa.Output("z", "m", "shown")),
     )  # fmt: skip
-    found = dependencies(compose([part]).structure)
+    found = dependencies(psa.compose([part]).structure)
     state, v, w, a = ("state", 0), ("input", 0), ("input", 1), ("parameter", 0)
     rate = {state: "dependent", v: "constant", w: "dependent", a: "dependent"}
     assert found["derivative", 0] == rate
     assert found["output", 0] == {v: "tunable", a: "dependent"}
     assert found["output", 1] == {state: "constant"}
+
+
+Table = Mapping[str, npt.NDArray[np.float64]]
+
+
+def table(content: bytes) -> Table:
+    names, *rows = content.decode().splitlines()
+    columns = np.array([[float(v) for v in row.split(",")] for row in rows]).T
+    return dict(zip(names.split(","), columns, strict=True))
+
+
+# Parameter sets
+
+
+# The reference run
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_manifest_lists_every_file_as_the_schema_of_the_standard_has_it(fmi: int) -> None:
+    """Names, attributes and roles as FMI-LS-REF 1.0.0-beta.1 and the Experiments Format have them.
+
+    Its schema knows no other attribute of a file than these four.
+    """
+    inside = entries(STACK, fmi)
+    root = ET.fromstring(inside[f"{FOLDER}/fmi-ls-manifest.xml"])
+    space = "{http://fmi-standard.org/fmi-ls-manifest}"
+    assert root.tag == "fmiReferences"
+    assert root.attrib[f"{space}fmi-ls-name"] == "org.fmi-standard.fmi-ls-ref"
+    assert root.attrib[f"{space}fmi-ls-version"] == "1.0.0-beta.1"
+    assert len(root.attrib) == 3
+    roles = {}
+    for related in root:
+        path = f"{FOLDER}/{related.attrib['source']}".replace(f"{FOLDER}/../../", "")
+        assert related.tag == "Related"
+        assert set(related.attrib) == {"type", "source", "role", "description"}
+        assert path in inside
+        roles[path] = related.attrib["role"]
+    own = {n for n in inside if n.startswith(FOLDER)} - {f"{FOLDER}/fmi-ls-manifest.xml"}
+    assert set(roles) == {*own, NOTES}
+    assert roles[f"{FOLDER}/{EXPERIMENTS}"] == "experiment/smoke-test"
+    assert roles[f"{FOLDER}/{PARAMETERS}"] == "parameter"
+    assert roles[f"{FOLDER}/{OUTPUTS}"] == "result"
+    (experiment,) = ET.fromstring(inside[f"{FOLDER}/{EXPERIMENTS}"])
+    assert {e.tag: e.attrib["source"] for e in experiment} == {
+        "Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS,
+    }  # fmt: skip
+    times = table(inside[f"{FOLDER}/{OUTPUTS}"])["time"]
+    assert float(experiment.attrib["startTime"]) == times[0] == 0.0
+    assert float(experiment.attrib["stopTime"]) == times[-1]
+    assert float(experiment.attrib["stepSize"]) == pytest.approx(np.diff(times), rel=1e-6)
+    assert set(table(inside[f"{FOLDER}/{INPUTS}"])["time"]) == set(times)
+
+
+@pytest.mark.parametrize(
+    "name", slow_but([STACK, "single_mass"], ["PTBS200", STACK, "manipulator", "single_mass"])
+)
+def test_reference_outputs_agree_with_the_independent_reference(name: str) -> None:
+    model = model_named(name).plant()
+    inside = reference_entries(model, {})
+    inputs, outputs = (table(inside[f"{FOLDER}/{n}"]) for n in (INPUTS, OUTPUTS))
+    kinks = {name: column[::100] for name, column in inputs.items()}
+    times = kinks.pop("time")
+    signals = Signals(tuple(kinks), times, np.column_stack(list(kinks.values())))
+    truth = expected_outputs(model, outputs["time"], signals)
+    for column, (output, found) in zip(truth.T, list(outputs.items())[1:], strict=True):
+        assert np.max(np.abs(column - found)) < 1e-6 * np.ptp(found), output
+
+
+@pytest.mark.usefixtures("without_binary")
+def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise SimulationError("no")
+
+    monkeypatch.setattr("psa_casadi.export.fmu.reference_run.run", fails)
+    with zipfile.ZipFile(psa.export_fmu(flexure, tmp_path / "m.fmu", fmi=3)) as archive:
+        names = set(archive.namelist())
+        page = archive.read("documentation/index.html").decode()
+    assert not any(n.startswith("extra/") for n in names)
+    assert NOTES not in names
+    assert all(link.removeprefix("../") in names for link in re.findall(r'href="([^"]*)"', page))
+
+
+SAID = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+LICENSE = (Path(__file__).parents[2] / "LICENSE").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_every_fmu_holds_the_notices_that_its_licences_ask_for(fmi: int) -> None:
+    """BSD 3-Clause for the code, BSD 2-Clause for the headers, in the binaries' documentation."""
+    inside = entries(STACK, fmi)
+    assert LICENSE_ENTRY == "documentation/licenses/license.txt"
+    text = inside[LICENSE_ENTRY].decode()
+    assert LICENSE in text
+    assert 'Modelica Association Project "FMI"' in text
+    assert "Redistributions in binary form" in text.partition("B. Headers")[2]
+    assert inside["sources/LICENSE.txt"].decode() == LICENSE
+    root = ET.fromstring(inside["modelDescription.xml"])
+    assert LICENSE_ENTRY in root.attrib["license"]
+    assert LICENSE.splitlines()[2] in root.attrib["copyright"]
+    assert not {"author", "version"} & set(root.attrib)
+
+
+@pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
+def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
+    fmi: int, tmp_path: Path
+) -> None:
+    plain, path = tmp_path / "model.json", tmp_path / "m.fmu"
+    model = replace(model_named("flexure"), publication=Publication(author="file", version="0.9"))
+    save_model(model, plain)
+    options = ["--author", SAID.author, "--copyright", SAID.copyright, "--license", SAID.license]
+    command = ("export", "fmu", "--model", plain, "--fmi", str(fmi), "-o", path)
+    done(*command, *options)
+    with zipfile.ZipFile(path) as archive:
+        xml = archive.read("modelDescription.xml").decode()
+        terms, page = (archive.read(f"documentation/{n}").decode()
+                       for n in ("licenses/license.txt", "index.html"))  # fmt: skip
+    assert_valid(xml, "schema", f"fmi{fmi}", f"fmi{fmi}ModelDescription.xsd")
+    stated = replace(SAID, version="0.9").stated
+    assert {n: ET.fromstring(xml).attrib[n] for n in stated} == stated
+    assert all(f"{name}: {text}" in terms for name, text in stated.items())
+    assert "(c) 2026 A. Author &amp; sons" in page
+    with Archive(path) as archived:
+        assert list(missing_notices(archived)) == []
+        as_exported = published_as(archived, model.plant())
+        assert as_exported.publication.stated == stated
+        assert list(unreproducible_parts(archived, as_exported)) == []
+    assert "--author is ' '" in refused(*command, "--author", " ")
+
+
+def test_a_licence_that_was_lost_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "m.fmu"
+    gone = {LICENSE_ENTRY: lambda _: b"all rights reserved\n"}
+    with Archive(rewritten(exported("flexure", 2), path, gone)) as archive:
+        (found,) = missing_notices(archive)
+    assert "lacks the notice 'Copyright (c)" in found
+    unsaid = {"modelDescription.xml": lambda xml: re.sub(rb' license="[^"]*"', b"", xml)}
+    with Archive(rewritten(exported("flexure", 2), path, unsaid)) as archive:
+        assert list(missing_notices(archive)) == ["the description states no license"]

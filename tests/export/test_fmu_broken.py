@@ -13,21 +13,121 @@ from typing import Any
 import pytest
 from fmpy.validation import _validate_variable_names
 
-from psa_casadi.errors import InputError
+import psa_casadi as psa
 from psa_casadi.export.check import agreement, binaries, check, description
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.binaries import FUNCTIONS, read_binary
-from psa_casadi.export.check.check import CheckReport, check_fmu
 from psa_casadi.export.check.rows import OF_BINARIES
-from psa_casadi.export.fmu.archive import MODEL_ENTRY, export_fmu, write_archive
+from psa_casadi.export.common.variable_table import variable_table
+from psa_casadi.export.fmu.archive import MODEL_ENTRY, write_archive
 from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.report.words.text import check_sentence
 from psa_casadi.units import FloatArray
-from tests.export.broken_descriptions import DESCRIPTIONS, STACK
 from tests.export.c_host.build import binary
 from tests.export.fmu_models import entries, exported, model_named, recompiled, rewritten
 from tests.tiers import slow, slow_but
+
+STACK = "P-885.51"
+#: Value references of the model's variables by name.
+PLACES = {v.name: k for k, v in enumerate(variable_table(model_named(STACK).plant()), 1)}
+SWITCH, KNOWNS = "switch.voltage_reversal", ("u", "voltage", "G", "R_s", "C_p")
+KINDS = "tunable tunable dependent dependent dependent"
+
+
+def _unknown(fmi: int, name: str, *knowns: str, kinds: str) -> str:
+    """Return how the description lists the dependencies of an output."""
+    places = " ".join(str(PLACES[n]) for n in knowns)
+    own = "index" if fmi == 2 else "valueReference"
+    return f'{own}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
+
+
+def _dependency(
+    name: str, before: tuple[str, str], after: tuple[str, str], fmi: int
+) -> tuple[str, str]:
+    """Return the edit of an entry; a pair has the knowns and their kinds."""
+    old, new = (_unknown(fmi, name, *k.split(), kinds=kinds) for k, kinds in (before, after))
+    return old, new
+
+
+def _of_state(fmi: int, unit: str) -> tuple[str, str]:
+    """Return the edit of the unit of der(u), the only variable in V/s that has no nominal value."""
+    more = (' intermediateUpdate="true"' if fmi == 3 else "") + ' derivative="2"'
+    return f'unit="V/s"{more}', f'unit="{unit}"{more}'
+
+
+#: By name: old and new text for a version of FMI, the rows, and a part of what one of them says.
+Faults = dict[str, tuple[Callable[[int], tuple[str, str]], set[str], str]]
+DESCRIPTIONS: Faults = {
+    "wrong token": (
+        lambda v: ('guid="{', 'guid="{0') if v == 2 else ('Token="{', 'Token="{0'),
+        {"co-simulation instantiates", "model exchange instantiates"},
+        "not of the same export",
+    ),
+    "unit without a definition": (
+        lambda _: ('<Unit name="N/V">', '<Unit name="N.V">'),
+        {"description valid", "units defined", "units consistent"},
+        "'k_L' has the unit 'N/V', which is not defined",
+    ),
+    "variable without a unit": (
+        lambda _: (' unit="N.s/m" min', " min"),
+        {"units defined"},
+        "has the unit 'None'",
+    ),
+    "wrong unit of a derivative": (
+        lambda v: _of_state(v, "V"), {"units consistent"}, "'der(u)' is in 'V', but 'u' is in 'V'",
+    ),
+    "wrong definition of a unit": (
+        lambda _: ('<BaseUnit kg="-1" m="-2" s="4" A="2"', '<BaseUnit kg="-1" m="-2" s="3" A="2"'),
+        {"units consistent"},
+        "the unit 'F' is defined as",
+    ),
+    "wrong factor of a display unit": (
+        lambda _: ('name="um" factor="1000000.0"', 'name="um" factor="1000.0"'),
+        {"units consistent"},
+        "the display unit 'um' has the factor 1000",
+    ),
+    "missing dependency": (
+        lambda v: _dependency("charge", ("u C_p", "tunable dependent"), ("u", "tunable"), v),
+        {"dependencies complete", "dependencies of the model"},
+        "'charge' depends on 'C_p', which its dependencies do not list",
+    ),
+    "superfluous dependency": (
+        lambda v: _dependency(
+            "displacement", ("x", "constant"), ("x v_x", "constant constant"), v),
+        {"dependencies of the model"},
+        "'displacement' does not depend on 'v_x', which its dependencies list",
+    ),
+    "wrong kind of a dependency": (
+        lambda v: _dependency(
+            "charge", ("u C_p", "tunable dependent"), ("u C_p", "constant dependent"), v),
+        {"dependencies of the model"},
+        "'charge' depends on 'u' in the way 'tunable', not 'constant'",
+    ),
+    "wrong start value": (
+        lambda _: ('start="0.0001"', 'start="0.0002"'),
+        {"start values"},
+        "'tau' starts at 0.0002, the model has 0.0001",
+    ),
+    "nominal value of zero": (
+        lambda _: ('nominal="65.7"', 'nominal="0.0"'),
+        {"nominal values", "model exchange"},  # a tolerance of zero for a state at zero
+        "'f_H' has the nominal value 0",
+    ),
+    "wrong nominal value": (
+        lambda _: ('nominal="65.7"', 'nominal="66.0"'),
+        {"nominal values"},
+        "'f_H' has another nominal value in the binary",
+    ),
+    "wrong number of event indicators": (
+        lambda v: (
+            ('EventIndicators="1"', 'EventIndicators="2"') if v == 2
+            else (f"<EventIndicator {_unknown(3, SWITCH, *KNOWNS, kinds=KINDS)} />", "")),
+        {"event indicators"},
+        "event indicators are announced",
+    ),
+}  # fmt: skip
+
 
 XML = "modelDescription.xml"
 VERSIONS = (2, 3)
@@ -43,7 +143,7 @@ harmless = pytest.mark.usefixtures("code_runs_here")
 ALWAYS = "reproducible"
 
 
-def _failures(report: CheckReport) -> dict[str, str]:
+def _failures(report: psa.CheckReport) -> dict[str, str]:
     return {row.name: row.remark for row in report.failures}
 
 
@@ -76,7 +176,7 @@ _OUTPUTS: dict[bytes, FloatArray] = {}
 def test_wrong_description(fault: str, fmi: int, tmp_path: Path) -> None:
     edit, rows, remark = DESCRIPTIONS[fault]
     changes = {XML: _edit(*edit(fmi))}
-    found = _failures(check_fmu(rewritten(exported(STACK, fmi), tmp_path / "b.fmu", changes)))
+    found = _failures(psa.check_fmu(rewritten(exported(STACK, fmi), tmp_path / "b.fmu", changes)))
     assert set(found) == rows | {ALWAYS}, found
     assert any(remark in found[row] for row in rows), found
 
@@ -166,7 +266,7 @@ def test_wrong_sources(faults: tuple[str, ...], tmp_path: Path) -> None:
     edits: dict[str, tuple[tuple[str, str], ...]] = {}
     for file, old, new, _ in (CORE[fault] for fault in faults):
         edits[file] = (*edits.get(file, ()), (old, new))
-    report = check_fmu(recompiled(tmp_path / "b.fmu", 2, edits))
+    report = psa.check_fmu(recompiled(tmp_path / "b.fmu", 2, edits))
     assert report.compared
     found = set(_failures(report))
     assert all(CORE[fault][3] <= found for fault in faults), found
@@ -204,7 +304,7 @@ MISSING = {
 @slow
 @harmless
 def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
-    found = _failures(check_fmu(recompiled(tmp_path / "b.fmu", 3, FACE)))
+    found = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, FACE)))
     assert {"adjoint derivatives", "life cycle", "event indicators"} == set(found), found
     assert "stays negative after an event" in found["event indicators"]
 
@@ -212,7 +312,7 @@ def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
 @slow
 @harmless
 def test_a_function_under_another_name(tmp_path: Path) -> None:
-    found = _failures(check_fmu(recompiled(tmp_path / "b.fmu", 3, MISSING)))
+    found = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, MISSING)))
     assert {"functions present", "no other symbols", "binary loads"} == set(found), found
     assert "fmi3ActivateModelPartition is missing" in found["functions present"]
     assert "fmi3ActivateModelPartitions is exported" in found["no other symbols"]
@@ -228,7 +328,7 @@ def test_binaries_that_cannot_be_used(fmi: int, tmp_path: Path) -> None:
     for wrong in (None, content[: len(content) // 2], b"no library at all"):
         path = tmp_path / "b.fmu"
         write_archive(path, left if wrong is None else {**left, name: wrong})
-        report = check_fmu(path)
+        report = psa.check_fmu(path)
         assert not report.compared
         assert "binary loads" in _failures(report)
         assert {row.name for row in report.rows if row.passed} >= {"units defined", ALWAYS}
@@ -246,10 +346,10 @@ def test_binaries_of_all_platforms_are_inspected(name: str, fmi: int) -> None:
 
 def test_without_lief_the_binaries_are_not_inspected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(binaries, "has_lief", lambda: False)
-    with pytest.raises(InputError, match="run `pip install lief`"):
-        check_fmu(exported(STACK, 2), portable=True)
+    with pytest.raises(psa.InputError, match="run `pip install lief`"):
+        psa.check_fmu(exported(STACK, 2), portable=True)
     monkeypatch.setattr(check, "rows_apart", lambda *_: [])
-    report = check_fmu(exported(STACK, 2))
+    report = psa.check_fmu(exported(STACK, 2))
     assert report.left_out == OF_BINARIES
     said = check_sentence(report)
     assert "Left out, as lief is not installed (`pip install lief`): functions present" in said
@@ -287,7 +387,7 @@ def test_what_the_compiler_of_the_system_makes_passes(
     """No wheel of a compiler: the FMU is for systems like this one, and sound."""
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.has_zig", lambda: False)
     monkeypatch.setenv("CC", "gcc")
-    report = check_fmu(export_fmu(model_named(STACK), tmp_path / "own.fmu"))
+    report = psa.check_fmu(psa.export_fmu(model_named(STACK), tmp_path / "own.fmu"))
     assert report.passed, _failures(report)
     assert "loads on GNU libc 2." in next(r.remark for r in report.rows if r.name == "GNU libc")
 
@@ -311,14 +411,14 @@ def test_sources_and_model_that_are_not_those_of_the_binary(fmi: int, tmp_path: 
     path = tmp_path / "b.fmu"
     change = _edit("\n", "\n\n")
     found = _failures(
-        check_fmu(rewritten(exported(STACK, fmi), path, {"sources/solver.c": change}))
+        psa.check_fmu(rewritten(exported(STACK, fmi), path, {"sources/solver.c": change}))
     )
     assert found == {ALWAYS: "sources/solver.c differs"}
     lost = {n: c for n, c in entries(STACK, fmi).items() if n != "sources/linear.c"}
     write_archive(path, lost)
-    assert "sources/linear.c is missing" in _failures(check_fmu(path))[ALWAYS]
+    assert "sources/linear.c is missing" in _failures(psa.check_fmu(path))[ALWAYS]
     changed = {MODEL_ENTRY: lambda _: b"{"}
-    report = check_fmu(rewritten(exported(STACK, fmi), path, changed))
+    report = psa.check_fmu(rewritten(exported(STACK, fmi), path, changed))
     assert set(_failures(report)) == {"model inside"}
     assert not report.compared
 
@@ -329,13 +429,13 @@ def test_a_folder_in_place_of_a_source(tmp_path: Path) -> None:
     path, name = tmp_path / "b.fmu", "sources/solver.c"
     files = {f"{n}/x" if n == name else n: c for n, c in entries(STACK, 2).items()}
     write_archive(path, files)
-    assert set(_failures(check_fmu(path))) == {ALWAYS}
+    assert set(_failures(psa.check_fmu(path))) == {ALWAYS}
 
 
 @harmless
 @pytest.mark.parametrize("fmi", slow_but([2], VERSIONS))
 def test_another_model(fmi: int) -> None:
-    report = check_fmu(exported(STACK, fmi), model_named("manipulator"))
+    report = psa.check_fmu(exported(STACK, fmi), model_named("manipulator"))
     assert {"start values", ALWAYS, "co-simulation, step 0.01 s", "model exchange"} <= set(
         _failures(report)
     )
@@ -344,14 +444,14 @@ def test_another_model(fmi: int) -> None:
 def test_no_fmu(tmp_path: Path) -> None:
     path = tmp_path / "text.fmu"
     path.write_text("no archive")
-    with pytest.raises(InputError, match="cannot be read as an FMU"):
-        check_fmu(path)
+    with pytest.raises(psa.InputError, match="cannot be read as an FMU"):
+        psa.check_fmu(path)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(
             XML, entries(STACK, 2)[XML].replace(b'fmiVersion="2.0"', b'fmiVersion="1.0"')
         )
-    with pytest.raises(InputError, match="export it again"):
-        check_fmu(path)
+    with pytest.raises(psa.InputError, match="export it again"):
+        psa.check_fmu(path)
 
 
 NAMES = [
@@ -393,7 +493,7 @@ def test_the_time_of_a_check_is_that_of_all_its_parts(monkeypatch: pytest.Monkey
 
     monkeypatch.setitem(description.DESCRIBED, "units defined", slowly)
     monkeypatch.setitem(description.DESCRIBED, "units consistent", slowly)
-    report = check_fmu(exported(STACK, 2), timeout=0.3)
+    report = psa.check_fmu(exported(STACK, 2), timeout=0.3)
     assert not report.passed
     assert report.rows[-1].name == "time"
     assert "time limit of 0.3 s of the whole check (--timeout sets it)" in report.rows[-1].remark

@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 from fmpy.fmi3 import FMU3ScheduledExecution
 
-from psa_casadi.components import BASE
+import psa_casadi as psa
 from psa_casadi.export.check.calls import parameter_changes
 from psa_casadi.export.check.structure import directional_error, incomplete_dependencies
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
@@ -30,7 +29,6 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
-from psa_casadi.model.compose import compose
 from tests.export.fmi3_instances import Instance3, Update, loaded, try_step
 from tests.export.fmu_models import exported, model_named, recompiled
 from tests.tiers import slow, slow_but
@@ -107,12 +105,6 @@ def test_stop_time_is_kept() -> None:
             slave.step(2e-3, 1e-3)
 
 
-def test_initial_states_are_taken() -> None:
-    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION, values={"u": 80.0}) as slave:
-        assert slave.get(["u", "charge"]) == pytest.approx([80.0, 80.0 * 1.5e-6])
-        assert slave.get(["current"])[0] == pytest.approx(-80.0 / 8.0)
-
-
 _COUNTING = """
 #include <stdarg.h>
 #include <stdio.h>
@@ -181,19 +173,6 @@ def test_what_the_model_does_not_have_gives_no_instance() -> None:
     with pytest.raises(Exception, match="Failed to instantiate"):
         other.instantiate(logMessage=lambda *told: said.append(told[-1]))
     assert b"no scheduled execution" in said[-1]
-
-
-def test_co_simulation_equals_that_of_fmi_2_bit_for_bit(slave: Instance3) -> None:
-    with Fmu(exported(STACK)) as fmu, fmu.start(CO_SIMULATION) as older:
-        for k in range(200):
-            voltage = 50.0 * np.sin(0.1 * k) if k < 150 else -20.0
-            slave.set({"voltage": voltage})
-            older.set({"voltage": voltage})
-            done = slave.try_step(k * 1e-5, 1e-5)
-            assert done[:4] == (OK, False, False, False)
-            assert done.time == pytest.approx((k + 1) * 1e-5)
-            older.step(k * 1e-5, 1e-5)
-            assert slave.get(OUTPUTS).tobytes() == older.get(OUTPUTS).tobytes()
 
 
 def test_calls_out_of_order_are_refused_with_function_and_state(slave: Instance3) -> None:
@@ -529,8 +508,8 @@ def test_a_parameter_out_of_its_bounds_is_refused(fmi: int, interface: int) -> N
 def test_the_check_keeps_the_bounds(tmp_path: Path) -> None:
     """A model whose parameters stand at their bounds passes, whatever the check moves."""
     edges = {"n": 4.0, "G": 1e4, "u_rated": 1e-3, "tau": 1.0}
-    model = compose(BASE, {**model_named(STACK).values, **edges})
-    with Fmu(export_fmu(model, tmp_path / "edges.fmu", fmi=3)) as fmu:
+    model = psa.compose(psa.BASE, {**model_named(STACK).values, **edges})
+    with Fmu(psa.export_fmu(model, tmp_path / "edges.fmu", fmi=3)) as fmu:
         assert [fmu.bounds[n] for n in ("n", "m_B")] == [(1.0, 4.0), (1e-9, 1e3)]
         assert not [*parameter_changes(fmu), *incomplete_dependencies(fmu)]
         assert directional_error(fmu) < 1e-4

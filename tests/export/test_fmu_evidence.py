@@ -11,13 +11,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.components.outputs import OUTPUT
-from psa_casadi.effects import EFFECTS
-from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.check.rows import CheckRow
@@ -31,14 +27,13 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.prepare import prepared
-from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import loads
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
 from psa_casadi.variables import Interval
-from tests.export.fmu_models import assert_valid, exported, rewritten
-from tests.model.evidence_models import evident_fmu, evident_model, files_inside, noisy_record
+from tests.contract.helpers import done
+from tests.export.fmu_models import assert_valid, exported, files_inside, rewritten
+from tests.model.evidence_models import evident_fmu, evident_model, noisy_record
 from tests.tiers import slow, slow_but
 
 
@@ -59,6 +54,14 @@ def test_experiments_name_files_that_are_there() -> None:
         assert all(f"{FOLDER}/{e.attrib['source']}" in found for e in experiment)
     for name in (n for n in found if n.endswith(".ssv")):
         assert_valid(found[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
+        root = ET.fromstring(found[name])
+        told = {
+            p.get("name"): p[0].get("unit") for p in root.iterfind("{*}Parameters/{*}Parameter")
+        }
+        assert {*told.values()} <= {u.get("name") for u in root.iterfind("{*}Units/{*}Unit")}
+        own = {p.name: p.unit for p in evident_model().structure.parameters if p.name in told}
+        assert own.items() <= told.items()
+        assert own
     one = found[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
     assert re.findall(r'Parameter name="(\w+)"', one) == ["k_L", "A", "tau"]
 
@@ -121,9 +124,8 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
     psa.save_model(evident_model(), tmp_path / "m.json")
     path, sets = tmp_path / "m.fmu", tmp_path / "sets"
     line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
-    said = CliRunner().invoke(app, f"{line} --parameter-sets 1 --sets-to {sets}".split())
-    assert said.exit_code == 0, said.output
-    assert "documentation/evidence.html (records: short), 8 parameter sets" in said.output
+    said = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
+    assert "documentation/evidence.html (records: short), 8 parameter sets" in said
     found = files_inside(path)
     assert len(list(sets.iterdir())) == 8
     for file in sets.iterdir():
@@ -187,7 +189,7 @@ def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> No
     seen = replace(stated().seen, temperature=Interval(290.0, 300.0))
     told = replace(stated(), seen=seen)
     assert "seen_temperature_low" not in with_validity(replace(model, evidence=told)).values
-    warm = replace(model.with_effect(EFFECTS["temperature"]), evidence=told)
+    warm = replace(model.with_effect(psa.EFFECTS["temperature"]), evidence=told)
     watched = with_validity(warm)
     column = watched.output_names.index(OUTPUT)
     x = [q.start for q in watched.structure.states]
@@ -198,11 +200,11 @@ def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> No
     assert seen_inputs(watched)[watched.input_names.index("temperature")] == (290.0, 300.0, np.inf)
 
 
-def carried(path: Path) -> Model:
+def carried(path: Path) -> psa.Model:
     return loads(files_inside(path)["resources/model.json"].decode())
 
 
-def play(path: Path, *records: Record) -> list[CheckRow]:
+def play(path: Path, *records: psa.Record) -> list[CheckRow]:
     with Fmu(path) as fmu:
         again = repeated(fmu, carried(path), records)
         return [r if isinstance(r, CheckRow) else played_again(fmu, r) for r in again]
@@ -223,7 +225,7 @@ def test_a_record_that_was_averaged_is_averaged_again() -> None:
     voltage = 50.0 - 50.0 * np.cos(8.0 * time)
     noise = 1e-7 * np.random.default_rng(1).standard_normal(len(time))
     clean = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
-    record = Record(name="fast", time=time, voltage=voltage, displacement=clean + noise)
+    record = psa.Record(name="fast", time=time, voltage=voltage, displacement=clean + noise)
     shorter, _ = prepared(record)
     assert shorter.n < record.n
     found = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])
@@ -304,16 +306,7 @@ def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
 
 
 @pytest.mark.slow
-def test_the_whole_check_with_evidence() -> None:
-    report = check_fmu(evident_fmu(), evidence=True, records=[noisy_record()])
-    assert report.passed, report.failures
-    names = [r.name for r in report.rows]
-    assert {"evidence inside", "reproducible", "reference run"} < set(names)
-    assert names[-1] == "held-out error of short"
-
-
-@pytest.mark.slow
 def test_an_fmu_without_evidence_does_not_pass_when_it_is_asked_for() -> None:
     """Where none is asked for, it passes: tests/export/test_fmu.py."""
-    report = check_fmu(exported("P-885.51"), evidence=True)
+    report = psa.check_fmu(exported("P-885.51"), evidence=True)
     assert [r.name for r in report.failures] == ["evidence"]

@@ -12,22 +12,62 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import fmpy
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
+from psa_casadi.export.check.binaries import FUNCTIONS
 from psa_casadi.export.check.check import CheckRow, check_fmu
 from psa_casadi.export.importer import archive as limits
 from psa_casadi.export.importer.archive import Archive, archive_problems
-from tests.export.hostile_fmus import DEED, PLACE, hostile_fmu
+from psa_casadi.files import temporary_folder
+from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
+from tests.contract.helpers import command
 from tests.export.ssp_master import SspArchive
+from tests.test_files import ended
 from tests.tiers import slow, slow_but
+
+#: What the library does, and when: "MOMENT:DEED" in this variable; MOMENT is load, make or step.
+DEED = "PSA_TEST_DEED"
+#: A file of this name takes the number of the process when the deed is done.
+PLACE = "PSA_TEST_PLACE"
+
+_SOURCES = Path(__file__).parent / "hostile"
+_SOURCE = (_SOURCES / "hostile.c").read_text("utf-8")
+
+
+#: The functions that do nothing.
+_STUBS = "".join(
+    f"API int {name}(void) {{ return 0; }}\n"
+    for name in sorted(FUNCTIONS[2] | FUNCTIONS[3])
+    if f"{name}(" not in _SOURCE
+)
+
+
+@cache
+def library() -> bytes:
+    """Return the library, compiled once for both versions of FMI, and never loaded here."""
+    with temporary_folder() as work:
+        (work / "hostile.c").write_text(_SOURCE + _STUBS, encoding="utf-8")
+        flags = ("-fPIC", "-fvisibility=hidden", "-shared", "hostile.c", "-o", "hostile.lib")
+        run_compiler([*compiler_command(), *OPTIMISE, *flags], work)
+        return (work / "hostile.lib").read_bytes()
+
+
+def hostile_fmu(path: Path, fmi: int, content: bytes | None = None) -> Path:
+    """Write the FMU, with another content of its library if one is given."""
+    folder = fmpy.platform_tuple if fmi == 3 else fmpy.platform
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.write(_SOURCES / f"fmi{fmi}.xml", "modelDescription.xml")
+        archive.writestr(f"binaries/{folder}/h{fmpy.sharedLibraryExtension}", content or library())
+    return path
+
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the code is for POSIX")
 
@@ -92,13 +132,13 @@ def test_the_command_fails_and_says_why(tmp_path: Path, monkeypatch: pytest.Monk
     """It ended with exit code 0, and without a word."""
     monkeypatch.setenv(DEED, "load:exit")
     path = hostile_fmu(tmp_path / "h.fmu", 2)
-    done = CliRunner().invoke(app, ["check", str(path), "--timeout", "30", "--memory", "512"])
-    assert done.exit_code == 1
-    assert "binary loads" in done.stdout.splitlines()[-1]
-    head, *lines = done.stdout.splitlines()
+    ended = command("check", path, "--timeout", "30", "--memory", "512")
+    assert ended.code == 1
+    assert "binary loads" in ended.out.splitlines()[-1]
+    head, *lines = ended.out.splitlines()
     remarks = " ".join(" ".join(line[head.index("remark") :] for line in lines).split())
     assert "the FMU ended its process with exit code 0 before the checks were done" in remarks
-    assert "RUNS THE CODE" in CliRunner().invoke(app, ["check", "--help"]).stdout
+    assert "RUNS THE CODE" in command("check", "--help").out
 
 
 @slow
@@ -123,7 +163,7 @@ def test_a_hang_ends_at_the_time_limit(
         "did not come back within the time limit of 4 s of the whole check (--timeout sets it)"
         in row.remark
     )
-    assert _gone(tmp_path / "place")
+    assert ended(int((tmp_path / "place").read_text()))
 
 
 @slow
@@ -132,22 +172,7 @@ def test_a_process_of_the_fmu_is_ended_with_it(
 ) -> None:
     monkeypatch.setenv(PLACE, str(tmp_path / "place"))
     _ended(tmp_path, 2, "step:child", monkeypatch)
-    assert _gone(tmp_path / "place")
-
-
-def _gone(place: Path) -> bool:
-    """Say whether the process that noted its number ends within a second."""
-    number = int(place.read_text())
-    for _ in range(50):
-        try:
-            os.kill(number, 0)
-            state = Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except (ProcessLookupError, FileNotFoundError):
-            return True
-        if state == "Z":  # dead, and not yet fetched by whoever inherited it
-            return True
-        time.sleep(0.02)
-    return False
+    assert ended(int((tmp_path / "place").read_text()))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits memory")
@@ -185,7 +210,7 @@ def test_a_request_to_end_leaves_nothing_behind(request_: signal.Signals, tmp_pa
         process.send_signal(request_)
         assert process.wait(30) not in (0, 1, 2)
     assert list(folder.iterdir()) == []
-    assert _gone(place)
+    assert ended(int(place.read_text()))
 
 
 Change = Callable[[zipfile.ZipFile], None]

@@ -2,20 +2,60 @@
 
 import hashlib
 import json
+import tempfile
+import zipfile
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 
 import casadi as ca
+import fmpy
 import numpy as np
 import numpy.typing as npt
 import pytest
+from fmpy.fmi2 import FMU2Model
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi.model.ports import ports_of, with_ports
+from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import start_state
-from tests.export.plain_fmu import pendulum
+
+_FOLDER = tempfile.TemporaryDirectory()
+_SOURCES = Path(__file__).parent / "pendulum"
+
+
+@cache
+def pendulum(*, indicators: int = 0, once: str = "false") -> Path:
+    """Return the FMU of the pendulum, with other words in its description."""
+    folder = Path(_FOLDER.name) / f"{indicators}{once}"
+    folder.mkdir()
+    path = folder / "pendulum.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        said = (_SOURCES / "modelDescription.xml").read_text("utf-8")
+        said = said.format(indicators=indicators, once=once)
+        archive.writestr("modelDescription.xml", said)
+        place = f"binaries/{fmpy.platform}/pendulum{fmpy.sharedLibraryExtension}"
+        archive.write(_binary(), place)
+    return path
+
+
+@cache
+def _binary() -> Path:
+    folder = Path(_FOLDER.name)
+    code = (_SOURCES / "pendulum.c").read_text("utf-8")
+    (folder / "pendulum.c").write_text(code, encoding="utf-8")
+    # further ones of the standard, which importers look up
+    names = [n for n in dir(FMU2Model) if n[:4] == "fmi2" and f" {n}(" not in code]
+    refused = "".join(f"int {name}(void) {{ return 3; }}\n" for name in names)
+    (folder / "refused.c").write_text(refused, encoding="utf-8")
+    library = folder / f"pendulum{fmpy.sharedLibraryExtension}"
+    headers = files("fmpy") / "c-code"
+    command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{headers}"]
+    run_compiler([*command, "pendulum.c", "refused.c", "-lm", "-o", str(library)], folder)
+    return library
+
 
 FloatArray = npt.NDArray[np.float64]
 FREE = {"length": (0.1, 5.0), "damping": (1e-3, 1.0)}

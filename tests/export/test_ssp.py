@@ -2,16 +2,14 @@
 
 import re
 import zipfile
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fmpy.ssp.ssd import read_ssd
 from lxml import etree  # type: ignore[import-untyped]
-from typer.testing import CliRunner, Result
 
-from psa_casadi.cli.app import app
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.importer.masters import Signals
@@ -108,33 +106,20 @@ def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
 
 def test_no_wire_runs_through_a_part_or_on_another_wire() -> None:
     layout = layout_of(wiring_of(closed_loop()))
-    pieces: list[tuple[tuple[float, float], tuple[float, float], int]] = []
-    for number, path in enumerate(layout.paths):
-        for a, b in pairwise(path):
-            assert a[0] == b[0] or a[1] == b[1], "wires have right angles"
-            for box in layout.boxes:
-                x1, x2 = sorted((a[0], b[0]))
-                y1, y2 = sorted((a[1], b[1]))
-                apart = x2 <= box.x1 or x1 >= box.x2 or y2 <= box.y1 or y1 >= box.y2
-                assert apart, (layout.wires[number], box.name)
-            pieces.append((a, b, number))
-    starts = [w.start for w in layout.wires]
-    for a, b, first in pieces:
-        for c, d, second in pieces:
-            if first < second and starts[first] != starts[second]:
-                assert not _on_each_other(a, b, c, d), (layout.wires[first], layout.wires[second])
-
-
-def _on_each_other(
-    a: tuple[float, float], b: tuple[float, float], c: tuple[float, float], d: tuple[float, float]
-) -> bool:
-    for along in (0, 1):
-        across = 1 - along
-        if a[across] == b[across] == c[across] == d[across]:
-            low = max(min(a[along], b[along]), min(c[along], d[along]))
-            high = min(max(a[along], b[along]), max(c[along], d[along]))
-            return high > low
-    return False
+    pieces = [
+        (wire, *np.sort(ends, axis=0))
+        for wire, path in zip(layout.wires, layout.paths, strict=True)
+        for ends in pairwise(path)
+    ]
+    for wire, low, high in pieces:
+        assert np.any(low == high), "wires have right angles"
+        for box in layout.boxes:
+            apart = (high <= (box.x1, box.y1)) | (low >= (box.x2, box.y2))
+            assert apart.any(), (wire, box.name)
+    for (one, *a), (other, *b) in combinations(pieces, 2):
+        common = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
+        crossing = np.any(common < 0.0) or not np.any(common > 0.0)  # at a point, or nowhere
+        assert crossing or one.start == other.start, (one, other)
 
 
 @slow
@@ -193,35 +178,6 @@ def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     )
     assert results is not None
     assert results[1] == wiring.name
-
-
-def psa(*arguments: str) -> Result:
-    return CliRunner().invoke(app, arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentences"),
-    [
-        (("--model", "m.json", "--stack", "demo", "-o", "stage.ssp"), ("both given",)),
-        (
-            ("--stack", "P-1", "-o", "absent/stage.ssp", "--picture", "wiring.gif"),
-            ("P-1", "absent does not exist", "is .svg or .png"),
-        ),
-        (("--stack", "P-885.51", "--platforms", "vax", "-o", "stage.ssp"), ("vax",)),
-    ],
-)
-def test_mistakes_are_told_at_once_and_nothing_is_written(
-    arguments: tuple[str, ...],
-    sentences: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    found = psa("export", "ssp", *arguments)
-    assert found.exit_code == 2
-    for sentence in sentences:
-        assert sentence in found.output
-    assert not list(tmp_path.iterdir())
 
 
 def ramp() -> Signals:

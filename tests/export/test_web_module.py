@@ -5,12 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from psa_casadi.component import Component
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+import psa_casadi as psa
 from psa_casadi.export.web import web_module
-from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.page.live import live_data
 from psa_casadi.simulation.simulate import accurate, input_samples
 from psa_casadi.simulation.start import start_on
@@ -44,24 +40,24 @@ def off(found: FloatArray, wanted: FloatArray) -> float:
     return float(np.max(np.abs(found - wanted)) / np.ptp(wanted))
 
 
-def inputs(model: Model, v: FloatArray) -> FloatArray:
+def inputs(model: psa.Model, v: FloatArray) -> FloatArray:
     """Return the samples of all inputs, those beside the voltage constant."""
     return input_samples(model, len(v), {"voltage": v})
 
 
-def started(model: Model, t: FloatArray, v: FloatArray) -> FloatArray:
+def started(model: psa.Model, t: FloatArray, v: FloatArray) -> FloatArray:
     return start_on(model, t, inputs(model, v)).x
 
 
-def ordinary_size(model: Model, effect: Component) -> float:
+def ordinary_size(model: psa.Model, effect: psa.Component) -> float:
     """Return the gain that a page switches an effect on with."""
     (told,) = (e for e in live_data(model, b"")["effects"] if e["name"] == effect.name)
     return float(told["on"])
 
 
-def everything() -> Model:
-    model = stack_model("P-885.51")
-    for effect in EFFECTS.values():
+def everything() -> psa.Model:
+    model = psa.stack_model("P-885.51")
+    for effect in psa.EFFECTS.values():
         model = model.with_effect(effect)
     return model
 
@@ -69,8 +65,8 @@ def everything() -> Model:
 @slow
 def test_every_effect_runs_in_one_module_as_it_does_here(browser: Browser) -> None:
     model, (t, v) = everything(), loops()
-    rows: dict[str, Model] = {"none": model}
-    for effect in EFFECTS.values():
+    rows: dict[str, psa.Model] = {"none": model}
+    for effect in psa.EFFECTS.values():
         rows[effect.name] = model.with_values({effect.gain or "": ordinary_size(model, effect)})
     starts = {name: started(m, t, v) for name, m in rows.items()}
     told = run_in_browser(
@@ -87,13 +83,13 @@ def test_every_effect_runs_in_one_module_as_it_does_here(browser: Browser) -> No
 
 
 def test_a_model_that_no_page_runs_is_refused() -> None:
-    with pytest.raises(InputError, match="sampled states"):
+    with pytest.raises(psa.InputError, match="sampled states"):
         web_module(controller())
 
 
 @slow
 def test_a_module_asks_for_nothing_but_mathematical_functions() -> None:
-    module = web_module(stack_model("P-885.51"))
+    module = web_module(psa.stack_model("P-885.51"))
     assert module[:4] == b"\0asm"
     assert len(module) < 90_000
     asked = set(re.findall(rb"Math[\x01-\x08]([a-z0-9]+)\x00", module))

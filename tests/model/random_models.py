@@ -5,9 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.component import Component
-from psa_casadi.components import BASE
-from psa_casadi.model.compose import Model, compose
+import psa_casadi as psa
 from psa_casadi.units import FloatArray
 
 
@@ -21,17 +19,17 @@ class Point:
 
 
 def random_model(
-    effects: Sequence[Component],
+    effects: Sequence[psa.Component],
     generator: np.random.Generator,
     *,
     gains: bool,
-    base: Sequence[Component] = BASE,
-) -> Model:
+    base: Sequence[psa.Component] = psa.BASE,
+) -> psa.Model:
     """Return the base with effects; every value within 30 % of its default or ordinary size.
 
     The gains are 0, or with `gains` one to three times their ordinary size.
     """
-    model = compose((*base, *effects))
+    model = psa.compose((*base, *effects))
     values: dict[str, float] = {}
     for parameter in model.structure.parameters:
         share = generator.uniform(0.7, 1.3)
@@ -46,7 +44,7 @@ def random_model(
     return model.with_values(values)
 
 
-def random_point(model: Model, generator: np.random.Generator) -> Point:
+def random_point(model: psa.Model, generator: np.random.Generator) -> Point:
     """Return states of their ordinary size with either sign, and inputs within the ratings."""
     x = model.state_nominals() * generator.normal(size=len(model.state_names))
     rated = model.values["u_rated"]

@@ -7,48 +7,46 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from psa_casadi.component import Component, Equations
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.variables import Input, Output, Parameter, State
+import psa_casadi as psa
 
 FloatArray = NDArray[np.float64]
 
 PERIOD, LAG, GAIN, PROPORTIONAL, INTEGRAL = 1e-3, 4e-3, 2.0, 0.6, 150.0
 
-PLANT = Component(
+PLANT = psa.Component(
     name="lag",
     description="first-order lag",
     source="textbook",
     parameters=(
-        Parameter("lag", LAG, "s", (1e-6, 10.0), "time constant"),
-        Parameter("gain", GAIN, "m/V", (0.0, 1e3), "gain"),
+        psa.Parameter("lag", LAG, "s", (1e-6, 10.0), "time constant"),
+        psa.Parameter("gain", GAIN, "m/V", (0.0, 1e3), "gain"),
     ),
-    states=(State("position", "m", "position", nominal=1.0),),
-    inputs=(Input("disturbance", "V", "added to the command", nominal=1.0),),
-    outputs=(Output("shown", "m", "position that is shown"),),
-    equations=lambda s: Equations(
+    states=(psa.State("position", "m", "position", nominal=1.0),),
+    inputs=(psa.Input("disturbance", "V", "added to the command", nominal=1.0),),
+    outputs=(psa.Output("shown", "m", "position that is shown"),),
+    equations=lambda s: psa.Equations(
         der={"position": (s.gain * (s.command + s.disturbance) - s.position) / s.lag},
         out={"shown": s.position},
     ),
 )
 
-CONTROLLER = Component(
+CONTROLLER = psa.Component(
     name="sampled_pi",
     description="sampled PI controller",
     source="textbook",
     parameters=(
-        Parameter("T_s", PERIOD, "s", (1e-6, 1.0), "sample period"),
-        Parameter("k_p", PROPORTIONAL, "V/m", (0.0, 1e3), "proportional gain"),
-        Parameter("k_i", INTEGRAL, "V/(m.s)", (0.0, 1e6), "integral gain"),
+        psa.Parameter("T_s", PERIOD, "s", (1e-6, 1.0), "sample period"),
+        psa.Parameter("k_p", PROPORTIONAL, "V/m", (0.0, 1e3), "proportional gain"),
+        psa.Parameter("k_i", INTEGRAL, "V/(m.s)", (0.0, 1e6), "integral gain"),
     ),
     sampled=(
-        State("integral", "V", "integral part", nominal=1.0),
-        State("command", "V", "command that is held", nominal=1.0),
+        psa.State("integral", "V", "integral part", nominal=1.0),
+        psa.State("command", "V", "command that is held", nominal=1.0),
     ),
     sample_period="T_s",
-    inputs=(Input("reference", "m", "reference", nominal=1.0),),
-    outputs=(Output("voltage", "V", "command that is sent"),),
-    equations=lambda s: Equations(
+    inputs=(psa.Input("reference", "m", "reference", nominal=1.0),),
+    outputs=(psa.Output("voltage", "V", "command that is sent"),),
+    equations=lambda s: psa.Equations(
         next={
             "integral": s.integral + s.k_i * s.T_s * (s.reference - s.position),
             "command": s.integral + s.k_p * (s.reference - s.position),
@@ -58,29 +56,29 @@ CONTROLLER = Component(
 )
 
 #: A controller of its own: its measurement is an input, and it has no continuous state.
-ALONE = Component(
+ALONE = psa.Component(
     name="controller",
     description="sampled PI controller with a direct part",
     source="textbook",
     parameters=CONTROLLER.parameters,
     sampled=CONTROLLER.sampled,
     sample_period="T_s",
-    inputs=(*CONTROLLER.inputs, Input("position", "m", "measured position", nominal=1.0)),
+    inputs=(*CONTROLLER.inputs, psa.Input("position", "m", "measured position", nominal=1.0)),
     outputs=CONTROLLER.outputs,
     equations=CONTROLLER.equations,
 )
 
 
 @cache
-def loop() -> Model:
+def loop() -> psa.Model:
     """Return the closed loop; its inputs are (disturbance, reference)."""
-    return compose((PLANT, CONTROLLER), name="loop")
+    return psa.compose((PLANT, CONTROLLER), name="loop")
 
 
 @cache
-def controller() -> Model:
+def controller() -> psa.Model:
     """Return the controller alone: two sampled states and no continuous one."""
-    return compose((ALONE,), name="controller")
+    return psa.compose((ALONE,), name="controller")
 
 
 def grid(count: int, step: float, start: float = 0.0) -> FloatArray:

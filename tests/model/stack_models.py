@@ -2,10 +2,7 @@
 
 import numpy as np
 
-from psa_casadi.component import Component
-from psa_casadi.components import BASE
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS
+import psa_casadi as psa
 from psa_casadi.units import FloatArray
 
 #: The paper's stacks: the others are identified and have no published stroke.
@@ -14,12 +11,12 @@ PAPER_STACKS = ("P-885.51", "PTBS200", "WYDS0808020")
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
 
 
-def stack(name: str, **changes: float) -> Model:
-    figures = {key: figure.value for key, figure in STACKS[name].values.items()}
-    return compose(BASE, figures | changes)
+def stack(name: str, **changes: float) -> psa.Model:
+    figures = {key: figure.value for key, figure in psa.STACKS[name].values.items()}
+    return psa.compose(psa.BASE, figures | changes)
 
 
-def at_ordinary_size(model: Model, effect: Component) -> Model:
+def at_ordinary_size(model: psa.Model, effect: psa.Component) -> psa.Model:
     """Return a model with one more effect, its gain at an ordinary size or step."""
     model = model.with_effect(effect)
     gain = model.parameter(str(effect.gain))
@@ -34,7 +31,7 @@ def sine(t: FloatArray, frequency: float) -> FloatArray:
     return voltage
 
 
-def jacobian(model: Model) -> FloatArray:
+def jacobian(model: psa.Model) -> FloatArray:
     """Return df/dx at rest by differences of a linear function, shape (nx, nx)."""
     linear = model.with_values(LINEAR)
     p, size = linear.parameter_vector(), linear.state_nominals()

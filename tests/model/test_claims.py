@@ -8,20 +8,17 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from psa_casadi.component import READ_OFF, RECORD_DURATION, Component
-from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
-from psa_casadi.model.compose import Model, Structure, compose
-from psa_casadi.model.parts import PARTS, part_model
+import psa_casadi as psa
+from psa_casadi.component import READ_OFF, RECORD_DURATION
+from psa_casadi.model.compose import Structure
 from psa_casadi.simulation.compiler import functions_of, generate_c, shared_library
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.stepper import run
 from psa_casadi.units import FloatArray, convert
-from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
+from psa_casadi.variables import nominal_value
 from tests.model.random_models import Point, random_model, random_point
 from tests.tiers import slow, slow_but
 
-ALL = tuple(EFFECTS.values())
+ALL = tuple(psa.EFFECTS.values())
 _draw = random.Random(20)  # pairs and triples: all of them would take too long
 SETS = [
     *((e,) for e in ALL),
@@ -35,7 +32,7 @@ every_effect = pytest.mark.parametrize("effect", ALL, ids=lambda e: e.name)
 each_in_turn = pytest.mark.parametrize("effect", slow_but(ALL[::4], ALL), ids=lambda e: e.name)
 
 
-def name_of(effects: tuple[Component, ...]) -> str:
+def name_of(effects: tuple[psa.Component, ...]) -> str:
     return "all" if effects == ALL else "+".join(e.name for e in effects) or "base"
 
 
@@ -64,13 +61,13 @@ def compiled(structure: Structure) -> ctypes.CDLL:
     return ctypes.CDLL(str(shared_library(texts, ["model_casadi.c"])))
 
 
-def values_of(model: Model, point: Point) -> list[FloatArray]:
+def values_of(model: psa.Model, point: Point) -> list[FloatArray]:
     """Return x' and the outputs as CasADi evaluates them."""
     result = model.structure.f(point.time, point.x, point.u, model.parameter_vector())
     return [np.array(part).ravel() for part in result]
 
 
-def c_values(model: Model, name: str, point: Point, sizes: list[int]) -> list[FloatArray]:
+def c_values(model: psa.Model, name: str, point: Point, sizes: list[int]) -> list[FloatArray]:
     """Call one compiled function; its results have the given sizes."""
     results = [np.full(size, np.nan) for size in sizes]
     arrays = (point.x, point.u, model.parameter_vector(), *results)
@@ -81,7 +78,7 @@ def c_values(model: Model, name: str, point: Point, sizes: list[int]) -> list[Fl
 
 
 def drive(
-    model: Model, samples: int, sample_time: float, start: float
+    model: psa.Model, samples: int, sample_time: float, start: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return times and inputs that begin at rest; two tones make minor loops."""
     t = np.linspace(0.0, (samples - 1) * sample_time, samples)
@@ -89,7 +86,7 @@ def drive(
     return start + t, inputs_of(model, t, voltage, 50.0 * np.sin(4e3 * t))
 
 
-def inputs_of(model: Model, t: FloatArray, voltage: FloatArray, load: FloatArray) -> FloatArray:
+def inputs_of(model: psa.Model, t: FloatArray, voltage: FloatArray, load: FloatArray) -> FloatArray:
     """Return the samples of all inputs; a temperature climbs by three kelvin from its reference."""
     given = {"voltage": voltage, "load_force": load}
     if "temperature" in model.input_names:
@@ -97,7 +94,7 @@ def inputs_of(model: Model, t: FloatArray, voltage: FloatArray, load: FloatArray
     return input_samples(model, len(t), given)
 
 
-def start_of(effect: Component, model: Model) -> FloatArray:
+def start_of(effect: psa.Component, model: psa.Model) -> FloatArray:
     """Return all states at 0, or at the first of the effect's trial starts."""
     start = np.zeros(len(model.state_names))
     for name, value in (effect.trial_starts[0] if effect.trial_starts else {}).items():
@@ -106,7 +103,7 @@ def start_of(effect: Component, model: Model) -> FloatArray:
 
 
 @pytest.mark.parametrize("effects", SETS, ids=name_of)
-def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
+def test_gain_0_is_the_base_exactly(effects: tuple[psa.Component, ...]) -> None:
     generator = np.random.default_rng(1)
     for _ in range(10):
         model = random_model(effects, generator, gains=False)
@@ -124,7 +121,7 @@ def test_gain_0_is_the_base_exactly(effects: tuple[Component, ...]) -> None:
 
 
 @each_in_turn
-def test_a_gain_changes_what_is_measured(effect: Component) -> None:
+def test_a_gain_changes_what_is_measured(effect: psa.Component) -> None:
     """At its ordinary size every effect shows: by more than 1e-4 of the stroke, and alone."""
     model = random_model((effect,), np.random.default_rng(3), gains=True)
     sizes = effect.finite_step or (1.0,)
@@ -134,12 +131,12 @@ def test_a_gain_changes_what_is_measured(effect: Component) -> None:
     voltage = 50.0 * (1.0 - np.cos(2 * np.pi * t)) + 20.0 * (t > 0.7)
     u = inputs_of(model, t, voltage, np.zeros_like(t))
     start = start_of(effect, model)
-    shown = [run(model.with_values({gain.name: g}), t, u, start).y[:, -1] for g in (0.0, step)]
+    shown = [psa.run(model.with_values({gain.name: g}), t, u, start).y[:, -1] for g in (0.0, step)]
     assert np.abs(shown[1] - shown[0]).max() > 1e-4 * np.ptp(shown[0])
 
 
 @every_effect
-def test_declaration_is_complete(effect: Component) -> None:
+def test_declaration_is_complete(effect: psa.Component) -> None:
     for text in (effect.description, effect.source, effect.looks_like, effect.equation_text):
         assert len(text) > 10
     assert effect.belongs_to in ("plant", "drive", "sensor", "environment")
@@ -159,23 +156,23 @@ def test_declaration_is_complete(effect: Component) -> None:
             assert all(low <= v <= high for v in values)
 
 
-def _model_with(component: Component) -> Model:
+def _model_with(component: psa.Component) -> psa.Model:
     """Return a model that a component is in: a part, else a stack, with what may be added to it."""
-    for part in PARTS.values():
-        if component.name in part.components and component not in BASE:
-            return part_model(part.name)
-    if component in SIMPLIFIED and component not in BASE:
-        return compose(SIMPLIFIED)
+    for part in psa.PARTS.values():
+        if component.name in part.components and component not in psa.BASE:
+            return psa.part_model(part.name)
+    if component in psa.SIMPLIFIED and component not in psa.BASE:
+        return psa.compose(psa.SIMPLIFIED)
     if component.name == "memory_spectrum":
-        return compose([component if c.name == "bouc_wen" else c for c in BASE])
-    added = [component] if component not in (*BASE, *ALL) else []
-    model = compose([*BASE, *ALL, *added])
+        return psa.compose([component if c.name == "bouc_wen" else c for c in psa.BASE])
+    added = [component] if component not in (*psa.BASE, *ALL) else []
+    model = psa.compose([*psa.BASE, *ALL, *added])
     assert component in model.components
     return model
 
 
-@pytest.mark.parametrize("component", [*COMPONENTS.values(), *ALL], ids=lambda c: c.name)
-def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
+@pytest.mark.parametrize("component", [*psa.COMPONENTS.values(), *ALL], ids=lambda c: c.name)
+def test_variables_have_units_bounds_and_sizes(component: psa.Component) -> None:
     model = _model_with(component)
     for parameter in component.parameters:
         low, high = parameter.bounds
@@ -186,9 +183,9 @@ def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
     assert all(0.0 < sizes[s.name] < 1e6 for s in component.states)
     held = [nominal_value(s.nominal, model.values) for s in component.sampled]
     assert all(0.0 < size < 1e6 for size in held)
-    shown: list[Input | Output] = [*component.inputs, *component.outputs]
+    shown: list[psa.Input | psa.Output] = [*component.inputs, *component.outputs]
     assert all(0.0 < nominal_value(v.nominal, model.values) < 1e6 for v in shown)
-    variables: list[Parameter | State | Input | Output] = [*component.parameters]
+    variables: list[psa.Parameter | psa.State | psa.Input | psa.Output] = [*component.parameters]
     variables += [*component.states, *component.sampled, *shown]
     for variable in variables:
         assert len(variable.description) > 3
@@ -197,7 +194,7 @@ def test_variables_have_units_bounds_and_sizes(component: Component) -> None:
 
 
 @pytest.mark.parametrize("effects", [(), EVERY], ids=name_of)
-def test_c_value_is_the_casadi_value(effects: tuple[Component, ...]) -> None:
+def test_c_value_is_the_casadi_value(effects: tuple[psa.Component, ...]) -> None:
     generator = np.random.default_rng(4)
     for gains in (True, True, True, False):
         model = random_model(effects, generator, gains=gains)
@@ -216,7 +213,7 @@ def test_c_value_is_the_casadi_value(effects: tuple[Component, ...]) -> None:
 
 
 @each_in_turn
-def test_sensitivities_are_differences_of_runs(effect: Component) -> None:
+def test_sensitivities_are_differences_of_runs(effect: psa.Component) -> None:
     """Steps that end at a reversal move with the parameters; their lengths count as constant."""
     model = random_model((effect,), np.random.default_rng(6), gains=True)
     unknowns = [*(p.name for p in effect.parameters), "k_L", "A", "beta", "gamma", "tau", "k_B"]
@@ -226,13 +223,13 @@ def test_sensitivities_are_differences_of_runs(effect: Component) -> None:
     allowed = 5e-3 if effect.belongs_to == "drive" else 5e-4
     # thresholds that follow the rate fall within microseconds at a reversal
     rtol = 1e-9 if effect.name == "rate_dependent_hysteresis" else 1e-8
-    exact = run(model, t, u, start, rtol=rtol, unknowns=unknowns).sensitivity[:, -1]
+    exact = psa.run(model, t, u, start, rtol=rtol, unknowns=unknowns).sensitivity[:, -1]
     for column, name in enumerate(unknowns):
         # a tone turns many times; a small gain would drown in the stepper's own error
         share = 3e-6 if name == effect.tone else 3e-2 if name == effect.gain else 3e-4
         step = share * model.parameter(name).typical(model.values)
         moved = [{**model.values, name: model.values[name] + h} for h in (step, -step)]
-        ends = [run(model, t, u, start, rtol=rtol, values=values).y for values in moved]
+        ends = [psa.run(model, t, u, start, rtol=rtol, values=values).y for values in moved]
         found = (ends[0][:, -1] - ends[1][:, -1]) / (2 * step)
         size = np.abs(exact[:, column]).max()
         assert size > 0.0, name

@@ -9,18 +9,16 @@ from typing import Any
 
 import pytest
 
-from psa_casadi.errors import InputError
-from psa_casadi.model.compose import Model
+import psa_casadi as psa
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.strict_json import MOST_BYTES, json_text, parse_json, read_json
 from psa_casadi.variables import Interval, Provenance
 from tests.model.evidence_models import evident_model
 from tests.mutations import sentences
 from tests.studies.fuzz.damage import damaged_bytes
 
-MODEL = stack_model("demo")
+MODEL = psa.stack_model("demo")
 
 
 def _short() -> Evidence | None:
@@ -75,6 +73,12 @@ def same_or_refused(text: str) -> bool:
     return False
 
 
+def test_a_whole_file_comes_back() -> None:
+    said = psa.Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+    text = dumps(replace(SAVED, publication=said))
+    assert dumps(loads(text)) == text
+
+
 def _places(content: Any) -> Iterator[tuple[Any, Any]]:
     keys = content if isinstance(content, dict) else range(len(content))
     for key in keys:
@@ -121,9 +125,7 @@ def refused(change: Callable[[dict[str, Any]], object]) -> str:
 GONE = object()
 #: What is said of a file in which a value at a place is another one, or is gone.
 NAMED: dict[str, tuple[str, Any]] = {
-    "its format is 'x/2', expected 'psa_casadi.model/1'": ("format", "x/2"),
     "'components' is missing; give a list": ("components", GONE),
-    "unknown name 'engine' in components": ("components.+", "engine"),
     "unknown name 'slow_creep' in components": ("components.+", "slow_creep"),
     "'components[5]' is {'name': 'warp'}; give a text": ("components.5", {"name": "warp"}),
     "'effects[0]' is [1]; give a text or names with": ("effects.+", [1]),
@@ -131,15 +133,9 @@ NAMED: dict[str, tuple[str, Any]] = {
     "'drive' is listed 10001 times": ("components", ["drive"] * 10_001),
     "'linear_force' is listed 2 times": ("components.+", "linear_force"),
     "'parameters' is missing; give names with values": ("parameters", GONE),
-    "parameter 'k_L' [N/V] has no value": ("parameters.k_L", GONE),
-    "'parameters.tau.value' is 'fast'; give a number": ("parameters.tau.value", "fast"),
     "'parameters.m_P.value' is True": ("parameters.m_P.value", True),
-    "'tau' is given in 'ms'; convert it to 's'": ("parameters.tau.unit", "ms"),
-    "'n' is 17 1, outside its bounds": ("parameters.n.value", 17),
     "unknown parameters ['warp']": ("parameters.warp", {"value": 1}),
-    "the interval of 'n' is [2.0, 1.0]; give [low": ("parameters.n.interval", [2, 1]),
     "'parameters.n.interval' is [1]; give [low, high] or null": ("parameters.n.interval", [1]),
-    "'parameters.n.free' is 'no'; give true or false": ("parameters.n.free", "no"),
     "'identified_from[0].sha256' is missing": ("identified_from", [{"record": "a"}]),
     "'notes' is 'one'; give a list": ("notes", "one"),
     "'publication.author' is 3; give a text": ("publication", {"author": 3}),
@@ -207,7 +203,7 @@ def test_many_mistakes_are_listed_up_to_twenty() -> None:
         assert problems[-1].startswith("... and ")
 
 
-UNWRITABLE: dict[str, Callable[[Model], Model]] = {
+UNWRITABLE: dict[str, Callable[[psa.Model], psa.Model]] = {
     "U+0000": lambda m: replace(m, description="a\0b"),
     "U+D800": lambda m: replace(m, name="\ud800"),
     "U+001B": lambda m: replace(m, provenance=replace(m.provenance, notes=("\x1b[2J",))),
@@ -219,7 +215,7 @@ UNWRITABLE: dict[str, Callable[[Model], Model]] = {
 
 @pytest.mark.parametrize("expected", UNWRITABLE)
 def test_a_model_that_could_not_be_read_again_is_not_saved(expected: str) -> None:
-    with pytest.raises(InputError, match=r"cannot be saved as MODEL\.json") as caught:
+    with pytest.raises(psa.InputError, match=r"cannot be saved as MODEL\.json") as caught:
         dumps(UNWRITABLE[expected](SAVED))
     assert expected in str(caught.value)
 

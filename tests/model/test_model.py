@@ -1,78 +1,76 @@
 """Composition, values, and MODEL.json."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
-from psa_casadi.model.compose import compose
-from psa_casadi.model.model_file import loads
-from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.stepper import run
-from psa_casadi.variables import Output, Parameter, State
-from tests.tiers import slow_but
+import psa_casadi as psa
+from psa_casadi.model.evidence import Evidence
+from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.records.split import divided
+from psa_casadi.variables import Interval
+from tests.model.evidence_models import NOISE, OFFSET, evident_model, noisy_record
 
-CREEP, DRIFT = EFFECTS["slow_creep"], EFFECTS["offset_drift"]
-SETS = {"base": BASE, "simplified": SIMPLIFIED, "all": (*BASE, *EFFECTS.values())}
+CREEP, DRIFT = psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]
 
 
-def component(equations: Callable[[Symbols], Equations], **declared: Any) -> Component:
-    return Component("extra", "for a test", "none", equations, **declared)
+def component(equations: Callable[[psa.Symbols], psa.Equations], **declared: Any) -> psa.Component:
+    return psa.Component("extra", "for a test", "none", equations, **declared)
 
 
 def message(build: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(psa.InputError) as caught:
         build()
     return str(caught.value)
 
 
-def gain_of(name: str, value: float = 0.0) -> Parameter:
-    return Parameter(name, value, "1", (0.0, 1.0), "a gain")
+def gain_of(name: str, value: float = 0.0) -> psa.Parameter:
+    return psa.Parameter(name, value, "1", (0.0, 1.0), "a gain")
 
 
 def test_a_loop_of_balances_is_named() -> None:
-    loop = component(lambda s: Equations(add={"drive_voltage": 0.1 * s.stack_current}))
-    text = message(lambda: compose((*BASE, loop)))
+    loop = component(lambda s: psa.Equations(add={"drive_voltage": 0.1 * s.stack_current}))
+    text = message(lambda: psa.compose((*psa.BASE, loop)))
     loop_names = text.split(":")[1].split(";")[0].strip().split(" -> ")
     assert loop_names[0] == loop_names[-1]
     assert set(loop_names) == {"drive_voltage", "drive_current", "stack_current"}
-    own = component(lambda s: Equations(add={"tip_force": 2 * s.tip_force}))
-    assert "tip_force -> tip_force;" in message(lambda: compose((*BASE, own)))
+    own = component(lambda s: psa.Equations(add={"tip_force": 2 * s.tip_force}))
+    assert "tip_force -> tip_force;" in message(lambda: psa.compose((*psa.BASE, own)))
 
 
 def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
-    state = State("z", "m", "a state", 1.0)
+    state = psa.State("z", "m", "a state", 1.0)
     bare = component(
-        lambda _: Equations(), states=(state,), outputs=(Output("w", "m", "an output"),)
+        lambda _: psa.Equations(), states=(state,), outputs=(psa.Output("w", "m", "an output"),)
     )
-    text = message(lambda: compose((*BASE, bare)))
+    text = message(lambda: psa.compose((*psa.BASE, bare)))
     assert "lacks the derivative of the state 'z'" in text
     assert "lacks the equation of the output 'w'" in text
-    foreign = component(lambda s: Equations(der={"x": s.v_x}, out={"displacement": s.x}))
-    text = message(lambda: compose((*BASE, foreign)))
+    foreign = component(lambda s: psa.Equations(der={"x": s.v_x}, out={"displacement": s.x}))
+    text = message(lambda: psa.compose((*psa.BASE, foreign)))
     assert "derivative of the state 'x', which it does not declare" in text
     assert "equation of the output 'displacement', which it does not declare" in text
-    nowhere = component(lambda s: Equations(add={"weight": s.x}))
-    assert "adds to 'weight', which is no balance" in message(lambda: compose((*BASE, nowhere)))
+    nowhere = component(lambda s: psa.Equations(add={"weight": s.x}))
+    assert "adds to 'weight', which is no balance" in message(
+        lambda: psa.compose((*psa.BASE, nowhere))
+    )
 
 
 @pytest.mark.parametrize("name", ["k_L", "x", "voltage"])
 def test_a_name_belongs_to_one_component(name: str) -> None:
-    twice = component(lambda _: Equations(), parameters=(gain_of(name),))
-    assert f"Two components declare '{name}'" in message(lambda: compose((*BASE, twice)))
+    twice = component(lambda _: psa.Equations(), parameters=(gain_of(name),))
+    assert f"Two components declare '{name}'" in message(lambda: psa.compose((*psa.BASE, twice)))
 
 
 def test_every_bad_value_is_named_at_once() -> None:
-    text = message(lambda: compose(BASE, {"k_l": 1.0, "n": 0.5, "m_P": float("nan")}))
+    text = message(lambda: psa.compose(psa.BASE, {"k_l": 1.0, "n": 0.5, "m_P": float("nan")}))
     assert "no parameter 'k_l'" in text
     assert "'n' is 0.5 1, outside its bounds [1, 4]" in text
     assert "'m_P' is nan" in text
-    model = compose(BASE)
+    model = psa.compose(psa.BASE)
     assert "'tau' is -1 s" in message(lambda: model.with_values({"tau": -1.0}))
     assert "no parameter 'creep_gain'" in message(lambda: model.with_values({"creep_gain": 0.1}))
     assert "no parameter 'tua'" in message(lambda: model.parameter("tua"))
@@ -81,7 +79,7 @@ def test_every_bad_value_is_named_at_once() -> None:
 
 
 def test_effects_come_and_go_without_a_trace() -> None:
-    base = compose(BASE, {"k_L": 12.0})
+    base = psa.compose(psa.BASE, {"k_L": 12.0})
     extended = base.with_effect(CREEP, {"creep_gain": 0.02}).with_effect(DRIFT)
     assert [e.name for e in extended.effects] == ["slow_creep", "offset_drift"]
     assert extended.values["k_L"] == 12.0
@@ -94,21 +92,60 @@ def test_effects_come_and_go_without_a_trace() -> None:
     assert back.values == base.values
 
 
-@pytest.mark.parametrize("name", slow_but([n for n in SETS if n != "all"], SETS))
-def test_velocity_is_the_rate_of_the_displacement(name: str) -> None:
-    model = compose(SETS[name])
-    gains = {"creep_gain": 0.05, "mode_gain": 0.2}
-    model = model.with_values({k: v for k, v in gains.items() if k in model.values})
-    t = np.linspace(0.0, 2e-3, 4001)
-    given = {"voltage": 50.0 * (1.0 - np.cos(4e3 * t)), "load_force": 20.0 * np.sin(3e3 * t)}
-    u = input_samples(model, len(t), given)
-    y = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-9).y
-    x, v = (y[:, model.output_names.index(n)] for n in ("displacement", "velocity"))
-    slope = (8 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12 * 5e-7)
-    assert np.ptp(x) > 5e-6
-    np.testing.assert_allclose(slope[5:], v[7:-2], rtol=0, atol=1e-6 * np.ptp(v))
+def evidence_in(model: psa.Model) -> Evidence:
+    assert model.evidence is not None
+    return model.evidence
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"x"', "null"])
-def test_what_is_no_model_file_says_so(text: str) -> None:
-    assert message(lambda: loads(text, "m.json")).startswith("m.json is not ")
+def test_it_says_what_the_record_has_shown_and_what_the_model_errs_by() -> None:
+    record, told = noisy_record(), evidence_in(evident_model())
+    rates = np.abs(np.diff(record.voltage) / np.diff(record.time))
+    assert told.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
+    assert told.seen.rate == pytest.approx(rates.max())
+    assert told.seen.duration == record.duration
+    assert told.seen.temperature is None
+    held = told.held_out
+    assert held is not None
+    assert held.interval_m.low < NOISE < held.interval_m.high
+    assert held.rms_m == pytest.approx(NOISE, rel=0.15)
+    (played,) = told.runs
+    assert (played.sha256, played.samples, played.averaged) == (record.sha256, 640, 1)
+    assert played.offset_m == pytest.approx(OFFSET, abs=1e-8)
+    (split,) = divided([record], ())
+    held_out = [k for first, stop in played.held_out for k in range(first, stop)]
+    assert held_out == np.flatnonzero(split.held_out).tolist()
+
+
+def test_the_covariance_is_that_of_the_intervals() -> None:
+    model = evident_model()
+    told, known = evidence_in(model).covariance, model.provenance.intervals
+    assert told.names == ("k_L", "A", "tau")
+    for k, name in enumerate(told.names):
+        half = 0.5 * (known[name].high - known[name].low)
+        assert 1.96 * told.matrix[k][k] ** 0.5 == pytest.approx(half, rel=0.02), name
+
+
+def test_other_values_or_physics_have_no_evidence() -> None:
+    model = evident_model()
+    same = model.with_values({"k_L": model.values["k_L"]})
+    assert same.evidence is model.evidence
+    assert model.with_values({"k_L": 1.01 * model.values["k_L"]}).evidence is None
+    assert model.with_effect(psa.EFFECTS["slow_creep"]).evidence is None
+    assert model.without(["creep_lag"]).evidence is None
+    assert model.with_starts({"u": 1.0}).evidence is model.evidence
+
+
+def test_a_plant_keeps_it_with_the_covariance_of_its_own_parameters() -> None:
+    model = evident_model()
+    drift = psa.EFFECTS["offset_drift"]
+    gain = drift.gain or ""
+    told = evidence_in(model)
+    names = ("k_L", gain)
+    wider = replace(told.covariance, names=names, matrix=((4.0, 1.0), (1.0, 9.0)))
+    both = replace(
+        model.with_effect(drift), evidence=replace(told, covariance=wider, outside=(drift.name,))
+    )
+    plant = loads(dumps(both)).plant()
+    assert evidence_in(plant).covariance.names == ("k_L",)
+    assert evidence_in(plant).covariance.matrix == ((4.0,),)
+    assert loads(dumps(plant)).evidence == plant.evidence

@@ -11,16 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.compose import Model
-from psa_casadi.model.nanopositioner import nanopositioner
-from psa_casadi.model.parts import PARTS, compensator_for, part_model
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.model.system import connect
-from psa_casadi.simulation.stepper import run
+from psa_casadi.model.nanopositioner import (
+    positioner_plant,
+)
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.modelica_runs import simulated
@@ -28,13 +24,13 @@ from tests.studies.benchmarks.nonlinearity import Controller, simulate_positione
 from tests.tiers import slow
 
 STACK = "P-885.51"
-VALUES = {name: figure.value for name, figure in STACKS[STACK].values.items()}
+VALUES = {name: figure.value for name, figure in psa.STACKS[STACK].values.items()}
 
 
-def _driven(model: Model, t: FloatArray, **inputs: FloatArray) -> dict[str, FloatArray]:
+def _driven(model: psa.Model, t: FloatArray, **inputs: FloatArray) -> dict[str, FloatArray]:
     """Return outputs and states of a run from rest."""
     u = np.column_stack([np.broadcast_to(inputs.get(n, 0.0), t.shape) for n in model.input_names])
-    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
+    steps = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
     states = dict(zip(model.state_names, steps.x.T, strict=True))
     return states | dict(zip(model.output_names, steps.y.T, strict=True))
 
@@ -61,7 +57,7 @@ def _two_periods(frequency: float) -> tuple[FloatArray, FloatArray, NDArray[np.b
 def test_the_compensator_makes_the_reference_linear() -> None:
     """At 0.2 Hz, where lags do not count: below 0.02 % of the range, from more than 3 %."""
     t, wave, last = _two_periods(0.2)
-    compensator = compensator_for(stack_model(STACK))
+    compensator = psa.compensator_for(psa.stack_model(STACK))
     compensated = _driven(compensator, t, command=80.0 * wave)["compensated_command"]
     deviations = []
     for voltage in (80.0 * wave, compensated):
@@ -81,14 +77,16 @@ def test_the_compensator_makes_the_reference_linear() -> None:
 )
 def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gain: float) -> None:
     """The force behind the lag follows the command; without the effect it does not."""
-    component = EFFECTS[effect]
-    plain = stack_model(STACK).plant()
+    component = psa.EFFECTS[effect]
+    plain = psa.stack_model(STACK).plant()
     stack = plain.with_effect(component, {str(component.gain): gain})
     t, wave, last = _two_periods(20.0)
     errors = []
     for known in (stack, plain):
         wires = (("compensator.compensated_command", "stack.voltage"),)
-        model = connect({"compensator": compensator_for(known), "stack": stack}, wires, name="m")
+        model = psa.connect(
+            {"compensator": psa.compensator_for(known), "stack": stack}, wires, name="m"
+        )
         found = _driven(model, t, compensator_command=80.0 * wave)
         lag = stack.values["tau"] + stack.values["R_s"] * stack.values["C_p"]
         late = 40.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * (t - lag)))
@@ -99,14 +97,14 @@ def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gai
 
 
 def test_the_voltage_amplifier_has_bandwidth_range_and_slew_rate() -> None:
-    amplifier = part_model("voltage_amplifier", bandwidth=1e3)
+    amplifier = psa.part_model("voltage_amplifier", bandwidth=1e3)
     t = np.linspace(0.0, 2e-3, 401)
     small = _driven(amplifier, t, command=np.full_like(t, 1e-3))["output_voltage"]
     np.testing.assert_allclose(small, 1e-2 * (1.0 - np.exp(-2e3 * np.pi * t)), atol=1e-8)
     beyond = _driven(amplifier, t, command=np.full_like(t, 30.0))["output_voltage"]
     assert beyond.max() <= 120.0 + 1e-6
     assert beyond[-1] == pytest.approx(120.0, abs=1e-3)
-    slow = part_model("voltage_amplifier", bandwidth=1e5, current_limit=0.05)
+    slow = psa.part_model("voltage_amplifier", bandwidth=1e5, current_limit=0.05)
     found = _driven(slow, t, command=np.full_like(t, 10.0))
     slew = 0.05 / 1.5e-6
     assert found["load_current"].max() <= 0.05
@@ -115,14 +113,14 @@ def test_the_voltage_amplifier_has_bandwidth_range_and_slew_rate() -> None:
     assert rate == pytest.approx(slew, rel=1e-3)
 
 
-def _charge_drive(**values: float) -> Model:
+def _charge_drive(**values: float) -> psa.Model:
     wires = (
         ("amplifier.output_voltage", "stack.voltage"),
         ("stack.charge", "amplifier.load_charge"),
     )
-    parts = {"amplifier": part_model("charge_amplifier", **values),
-             "stack": stack_model(STACK).plant()}  # fmt: skip
-    return connect(parts, wires, name="charge_drive")
+    parts = {"amplifier": psa.part_model("charge_amplifier", **values),
+             "stack": psa.stack_model(STACK).plant()}  # fmt: skip
+    return psa.connect(parts, wires, name="charge_drive")
 
 
 def test_the_charge_amplifier_sets_voltage_below_its_corner_and_charge_above() -> None:
@@ -145,7 +143,7 @@ def test_the_charge_amplifier_sets_voltage_below_its_corner_and_charge_above() -
         assert abs(1e3 * (in_phase + 1j * quadrature) - expected) < 2e-3 * abs(expected)
 
 
-def _closed_on(model: Model, reference_m: Callable[[float], float], count: int) -> FloatArray:
+def _closed_on(model: psa.Model, reference_m: Callable[[float], float], count: int) -> FloatArray:
     """Return the commands of a controller whose plant is a fixed gain of 1 um/V, by the model."""
     names = model.state_names, model.sampled_names
     T, z = model.values["sample_time"], np.zeros(len(names[1]))
@@ -162,7 +160,7 @@ def _closed_on(model: Model, reference_m: Callable[[float], float], count: int) 
 
 def test_the_controller_is_the_recursion_of_a_textbook() -> None:
     """Notch, PI, feed-forward, saturation and anti-windup against a plain recursion."""
-    model = part_model(
+    model = psa.part_model(
         "position_controller", proportional_gain=2e5, integral_gain=4e8, feed_forward=1e5,
         notch_floor=0.1, notch_width=0.7,
     )  # fmt: skip
@@ -182,7 +180,7 @@ def test_the_controller_is_the_recursion_of_a_textbook() -> None:
 
 def test_the_plain_loop_has_the_reference_s_stack() -> None:
     """With a stage that does not push back, the benchmark's stack moves as the reference's does."""
-    system = nanopositioner(compensated=False)
+    system = psa.nanopositioner(compensated=False)
     values = {n: dict(m.values) for n, m in system.parts.items()}
     values["flexure"] |= {"k_c": 1e-3, "c_c": 0.0}
     values["amplifier"]["bandwidth"] = 2e3
@@ -199,20 +197,23 @@ def test_the_plain_loop_has_the_reference_s_stack() -> None:
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (lambda: part_model("voltage"), "voltage_amplifier"),
-        (lambda: part_model("voltage_amplifier", speed=1.0), "no parameter 'speed'"),
-        (lambda: compensator_for(part_model("flexure_stage")), "no drive, linear_force, bouc_wen"),
+        (lambda: psa.part_model("voltage"), "voltage_amplifier"),
+        (lambda: psa.part_model("voltage_amplifier", speed=1.0), "no parameter 'speed'"),
+        (
+            lambda: psa.compensator_for(psa.part_model("flexure_stage")),
+            "no drive, linear_force, bouc_wen",
+        ),
     ],
 )
-def test_what_is_no_part_of_a_stack_is_refused(made: Callable[[], Model], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_what_is_no_part_of_a_stack_is_refused(made: Callable[[], psa.Model], said: str) -> None:
+    with pytest.raises(psa.InputError, match=said):
         made()
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("name", psa.PARTS)
 def test_a_part_is_the_same_in_modelica(name: str) -> None:
     """The first input is a sine of half its usual size, the others rest; all outputs."""
-    model = part_model(name)
+    model = psa.part_model(name)
     text = modelica_text(model, name="Part")
     first, *others = model.structure.inputs
     peak = 0.5 * nominal_value(first.nominal, model.values)
@@ -226,10 +227,131 @@ def test_a_part_is_the_same_in_modelica(name: str) -> None:
     t = np.linspace(0.0, span, 4001)
     u = np.tile([i.start for i in model.structure.inputs], (len(t), 1))
     u[:, 0] = peak * (1.0 - np.cos(omega * t))
-    steps = run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
+    steps = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-8)
     names = (*model.state_names, *model.output_names)
     between = slice(40, None, 100)  # between two sample instants, where rumoca has points
     for variable, wanted in zip(names, np.hstack([steps.x, steps.y]).T, strict=True):
         at = np.interp(t[between], got["time"], got[f"part.{variable}"])
         error = np.abs(at - wanted[between]).max()
         assert error < 1e-4 * max(np.ptp(wanted), 1e-12), variable
+
+
+STACK_AND_STAGE = (
+    ("stack.displacement", "flexure.tip_position"),
+    ("stack.velocity", "flexure.tip_velocity"),
+    ("flexure.reaction_force", "stack.load_force"),
+)
+
+
+def _gain(name: str, unit: str = "V") -> psa.Model:
+    """A part whose output follows its input at once."""
+    part = psa.Component(
+        name=name,
+        description="twice the input",
+        source="test",
+        equations=lambda s: psa.Equations(out={"out": 2.0 * s.into}),
+        inputs=(psa.Input("into", "V", "input", start=0.25),),
+        outputs=(psa.Output("out", unit, "output"),),
+    )
+    return psa.compose([part], name=name)
+
+
+def test_a_connected_model_has_the_equations_of_its_parts() -> None:
+    """Derivatives and outputs of stack and stage at random points, wired by hand."""
+    stack, stage = psa.stack_model("P-885.51").plant(), psa.part_model("flexure_stage")
+    both = psa.connect({"stack": stack, "flexure": stage}, STACK_AND_STAGE, name="both")
+    assert both.input_names == ("stack_voltage",)
+    draw = np.random.default_rng(2)
+    for _ in range(5):
+        x = stack.state_nominals() * draw.normal(size=len(stack.state_names))
+        x_f = stage.state_nominals() * draw.normal(size=2)
+        tip = np.array([x[stack.state_names.index("x")], x[stack.state_names.index("v_x")]])
+        slope, out = stage.structure.f(0.0, x_f, tip, stage.parameter_vector())
+        force = float(out[stage.output_names.index("reaction_force")])
+        own, shown = stack.structure.f(0.0, x, [30.0, force], stack.parameter_vector())
+        got = both.structure.f(0.0, [*x, *x_f], [30.0], both.parameter_vector())
+        parts = [np.array(v).ravel() for v in (own, slope, shown, out)]
+        expected = np.concatenate(parts[:2]), np.concatenate(parts[2:])
+        for found, wanted in zip(got, expected, strict=True):
+            np.testing.assert_allclose(np.array(found).ravel(), wanted, rtol=1e-13)
+
+
+def test_every_mistake_in_the_wires_is_told_at_once() -> None:
+    parts = {"a": _gain("a"), "b": _gain("b"), "c": _gain("c", unit="m")}
+    wires = (("a.out", "b.into"), ("b.out", "b.into"), ("c.out", "a.into"), ("a.there", "c.into"),
+             ("nowhere.out", "c.into"))  # fmt: skip
+    with pytest.raises(psa.InputError) as caught:
+        psa.connect(parts, wires, name="m", inputs={"x": "b.into", "2y": "c.into"})
+    text = str(caught.value)
+    for part in (
+        "'2y' cannot name",
+        "'b.into' has two sources, 'a.out' and 'b.out'",
+        "from 'c.out' [m] to 'a.into' [V] joins different units",
+        "'a.there' is no output",
+        "'nowhere.out' names no part",
+        "has two sources, 'b.out' and 'x'",
+    ):
+        assert part in text
+
+
+def test_an_algebraic_loop_is_named() -> None:
+    parts = {"a": _gain("a"), "b": _gain("b")}
+    with pytest.raises(psa.InputError, match=r"a\.out -> b\.out -> a\.out"):
+        psa.connect(parts, (("a.out", "b.into"), ("b.out", "a.into")), name="m")
+
+
+def test_sampled_parts_of_different_periods_are_refused() -> None:
+    parts = {n: psa.part_model("position_controller", sample_time=t)
+             for n, t in (("one", 1e-4), ("two", 2e-4))}  # fmt: skip
+    with pytest.raises(
+        psa.InputError, match=r"one_sample_time = 0\.0001 s, two_sample_time = 0\.0002 s"
+    ):
+        psa.connect(parts, (), name="m")
+
+
+def _reference(t: float) -> float:
+    return 5e-6 * (1.0 - math.cos(2.0 * math.pi * 250.0 * t))
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+def test_the_closed_loop_is_that_of_an_independent_simulation(compensated: bool) -> None:
+    """Position, command and voltage at every instant, against the loop in plain Python."""
+    system = psa.nanopositioner(compensated=compensated)
+    found = simulate_positioner(
+        {n: m.values for n, m in system.parts.items()}, _reference, 4e-3, 5e-5
+    )
+    model = system.model()
+    samples = np.array([[_reference(t)] for t in found.time])
+    steps = psa.run(model, found.time, samples, np.zeros(len(model.state_names)), rtol=1e-9)
+    shown = dict(zip(model.output_names, steps.y.T, strict=True))
+    assert np.ptp(found.position) > 8e-6
+    np.testing.assert_allclose(shown["stage_position"], found.position, atol=1e-12)
+    np.testing.assert_allclose(shown["command"], found.command, atol=1e-6)
+    np.testing.assert_allclose(shown["voltage"], found.voltage, atol=1e-5)
+
+
+@pytest.mark.parametrize("stack", ["P-885.51", "PTBS200", "WYDS0808020"])
+def test_the_tuned_loop_keeps_its_margins(stack: str) -> None:
+    """The sensitivity asked for is met with the resonance where it is, and used up nearly."""
+    plant = positioner_plant(stack).model()
+    found = {}
+    for limit in (1.4, 1.6):
+        tuned = psa.controller_for(plant, position="stage_position", sensitivity=limit)
+        found[limit] = psa.margins_of(plant, tuned, "stage_position")
+        assert 1.2 < found[limit].sensitivity <= limit * 1.0001
+        assert found[limit].gain > limit / (limit - 1.0)
+        assert found[limit].phase > 2.0 * np.arcsin(0.5 / limit)
+        for share in (0.9, 1.1):
+            notch = share * tuned.values["notch_frequency"]
+            beside = tuned.with_values({"notch_frequency": notch})
+            assert psa.margins_of(plant, beside, "stage_position").sensitivity <= limit * 1.0001
+    assert found[1.6].crossover > found[1.4].crossover > 50.0
+
+
+def test_a_plant_that_cannot_be_tuned_is_refused() -> None:
+    stack = psa.stack_model("P-885.51").plant()
+    with pytest.raises(psa.InputError) as caught:
+        psa.controller_for(stack, sensitivity=9.0, sample_time=-1.0)
+    assert [p.split()[0] for p in caught.value.problems] == [
+        "The", "The", "sample_time", "sensitivity",
+    ]  # fmt: skip

@@ -22,54 +22,16 @@ MOUSE = (
     "primaryPointerType=4,availablePointerTypes=4"
 )
 DARK = "--blink-settings=preferredColorScheme=0"
+SCRIPTS = Path(__file__).parent / "scripts"
 _CONSOLE = re.compile(r":CONSOLE[:(]\d+\)?\] (.*)")
 
-# Tells the page around the frame how the page in the frame came out.
-_REPORTER = """<script>
-window.addEventListener('load', function () {
-  setTimeout(function () {
-    var root = document.documentElement, sizes = [], outside = [], small = [];
-    function look(node) {
-      var box = node.getBoundingClientRect();
-      if (box.right > root.clientWidth + 1 && !node.closest('.scroll')) {
-        outside.push(node.tagName + '.' + node.getAttribute('class'));
-      }
-      var size = parseFloat(getComputedStyle(node).fontSize);
-      if (node.childElementCount === 0 && node.textContent.trim()) {
-        sizes.push(size);
-        if (size < 9) { small.push(node.textContent); }
-      }
-    }
-    document.body.querySelectorAll('*:not(script):not(defs *)').forEach(look);
-    var plots = Array.prototype.slice.call(document.querySelectorAll('.drawing'));
-    parent.postMessage(JSON.stringify({
-      width: root.clientWidth, needed: root.scrollWidth, outside: outside.slice(0, 5),
-      smallest: Math.min.apply(null, sizes), small: small.slice(0, 5), plots: plots.length,
-      drawn: plots.filter(function (p) { return p.querySelector('svg.main-svg'); }).length,
-      narrowest: Math.min.apply(null, plots.map(function (p) {
-        return p.querySelector('svg.main-svg').getBoundingClientRect().width; }))
-    }), '*');
-  }, 500);
-});
-</script>"""
 
-
-# Looks for what keeps people out who cannot see the page, or not well, or have no mouse.
-_AXE = """<script>
-window.addEventListener('load', function () {
-  setTimeout(function () {
-    axe.run({resultTypes: ['violations']}).then(function (found) {
-      var told = document.createElement('pre');
-      told.id = 'axe';
-      told.textContent = JSON.stringify(found.violations.map(function (v) {
-        return {impact: v.impact, rule: v.id, places: v.nodes.map(function (n) { return n.html; })};
-      }));
-      document.body.appendChild(told);
-    });
-  }, 500);
-});
-</script>"""
 _FOUND = re.compile(r'<pre id="axe">(.*?)</pre>', re.DOTALL)
+
+
+def script(name: str) -> str:
+    """Return a script of the tests as a part of a page."""
+    return f"<script>{(SCRIPTS / name).with_suffix('.js').read_text('utf-8')}</script>"
 
 
 @dataclass(frozen=True)
@@ -96,7 +58,7 @@ class Browser:
         text = page.read_text(encoding="utf-8")
         copy = page.with_name(f"{page.stem}-axe.html")  # beside it: its links are relative
         text = without_policy(text)
-        looked = f"<script>{axe}</script>{_AXE}</body>".join(text.rsplit("</body>", 1))
+        looked = f"<script>{axe}</script>{script('axe')}</body>".join(text.rsplit("</body>", 1))
         copy.write_text(looked, encoding="utf-8")
         try:
             found = _FOUND.search(self.document(copy, *flags)[0])
@@ -165,7 +127,7 @@ def on_a_phone(page: Path, height: int = 844) -> Path:
     inner, outer = (page.with_name(f"{page.stem}-{part}.html") for part in ("inner", "phone"))
     text = page.read_text(encoding="utf-8")
     text = without_policy(text)
-    inner.write_text(text.replace("</body>", f"{_REPORTER}</body>"), encoding="utf-8")
+    inner.write_text(text.replace("</body>", f"{script('phone')}</body>"), encoding="utf-8")
     outer.write_text(
         "<!DOCTYPE html><html><body style='margin:0'><script>addEventListener('message',"
         "function (e) { document.getElementById('told').textContent = e.data; });</script>"

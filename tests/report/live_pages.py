@@ -15,31 +15,9 @@ from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.report.page.live import doubles, live_data
 from psa_casadi.units import FloatArray
-from tests.report.browser import Browser
+from tests.report.browser import SCRIPTS, Browser
 
-_PAGE = """<!DOCTYPE html><html><body><pre id="told"></pre><script>{library}</script><script>
-(function () {{
-  var given = {given};
-  function text(numbers) {{
-    var bytes = new Uint8Array(numbers.buffer), found = '';
-    bytes.forEach(function (b) {{ found += String.fromCharCode(b); }});
-    return btoa(found);
-  }}
-  psaLive.load(given.model).then(function (run) {{
-    var told = given.cases.map(function (c) {{
-      c.t = psaLive.doubles(c.t);
-      Object.keys(c.inputs).forEach(function (n) {{ c.inputs[n] = psaLive.doubles(c.inputs[n]); }});
-      var found = run(c), began = performance.now();
-      for (var k = 0; k < given.times; k += 1) {{ run(c); }}
-      var spent = (performance.now() - began) / Math.max(1, given.times);
-      if (found.status) {{ return {{status: found.status, reason: found.reason}}; }}
-      return {{status: 0, way: found.way, steps: found.steps, spent: spent,
-        shown: text(found.outputs[given.model.shown])}};
-    }});
-    document.getElementById('told').textContent = JSON.stringify(told);
-  }}, function (error) {{ document.getElementById('told').textContent = String(error); }});
-}})();
-</script></body></html>"""
+_PAGE = (SCRIPTS / "module.html").read_text("utf-8")
 _TOLD = re.compile(r'<pre id="told">(.*?)</pre>', re.DOTALL)
 
 

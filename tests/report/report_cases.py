@@ -2,29 +2,29 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import get_args
 
 import numpy as np
 
-from psa_casadi.components import BASE
+import psa_casadi as psa
 from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.held_out import Errors, Gain
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import Simulated, measured
 from psa_casadi.identification.fitting.unknowns import unknowns_of
-from psa_casadi.identification.identify import Identification, identify
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.records import Record, multisine, sine, time_grid
+from psa_casadi.identification.identify import identify
+from psa_casadi.records import multisine, sine, time_grid
 from psa_casadi.records.split import Experiment, split, whole
 from psa_casadi.report.words.series import Curve, Series
-from psa_casadi.simulation.simulate import EXACT, Way, simulate
+from psa_casadi.simulation.simulate import EXACT, Way
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval, Provenance
 
 NOISE = 5e-9
+VERDICTS: tuple[result.Verdict, ...] = get_args(result.Verdict)
 ADDED = {"cause_named", "partly_explained", "ambiguous"}
 
 
@@ -33,12 +33,12 @@ def experiment(name: str, samples: int) -> tuple[Experiment, FloatArray, FloatAr
     """Return a record of a stack that drifts, some samples missing, without and with the drift."""
     time = time_grid(samples / 1000.0, 1e-3)
     voltage = multisine(time, 5.0, 95.0, (1.0, 12.0), seed=3)
-    clean = simulate(compose(BASE), time, voltage).displacement
+    clean = psa.simulate(psa.compose(psa.BASE), time, voltage).displacement
     drift = 8e-8 * time / time[-1]
     y = clean + drift + NOISE * np.random.default_rng(1).standard_normal(len(time))
     y[40:50] = np.nan
     return (
-        split(Record(name=name, time=time, voltage=voltage, displacement=y)),
+        split(psa.Record(name=name, time=time, voltage=voltage, displacement=y)),
         clean,
         clean + drift,
     )
@@ -62,7 +62,7 @@ def periodic(counts: bool = False) -> tuple[Experiment, NoiseFloor, Misfit, Misf
     noise = NOISE * np.random.default_rng(4).standard_normal(time.size)
     size = 1e9 if counts else 1.0
     quiet, record = (
-        Record(
+        psa.Record(
             name="loops",
             time=time,
             voltage=voltage,
@@ -86,7 +86,7 @@ def with_periodic(d: result.Diagnosis, *, counts: bool = False) -> result.Diagno
                    base=(base,), extended=(y,))  # fmt: skip
 
 
-def _fit(model: Model, records: int) -> Fit:
+def _fit(model: psa.Model, records: int) -> Fit:
     unknowns = unknowns_of(model, ("k_L", "tau"), [{}] * records, [0.0] * records, 1e-6)
     empty, levels = np.zeros((0, unknowns.size)), (NOISE,) * records
     return Fit(model, unknowns, np.zeros(unknowns.size), np.zeros(0), empty, levels, 0.0, True,
@@ -100,7 +100,7 @@ def diagnosis(
     added = verdict in ADDED
     parts = [experiment(n, samples) for n in names]
     base = tuple(p[1] for p in parts)
-    model = compose((*BASE, EFFECTS["slow_creep"]) if added else BASE)
+    model = psa.compose((*psa.BASE, psa.EFFECTS["slow_creep"]) if added else psa.BASE)
     intervals = {"k_L": Interval(9.9, 10.1), "tau": Interval(1e-7, 1.0)}
     model = replace(model, provenance=Provenance(free=("k_L", "tau"), intervals=intervals))
     cause = result.Cause("slow_creep", "plant", 0.97,
@@ -132,7 +132,7 @@ def diagnosis(
         next_experiment=result.NextExperiment(None, (), ("Hold the voltage for a minute.",)),
         remarks=("Forces are assumed.",),
         experiments=tuple(p[0] for p in parts),
-        base_fit=_fit(compose(BASE), len(names)),
+        base_fit=_fit(psa.compose(psa.BASE), len(names)),
         extended_fit=_fit(model, len(names)),
         base=base,
         extended=tuple(p[2] for p in parts) if added else base,
@@ -144,14 +144,14 @@ def diagnosis(
 
 
 @cache
-def identification() -> Identification:
+def identification() -> psa.Identification:
     """Return the fit of the base model to two short records that drift."""
     return identify(
         [experiment(name, n)[0].record for name, n in (("rig_a", 1500), ("rig_b", 800))]
     )
 
 
-def long_fit(records: int, samples: int) -> tuple[Identification, tuple[Series, ...]]:
+def long_fit(records: int, samples: int) -> tuple[psa.Identification, tuple[Series, ...]]:
     """Return a fit that claims to come from long records of loops, and their curves.
 
     Every record has one sample that is 3 um off, and one missing stretch of a fiftieth.
@@ -165,7 +165,7 @@ def long_fit(records: int, samples: int) -> tuple[Identification, tuple[Series, 
         measured = model + NOISE * rng.standard_normal(samples)
         measured[int((0.05 + 0.4 * k / records) * samples)] += 3e-6
         measured[samples // 2 : samples // 2 + samples // 50] = np.nan
-        record = Record(name=f"long_{k + 1}", time=time, voltage=voltage, displacement=measured)
+        record = psa.Record(name=f"long_{k + 1}", time=time, voltage=voltage, displacement=measured)
         experiments.append(whole(record))
         curve = Curve("model", "#0072b2", model)
         held = np.zeros(samples, dtype=bool)

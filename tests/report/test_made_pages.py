@@ -3,7 +3,6 @@
 import json
 import re
 
-import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from typer.core import TyperGroup
@@ -17,10 +16,7 @@ from build_scripts.measured_data import ROOT
 from build_scripts.schemas_page import WRITTEN_BY
 from build_scripts.schemas_page import section as schema_section
 from psa_casadi.cli.app import app
-from psa_casadi.components import COMPONENTS
-from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
-from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.report.documents.files import FILES, schema_texts
 
 
@@ -49,11 +45,11 @@ def test_the_page_of_commands_holds_every_command_and_option() -> None:
 
 def test_the_gallery_lists_every_effect() -> None:
     shown = [row[0].replace("<wbr>", "") for row in overview().rows]
-    assert shown == [f"[<code>{name}</code>](#{name})" for name in EFFECTS]
+    assert shown == [f"[<code>{name}</code>](#{name})" for name in psa.EFFECTS]
 
 
 def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> None:
-    effect = EFFECTS["backlash"]
+    effect = psa.EFFECTS["backlash"]
     text = section(effect)
     assert effect.equation_text.split(",  ", maxsplit=1)[0] in text
     assert f"]({PICTURES}/backlash.png)" in text
@@ -100,28 +96,13 @@ def test_the_page_of_json_files_holds_every_member_of_every_schema() -> None:
 
 def test_the_page_of_ports_has_every_port_with_its_sign() -> None:
     text = "\n".join(ports_page.sections())
-    for name in PARTS:
+    for name in psa.PARTS:
         rows = text.split(f"### `{name}`\n")[1].split("\n#")[0]
-        for port in (*part_model(name).input_names, *part_model(name).output_names):
+        for port in (*psa.part_model(name).input_names, *psa.part_model(name).output_names):
             assert f"| `{port}` |" in rows
-    for effect in EFFECTS.values():
+    for effect in psa.EFFECTS.values():
         assert all(f"| `{i.name}` | in | {i.unit} |" in text for i in effect.inputs)
     assert "| `load_force` | in | N | 0 |" in text
-    names = {i.name for c in COMPONENTS.values() for i in c.inputs}
-    names |= {o.name for c in COMPONENTS.values() for o in c.outputs}
+    names = {i.name for c in psa.COMPONENTS.values() for i in c.inputs}
+    names |= {o.name for c in psa.COMPONENTS.values() for o in c.outputs}
     assert names <= {*re.findall(r"^\|.*?`(\w+)` \| (?:in|out) \|", text, re.MULTILINE)}
-
-
-def test_the_signs_of_the_page_are_those_of_the_models() -> None:
-    model = psa.stack_model("P-885.51").plant()
-    t = np.linspace(0.0, 0.02, 201)
-    rising = psa.simulate(model, t, 5000.0 * t).outputs
-    for name in ("displacement", "velocity", "current", "charge", "blocked_force"):
-        assert rising[name][100] > 0, name
-    pulled = psa.simulate(model, t, 0 * t, load_force=np.minimum(1e4 * t, 50.0)).outputs
-    assert pulled["displacement"][-1] > 0
-    stage = part_model("flexure_stage")
-    x0 = np.zeros(len(stage.state_names))
-    pushed = psa.run(stage, t, np.column_stack([1e-3 * t, 1e-3 + 0 * t]), x0, hold="linear").y
-    force, position = pushed[-1]
-    assert force < 0 < position

@@ -1,26 +1,23 @@
 """What every page says of its making, its one unit for errors, and the page that is small."""
 
+import ast
 import base64
 import gzip
 import hashlib
 import re
-from dataclasses import replace
+from inspect import signature
 from pathlib import Path
+from string import Formatter
 
 import pytest
 from plotly.offline import get_plotlyjs
 
+import psa_casadi
 import psa_casadi as psa
 from psa_casadi.command_line import typed
-from psa_casadi.diagnosis.held_out import Errors
+from psa_casadi.notes import note
 from psa_casadi.report.page.designs import write_design_page
-from psa_casadi.report.page.results import write_fit_report
-from psa_casadi.report.words.phrases import (
-    handy_scale,
-    length_scale,
-    one_unit,
-    quantity,
-)
+from psa_casadi.report.words.notes import SENTENCES
 from tests.report.html_page import Page, written
 from tests.report.report_cases import diagnosis, identification
 
@@ -34,7 +31,7 @@ def test_every_page_tells_date_version_command_and_the_records_hashes(
         d, found = diagnosis("cause_named"), identification()
         paths = [tmp_path / f"{k}.html" for k in range(3)]
         psa.write_report(d, paths[0], still=True)
-        write_fit_report(found, paths[1], still=True)
+        psa.write_fit_report(found, paths[1], still=True)
         write_design_page(paths[2], title="A design", summary=["It moves."])
     finally:
         typed.reset(token)
@@ -63,31 +60,50 @@ def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
     assert "at the top of the page" in text
 
 
-def test_the_errors_of_a_page_have_one_unit(tmp_path: Path) -> None:
-    d = replace(
-        diagnosis("cause_named"),
-        base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
-        extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
+def _said() -> list[tuple[str, set[str]]]:
+    """Return the code and the names of the values of every note in the package."""
+    found = []
+    for path in Path(psa_casadi.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "note":
+                names = {k.arg for k in node.keywords if k.arg}
+                codes = [c for c in ast.walk(node.args[0]) if isinstance(c, ast.Constant)]
+                found += [(c.value, names) for c in codes if isinstance(c.value, str)]
+    return found
+
+
+def test_every_note_has_a_sentence_that_takes_its_values() -> None:
+    said = _said()
+    assert len(said) > 40
+    for code, names in said:
+        sentence = SENTENCES[code]
+        if isinstance(sentence, str):
+            asked = {field for _, field, _, _ in Formatter().parse(sentence) if field}
+            assert asked <= names, code
+        else:
+            assert set(signature(sentence).parameters) == names, code
+
+
+def test_values_have_their_units_and_names_stand_in_a_row() -> None:
+    assert str(note("noise_repeats", apart=(0.02, "s"))).endswith("returns after 20 ms")
+    assert str(note("little", least=0.7)) == "that is less than 70 % and much remains"
+    said = str(note("vague", names=("a", "b"), why=note("no_such_voltage")))
+    assert said.startswith("a, b: in the extended model and not named: no stack bears")
+    assert str(note("same_curve", effects=("a", "b", "c"))).startswith("a and b and c bend")
+
+
+def test_a_code_without_a_sentence_is_an_error() -> None:
+    with pytest.raises(KeyError):
+        str(note("nothing of the kind"))
+
+
+EVIDENCE = Path(__file__).parents[2] / "docs" / "evidence.md"
+
+
+def test_a_row_of_stated_probabilities_counts_the_effects_it_names() -> None:
+    rows = re.findall(
+        r"^\| .*, (\d+) effects: mean, right \|(.*)$", EVIDENCE.read_text("utf-8"), re.M
     )
-    text = written(d, tmp_path)[1].text.replace("\u00a0", " ")
-    start = text.index("Error on held-out samples")
-    bars = text[start : text.index("Dashed: the noise")]
-    assert "base model 2.50 µm extended model 0.0500 µm noise 0.00500 µm" in bars
-    assert " nm" not in bars
-
-
-def test_a_quantity_in_a_sentence_has_the_unit_of_its_page() -> None:
-    values = [(-0.29e-6, "m"), (0.17, "s"), (6e-8, "m"), (1.2e-5, "m"), (3e-3, "m"), (3.0, "V")]
-
-    def shown() -> list[str]:
-        return [quantity(*value) for value in values]
-
-    handy = ["-0.29 µm", "0.17 s", "60 nm", "12 µm", "3 mm", "3 V"]
-    assert shown() == handy
-    with one_unit(handy_scale(2e-9)):
-        assert shown() == ["-290 nm", *handy[1:]]
-    with one_unit(handy_scale(2e-6)):
-        assert shown() == [*handy[:2], "0.06 µm", *handy[3:]]
-    with one_unit(length_scale(1.0, counts=True)):
-        assert shown() == handy
-    assert shown() == handy  # a unit of a page ends with it
+    assert len(rows) == 3
+    for told, cells in rows:
+        assert sum(int(n) for n in re.findall(r"of (\d+) \|", cells)) == int(told)

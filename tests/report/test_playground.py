@@ -11,90 +11,21 @@ import fmpy
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+import psa_casadi as psa
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.model.model_file import loads, save_model
-from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.model.model_file import loads
 from psa_casadi.report.page.playground import playground
 from psa_casadi.simulation.compiler import run_compiler
-from psa_casadi.simulation.simulate import simulate
+from tests.contract.helpers import done
 from tests.model.sampled_models import controller
-from tests.report.browser import Browser, driven, on_a_phone
+from tests.report.browser import SCRIPTS, Browser, driven, on_a_phone
 from tests.report.test_report_browser import told_of
 from tests.tiers import slow
 
 pytestmark = pytest.mark.xdist_group("browser")
 
-PLAY = """
-var box = document.querySelector('.live'), found = {};
-function pick(select, text) {
-  var list = Array.prototype.slice.call(select.options);
-  select.value = list.find(function (o) { return o.textContent === text; }).value;
-  select.dispatchEvent(new Event('change'));
-}
-var selects = box.querySelectorAll('select');
-var numbers = box.querySelectorAll('.bar input[type=number]');
-found.stacks = Array.prototype.map.call(selects[0].options, function (o) {
-  return o.textContent; });
-found.switches = Array.prototype.map.call(box.querySelectorAll('.switch'), function (s) {
-  return s.childNodes[1].textContent; });
-found.plain = box.querySelector('output').textContent;
-pick(selects[1], 'sine');
-numbers[4].value = '300'; numbers[4].dispatchEvent(new Event('input'));
-box.querySelector('.switch input').click();
-setTimeout(function () {
-  found.effect = box.querySelector('output').textContent;
-  found.values = box.psa.values.slice();
-  found.csv = box.psa.csv();
-  numbers[1].value = '900'; numbers[1].dispatchEvent(new Event('input'));
-  box.psa.csv();
-  found.beyond = box.querySelector('.warnings').textContent;
-  numbers[1].value = '-120'; numbers[1].dispatchEvent(new Event('input'));
-  box.psa.csv();
-  found.within = box.querySelector('.warnings').hidden;
-  numbers[1].value = '120'; numbers[1].dispatchEvent(new Event('input'));
-  found.file = box.psa.file();
-  found.knobs = Array.prototype.filter.call(box.querySelectorAll('.knob'), function (k) {
-    return !k.hidden && !k.closest('details'); }).length;
-  pick(selects[0], 'PTBS200');
-  setTimeout(function () {
-    found.other = box.querySelector('output').textContent;
-    var plot = box.querySelector('.plot'), area = plot.getBoundingClientRect();
-    [['pointerdown', 0.3], ['pointermove', 0.6]].forEach(function (row) {
-      plot.dispatchEvent(new PointerEvent(row[0], {pointerId: 1, button: 0,
-        clientX: area.left + row[1] * area.width, clientY: area.top + 0.5 * area.height}));
-    });
-    setTimeout(function () {
-      found.drawn = box.querySelector('output').textContent;
-      found.corners = psaLive.voltages.corners('0 0, 0.1 100; 0.2:50', 5).v;
-      found.read = psaLive.voltages.read(
-        'Zeit;t (ms);U [kV]\\n1;0,0;0,1\\n2;1,0;0,2\\n3;2,0;0,3\\n4;3,5;0,1\\n');
-      found.even = psaLive.voltages.read('t,v\\n' + Array.from({length: 20}, function (_, k) {
-        var t = k % 2 ? 1.01 * k : k;
-        return t + ',' + 2 * t; }).join('\\n'));
-      found.none = [psaLive.voltages.corners('1 0, 0 5', 5), psaLive.voltages.read('a,b\\n1,2\\n')];
-      found.spent = box.psa.last();
-      var knob = Array.prototype.find.call(box.querySelectorAll('.knob'), function (k) {
-        return k.querySelector('label').textContent === 'tau'; }).querySelector('[type=range]');
-      knob.value = '650'; knob.dispatchEvent(new Event('input'));
-      found.chosen = box.psa.file();
-      var create = URL.createObjectURL;
-      URL.createObjectURL = function (blob) {
-        var reader = new FileReader();
-        reader.onload = function () { found.fmu = reader.result.split(',')[1]; tell(found); };
-        reader.readAsDataURL(blob);
-        return create.call(URL, blob);
-      };
-      Array.prototype.find.call(box.querySelectorAll('button'), function (b) {
-        return b.textContent === 'Download FMU'; }).click();
-    }, 400);
-  }, 400);
-}, 400);
-"""
+PLAY = (SCRIPTS / "playground.js").read_text("utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -112,8 +43,8 @@ def played(browser: Browser, page: Path) -> dict[str, Any]:
 
 @slow
 def test_it_has_every_stack_and_effect(played: dict[str, Any], page: Path) -> None:
-    assert set(played["stacks"]) == set(STACKS)
-    assert played["switches"] == [n.replace("_", " ") for n in EFFECTS]
+    assert set(played["stacks"]) == set(psa.STACKS)
+    assert played["switches"] == [n.replace("_", " ") for n in psa.EFFECTS]
     assert page.stat().st_size < 3e6
 
 
@@ -124,10 +55,10 @@ def test_what_it_downloads_is_what_python_simulates(played: dict[str, Any]) -> N
     assert len(table) == 300
     t, v = table[:, 0], table[:, head.index("voltage [V]")]
     assert np.ptp(v) == pytest.approx(120.0, rel=1e-3)
-    model = stack_model("P-885.51").with_effect(EFFECTS["slow_creep"])
+    model = psa.stack_model("P-885.51").with_effect(psa.EFFECTS["slow_creep"])
     gain = model.parameter("creep_gain").typical(model.values)
     model = model.with_values({"creep_gain": gain})
-    wanted = simulate(model, t, v).displacement
+    wanted = psa.simulate(model, t, v).displacement
     shown = table[:, head.index("measured_displacement [m]")]
     assert np.max(np.abs(shown - wanted)) < 2e-6 * np.ptp(wanted)
 
@@ -144,7 +75,7 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
     equations = (folder / "documentation" / "index.html").read_text(encoding="utf-8")
     assert "<h1>PTBS200</h1>" in equations
     assert "creep_gain" in equations
-    model, stack = loads(played["chosen"]), stack_model("PTBS200")
+    model, stack = loads(played["chosen"]), psa.stack_model("PTBS200")
     assert model.name == "PTBS200"
     assert {n for n, v in stack.values.items() if model.values[n] != v} == {"tau"}
     assert model.values["creep_gain"] > 0.0
@@ -154,7 +85,7 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
     assert [float(described[n].nominal) for n in model.state_names] == [
         told[n] for n in model.state_names
     ]
-    others = {c.gain for c in EFFECTS.values()} - {"creep_gain"}
+    others = {c.gain for c in psa.EFFECTS.values()} - {"creep_gain"}
     assert {float(described[gain].start) for gain in others if gain} == {0.0}
 
     if not shutil.which("gcc"):
@@ -172,14 +103,14 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
         relative_tolerance=1e-8,
         input=np.array(list(zip(t, v, strict=True)), [("time", float), ("voltage", float)]),
     )  # fmt: skip
-    wanted = simulate(model, t, v, rtol=1e-9, hold="zero").displacement
+    wanted = psa.simulate(model, t, v, rtol=1e-9, hold="zero").displacement
     assert np.max(np.abs(found["measured_displacement"] - wanted)) < 1e-7 * np.ptp(wanted)
 
 
 @slow
 def test_its_model_file_has_what_is_switched_on(played: dict[str, Any]) -> None:
     model = loads(played["file"])
-    base = stack_model("P-885.51")
+    base = psa.stack_model("P-885.51")
     assert [c.name for c in model.effects] == ["slow_creep"]
     assert {n: model.values[n] for n in base.values} == base.values
     assert (model.name, model.description) == (base.name, base.description)
@@ -191,7 +122,7 @@ def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) ->
     said = [played[k] for k in ("plain", "effect", "other", "drawn")]
     assert len(set(said)) == 4
     assert all(s.startswith("Stroke ") for s in said)
-    assert played["knobs"] == len(EFFECTS["slow_creep"].parameters)
+    assert played["knobs"] == len(psa.EFFECTS["slow_creep"].parameters)
     assert list(played["corners"].values()) == [0.0, 50.0, 100.0, 75.0, 50.0]
     assert list(played["read"]["t"].values()) == pytest.approx([0.0, 1e-3, 2e-3, 3.5e-3])
     assert list(played["read"]["v"].values()) == pytest.approx([100.0, 200.0, 300.0, 100.0])
@@ -222,16 +153,14 @@ def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> N
 
 @slow
 def test_the_command_plays_a_model_of_ones_own(tmp_path: Path) -> None:
-    model = stack_model("PTBS200").with_effect(EFFECTS["slow_creep"], {"creep_gain": 0.02})
-    save_model(model, tmp_path / "m.json")
-    words = ["web", str(tmp_path / "m.json"), "-o", str(tmp_path / "p.html"), "--quiet"]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.output
+    model = psa.stack_model("PTBS200").with_effect(psa.EFFECTS["slow_creep"], {"creep_gain": 0.02})
+    psa.save_model(model, tmp_path / "m.json")
+    done("web", tmp_path / "m.json", "-o", tmp_path / "p.html", "--quiet")
     text = (tmp_path / "p.html").read_text(encoding="utf-8")
     assert "Play with PTBS200" in text
     assert "0.02" in text
 
 
 def test_what_is_no_stack_is_refused() -> None:
-    with pytest.raises(InputError, match="no stack"):
+    with pytest.raises(psa.InputError, match="no stack"):
         playground(controller())

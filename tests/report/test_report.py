@@ -1,80 +1,51 @@
-import json
+"""What pages draw: pictures, thinned curves, spectra, residuals; their words are in `test_told`."""
+
 import re
-import struct
-from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
+from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.held_out import Budget, Share
-from psa_casadi.diagnosis.result import Cause, Estimate, Verdict
-from psa_casadi.effects import EFFECTS
-from psa_casadi.export.check.check import CheckReport, CheckRow
-from psa_casadi.report.plots.figures import save_figure
-from psa_casadi.report.plots.findings import evidence_plot
-from psa_casadi.report.words.phrases import Scale, length_scale, listing, number, plain, share_text
-from psa_casadi.report.words.series import noise_density, series_of, spectrum, telling_window
-from psa_casadi.report.words.tables import blind_table, check_table, error_table, parameter_table
-from psa_casadi.report.words.text import check_sentence, effect_page, story
-from psa_casadi.report.words.verdict_words import cause_size, verdict_sentence
-from tests.report.html_page import figures, written
-from tests.report.report_cases import ADDED, NOISE, diagnosis
-from tests.tiers import slow
-
-VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
-SENTENCES = {
-    "adequate": "Nothing beyond the noise is missing",
-    "cause_named": "The cause is slow creep (plant, confidence 97 %: extremely likely)",
-    "partly_explained": "The closest known cause is slow creep",
-    "ambiguous": "do not decide whether it is slow creep or offset drift",
-    "unexplained": "no effect in the table explains",
-    "not_driven": "The displacement does not follow the voltage",
-}
-
-
-def png_size(path: Path) -> tuple[int, int]:
-    data = path.read_bytes()
-    assert data.startswith(b"\x89PNG\r\n\x1a\n")
-    width, height = struct.unpack(">II", data[16:24])
-    return width, height
-
-
-@pytest.mark.parametrize("verdict", VERDICTS)
-def test_every_verdict_is_told_as_page_and_text(tmp_path: Path, verdict: Verdict) -> None:
-    d = diagnosis(verdict)
-    text, page = written(d, tmp_path, origin="synthetic")
-    assert page.loaded == []
-    assert page.targets <= page.names
-    assert not re.search(r"@import|url\(", text.split("<script>", 1)[0])
-    assert len(text) < 3e6
-    assert SENTENCES[verdict] in page.text
-    assert "synthetic data" in page.text
-    assert "measured" not in page.text
-    assert d.experiments[0].record.sha256 in page.text
-    assert "The record is slow <and> short." in page.text
-    # at the top 1, views 3, evidence 1, record 6; signature and data 2
-    assert len(figures(text)) == (13 if verdict in ADDED else 11)
-    assert "The residual of the" in page.text
-    shown = story(d, origin="synthetic")
-    assert SENTENCES[verdict] in " ".join(shown.split())
-    assert ("extended" in shown) == (verdict in ADDED)
-    assert 8 <= len(shown.splitlines()) <= 20
-    assert max(map(len, shown.splitlines())) <= 100
-    json.loads(d.to_json())
+import psa_casadi as psa
+from psa_casadi.diagnosis.result import Verdict
+from psa_casadi.export.check.check import CheckRow
+from psa_casadi.report.page import results
+from psa_casadi.report.plots.records import distribution_plot, time_plot
+from psa_casadi.report.words import colours, series
+from psa_casadi.report.words.fit_words import residual_sentence
+from psa_casadi.report.words.phrases import Scale, number, probability_text
+from psa_casadi.report.words.tables import check_table
+from psa_casadi.report.words.text import check_sentence
+from tests.report.html_page import Page, figures, numbers, written
+from tests.report.report_cases import NOISE, diagnosis, long_fit
+from tests.tiers import slow, slow_but
 
 
 @pytest.mark.parametrize("verdict", ["cause_named", "unexplained"])
 def test_the_picture_has_its_size_and_shows_something(tmp_path: Path, verdict: Verdict) -> None:
-    path = tmp_path / "d.png"
-    save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic")
-    assert png_size(path) == (1600, 1000)
-    assert path.stat().st_size > 50_000
-    save_figure(diagnosis(verdict, ("a", "b")), tmp_path / "n.png", origin="synthetic", narrow=True)
-    assert png_size(tmp_path / "n.png") == (720, 880)
-    (tmp_path / "n.png").unlink()
-    assert [p.name for p in tmp_path.iterdir()] == ["d.png"]
+    for narrow, size in ((False, (1000, 1600)), (True, (880, 720))):
+        path = tmp_path / f"{narrow}.png"
+        psa.save_figure(diagnosis(verdict, ("a", "b")), path, origin="synthetic", narrow=narrow)
+        picture = imread(path)
+        assert picture.shape[:2] == size
+        assert np.mean(np.any(picture[..., :3] < 0.9, axis=2)) > 0.03
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_every_colour_of_a_plot_has_a_counterpart_at_night(tmp_path: Path) -> None:
+    page, _ = written(diagnosis("cause_named"), tmp_path)
+    used = set(re.findall(r'"(#[0-9a-fA-F]{3,8})"', str(figures(page)).replace("'", '"')))
+    assert used
+    assert used <= set(colours.DARK)
+
+
+@pytest.mark.parametrize("width", range(60, 100, 3))
+def test_a_percent_sign_stays_with_its_number(width: int) -> None:
+    for line in psa.story(diagnosis("ambiguous"), width=width).splitlines():
+        assert not line.strip().startswith("%")
+        assert len(line) <= width
 
 
 @slow
@@ -84,11 +55,11 @@ def test_long_records_stay_small(tmp_path: Path) -> None:
 
 
 def test_the_window_shows_where_the_error_falls_most() -> None:
-    (series,) = series_of(diagnosis("cause_named"))
-    window = telling_window(series)
-    base, extended = (np.nan_to_num(series.residual(c)) for c in series.curves)
-    reached = series.curves[0].values
-    assert series.held_out[window].all()
+    (s,) = series.series_of(diagnosis("cause_named"))
+    window = series.telling_window(s)
+    base, extended = (np.nan_to_num(s.residual(c)) for c in s.curves)
+    reached = s.curves[0].values
+    assert s.held_out[window].all()
     assert 48 <= len(base[window]) <= len(base) // 8
 
     def shown(part: slice) -> float:
@@ -98,66 +69,14 @@ def test_the_window_shows_where_the_error_falls_most() -> None:
     assert shown(window) > 2 * shown(slice(None))
 
 
-def test_the_verdict_names_the_rival_of_a_later_cause_and_weights_as_what_they_are() -> None:
-    d = diagnosis("partly_explained")
-    memory = EFFECTS["hysteresis_memory"]
-    size = Estimate(0.1, "1", (0.08, 0.12))
-    second = Cause(memory.name, "plant", 0.6, {"memory_threshold": size} |
-                   dict.fromkeys(memory.linear, size), ("backlash",), 0.2)  # fmt: skip
-    d = replace(d, causes=(*d.causes, second), model=d.model.with_effect(memory))
-    said = "hysteresis memory (plant, confidence 60 %: more likely than not; or backlash)"
-    assert said in verdict_sentence(d)
-    said = cause_size(d, second)
-    assert "memory_threshold = 0.100" in said
-    assert said.endswith("9 weights, which shape its loop together")
-    assert "memory_cube_2" not in said
-    assert cause_size(d, d.causes[0]).startswith("creep_gain = 0.0400")
-
-
-def test_the_share_of_a_named_cause_among_several_is_told_beside_that_of_it_alone() -> None:
-    d = diagnosis("partly_explained")
-    own, other = (Share(n, s, (s - 0.05, s + 0.05)) for n, s in (("slow_creep", 0.6), ("hum", 0.3)))
-    spent = Budget(4e-8, NOISE, own, (own, other), None, 1e-9, 0.1)
-    first = d.candidates[0]
-    assert share_text(first, d) == "93 %"
-    hum = replace(d.causes[0], effect="hum")
-    d = replace(d, budget=spent, causes=(*d.causes, hum))
-    assert share_text(first, d) == "93 %; with others 60 %"
-    assert share_text(d.candidates[2], d) == "0 % (screened)"
-
-
-def test_the_bars_of_named_causes_come_first_with_their_confidence() -> None:
-    d = diagnosis("partly_explained")
-    last = d.candidates[-1].effect
-    d = replace(d, causes=(*d.causes, replace(d.causes[0], effect=last, confidence=0.5)))
-    bars, figures_ = evidence_plot(d, 2).data
-    assert bars["y"][::-1] == [plain(n) for n in (d.candidates[0].effect, last)]
-    assert [t.split("; ")[1] for t in figures_["text"]][::-1] == ["named, 97 %", "named, 50 %"]
-    shares = evidence_plot(diagnosis("unexplained"), 2).data[1]["text"]
-    assert not any("named" in t for t in shares)
-
-
 def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:
-    (series,) = series_of(diagnosis("cause_named", samples=20_000))
-    frequency, density = spectrum(series.time, series.residual(series.curves[1]))
+    (s,) = series.series_of(diagnosis("cause_named", samples=20_000))
+    frequency, density = series.spectrum(s.time, s.residual(s.curves[1]))
     assert frequency[-1] == pytest.approx(500.0, rel=2e-3)
     assert float(np.sqrt(np.mean(density[5:] ** 2))) == pytest.approx(
-        noise_density(series), rel=0.05
+        series.noise_density(s), rel=0.05
     )
-    assert noise_density(series) == pytest.approx(NOISE * np.sqrt(2e-3), rel=0.02)
-
-
-def test_tables_show_display_units_and_say_what_is_not_known() -> None:
-    d = diagnosis("cause_named")
-    rows = {row[0]: row for row in parameter_table(d.model).rows}
-    assert rows["tau"][1:4] == ("0.1000", "not determined", "ms")
-    assert rows["k_L"][2:5] == ("9.90 to 10.1", "N/V", "fit")
-    assert rows["m_P"][4] == "not fitted"
-    assert [row[1] for row in blind_table(d).rows] == ["at no size", "0.00200 s"]
-    both, one = (error_table(x, Scale("nm", 1e9)).rows for x in (d, diagnosis("adequate")))
-    assert [row[0] for row in both] == ["base", "extended", "noise"]
-    assert both[1][2] == "8.50"
-    assert [row[0] for row in one] == ["base", "noise"]
+    assert series.noise_density(s) == pytest.approx(NOISE * np.sqrt(2e-3), rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -169,33 +88,159 @@ def test_tables_show_display_units_and_say_what_is_not_known() -> None:
 )  # fmt: skip
 def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert number(value) == text
-
-
-def test_lengths_and_lists_are_handy() -> None:
-    assert length_scale(3e-5).text(1.8e-5) == "18.0 µm"
-    assert length_scale(2e-8).text(1.8e-8) == "18.0 nm"
-    assert length_scale(4000.0, counts=True).text(12.0) == "12.0 counts"
-    assert [listing(["a", "b", "c"][:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
-
-
-@pytest.mark.parametrize("name", EFFECTS)
-def test_the_page_of_an_effect_tells_all_of_it(name: str) -> None:
-    effect = EFFECTS[name]
-    page = " ".join(effect_page(effect).split())
-    for part in (effect.equation_text, effect.source, effect.looks_like, effect.belongs_to):
-        assert part
-        assert " ".join(part.split()) in page
-    for parameter in effect.parameters:
-        assert parameter.name in page
-    assert page.count("(0 removes the effect)") == 1
+    assert probability_text(1.0) == "> 99 %"
 
 
 def test_the_check_of_an_fmu_names_what_failed() -> None:
     good = CheckRow("units", 0.0, 0.0, True, "")
     bad = CheckRow("equations", float("nan"), 1e-9, False, "it stopped")
-    report = CheckReport(Path("x.fmu"), (good, bad), compared=False)
+    report = psa.CheckReport(Path("x.fmu"), (good, bad), compared=False)
     row = check_table(report).rows[1]
     assert " ".join(row) == "equations not finite 1.00e-9 FAIL it stopped"
     assert check_sentence(report).startswith("x.fmu did not pass: equations.")
     assert "no model" in check_sentence(report)
-    assert "passed all 1 checks" in check_sentence(CheckReport(Path("x.fmu"), (good,), True))
+    assert "passed all 1 checks" in check_sentence(psa.CheckReport(Path("x.fmu"), (good,), True))
+
+
+LONG = [(1, 1_000_000), (20, 5_000)]
+
+
+@slow
+@pytest.mark.parametrize(("records", "samples"), slow_but([(1, 1_000_000)], LONG))
+def test_long_and_many_records_stay_below_1_5_mb_and_keep_their_spikes(
+    records: int, samples: int
+) -> None:
+    found, rows = long_fit(records, samples)
+    page = results.fit_page(found, rows)
+    assert len(page.encode()) < 3e6
+    drawn = figures(page)[2:]
+    assert len(drawn) == 7 * min(records, results.MOST_RECORDS)
+    words = Page(page).text
+    assert ("are drawn" in words) == (records > results.MOST_RECORDS)
+    assert all(words.count(s.name) >= 2 for s in rows)
+    pictured = [s for s in rows if f"{s.name} (measured)" in words]
+    for figure, s in zip(drawn[::7], pictured, strict=True):
+        shown, model, residual = (numbers(t["y"]) for t in figure["data"])
+        whole = s.scale.factor * s.measured
+        assert np.nanmax(shown) == pytest.approx(np.nanmax(whole), rel=1e-6)
+        assert np.nanmin(shown) == pytest.approx(np.nanmin(whole), rel=1e-6)
+        assert np.nanmax(residual) == pytest.approx(3.0, rel=0.01)
+        assert np.isnan(shown).any()
+        assert np.isfinite(model).all()
+
+
+def test_every_column_of_pixels_keeps_its_extremes() -> None:
+    rng = np.random.default_rng(0)
+    signals = [rng.standard_normal(1_000_000), rng.standard_normal(1_000_000)]
+    signals[0][777], signals[1][900_000], signals[0][5] = 50.0, -60.0, np.nan
+    signals[1][250_000:260_000] = np.nan
+    shown = series.kept(signals, 4000)
+    assert len(shown) <= 4002
+    assert np.all(np.diff(shown) > 0)
+    assert (shown[0], shown[-1]) == (0, 999_999)
+    starts = np.searchsorted(shown, 1000 * np.arange(1000))
+    for values in signals:
+        for extreme in (np.fmax, np.fmin):  # NaN where a whole column is
+            whole = extreme.reduce(values.reshape(1000, 1000), axis=1)
+            np.testing.assert_array_equal(extreme.reduceat(values[shown], starts), whole)
+    assert {777, 900_000} <= set(shown.tolist())
+
+
+def test_a_short_record_is_drawn_whole_and_a_gap_stays_a_gap() -> None:
+    _, (s,) = long_fit(1, 900)
+    trace = time_plot(s, "measured", results.points_each(1)).data[0]
+    assert np.array_equal(np.isnan(trace["y"]), np.isnan(s.measured))
+    assert series.extremes([np.arange(10.0)], np.array([0, 5, 10])).tolist() == [0, 4, 5, 9]
+
+
+def test_single_precision_is_used_only_where_nobody_can_see_it() -> None:
+    step = np.arange(0.0, 1.0, 1e-5)
+    assert series.compact(step).dtype == np.float32
+    assert series.compact(1.7e9 + step).dtype == np.float64
+    assert series.compact(np.full(3, np.nan)).shape == (3,)
+
+
+def white(samples: int, seed: int = 0) -> series.FloatArray:
+    return np.random.default_rng(seed).standard_normal(samples)
+
+
+def figures_of(residual: series.FloatArray) -> series.ResidualFigures:
+    time = np.arange(len(residual)) / 1000.0
+    model, none = np.sin(time) * 1e-5, np.zeros(len(time), dtype=bool)
+    curve = series.Curve("model", "#0072b2", model)
+    s = series.Series("r", time, time, model + 1e-9 * residual, (curve,), none, 1e-9, False)
+    return series.residual_figures(s, curve)
+
+
+def test_the_autocorrelation_of_a_first_order_process_is_a_power_of_its_pole() -> None:
+    residual = lfilter([1.0], [1.0, -0.9], white(200_000, 1))
+    lags, values = series.autocorrelation(residual)
+    assert (lags[0], lags[-1]) == (1, 50_000)
+    assert np.all(np.diff(lags) > 0)
+    near = lags <= 30
+    assert values[near] == pytest.approx(0.9 ** lags[near], abs=0.03)
+
+
+def test_the_band_holds_nineteen_of_twenty_lags_of_white_noise() -> None:
+    outside = []
+    for residual in (white(20_000, seed) for seed in range(20)):
+        _, values = series.autocorrelation(residual)
+        outside.append(np.mean(np.abs(values) > series.white_band(residual)))
+    assert 0.03 < float(np.mean(outside)) < 0.08
+
+
+_SLOW = np.sin(2 * np.pi * 1e-3 * np.arange(20_000)) + 0.05 * white(20_000)
+_RNG = np.random.default_rng(3)
+_SKEWED, _HEAVY = _RNG.exponential(size=20_000) - 1.0, _RNG.laplace(size=20_000)
+
+
+@pytest.mark.parametrize(
+    ("residual", "figure", "wanted", "said"),
+    [
+        (white(20_000), "rms", (1e-9, 2e-11), "is as white as noise"),
+        (white(20_000), "beyond_three", (0.0027, 0.0012), "close to normal"),
+        (_SLOW, "lasting", (0.25, 0.015), "is not white: neighbouring samples correlate by 1.00"),
+        (_SLOW, "lasting", (0.25, 0.015), "lighter in its tails"),
+        (_SKEWED, "skewness", (2.0, 0.3), "longer upwards and heavier in its tails"),
+        (-_SKEWED, "skewness", (-2.0, 0.3), "longer downwards"),
+        (_HEAVY, "kurtosis", (3.0, 0.8), "is heavier in its tails than"),
+    ],
+)
+def test_a_residual_is_called_what_it_is(
+    residual: series.FloatArray, figure: str, wanted: tuple[float, float], said: str
+) -> None:
+    found = figures_of(residual)
+    assert getattr(found, figure) == pytest.approx(wanted[0], abs=wanted[1])
+    sentence = residual_sentence(found, "base model", Scale("s", 1.0))
+    assert said in sentence
+    assert figure != "lasting" or f"that of noise after {found.lasting:.2f} s" in sentence
+
+
+def test_a_residual_can_be_read_beside_one_that_is_far_off() -> None:
+    narrow, none = 1e-9 * white(5000), np.zeros(5000, dtype=bool)
+    wide, time = 3e-8 * np.linspace(-1.0, 1.0, 5000), np.arange(5000) / 1000.0
+    curves = (series.Curve("base", "#d55e00", -wide), series.Curve("extended", "#0072b2", -narrow))
+    s = series.Series("r", time, time, 0.0 * time, curves, none, 1e-9, False)
+    base, extended, normal = distribution_plot(s).data
+    span = np.ptp(narrow)
+    assert np.ptp(normal["x"]) == pytest.approx(2e9 * span, rel=1e-5)
+    assert extended["name"] == "extended"
+    assert np.sum(extended["y"]) == pytest.approx(100.0)
+    outside = 100.0 - 100.0 * 2e9 * span / 60.0
+    assert base["name"] == f"base ({outside:.0f} % outside)"
+    assert np.sum(base["y"]) == pytest.approx(100.0 - outside, abs=0.1)
+    near = series.Series("r", time, time, 0.0 * time, (curves[1], curves[1]), none, 1e-9, False)
+    assert np.ptp(distribution_plot(near).data[-1]["x"]) == pytest.approx(1e9 * span, rel=1e-5)
+
+
+def test_a_spectrum_of_many_lines_is_thinned_and_keeps_its_peaks() -> None:
+    time = np.arange(1_000_000) / 100_000.0
+    residual = white(len(time)) + np.sin(2 * np.pi * 20_000.0 * time)
+    frequency, density = series.spectrum(time, residual)
+    shown = series.shown_lines(frequency, density, 800)
+    assert len(frequency) > 50_000
+    assert len(shown) <= 810
+    peak = int(np.argmax(density))
+    assert peak in shown
+    assert frequency[peak] == pytest.approx(20_000.0, rel=1e-3)
+    assert (shown[0], shown[-1]) == (0, len(frequency) - 1)

@@ -101,26 +101,15 @@ def told_of(document: str) -> dict[str, Any]:
     return report
 
 
-@pytest.fixture(scope="module")
-def told(browser: Browser, page: Path) -> dict[str, Any]:
-    """What the page says of itself on a phone."""
+@slow
+def test_a_phone_shows_it_legibly_without_scrolling_sideways(browser: Browser, page: Path) -> None:
     document, console = browser.document(on_a_phone(page))
     assert console == []
-    return told_of(document)
-
-
-@slow
-def test_a_phone_shows_it_without_scrolling_sideways(told: dict[str, Any]) -> None:
-    assert told["width"] == PHONE
-    assert told["needed"] == PHONE
-    assert told["outside"] == []
+    told = told_of(document)
+    assert told["width"] == told["needed"] == PHONE
+    assert told["outside"] == told["small"] == []
     assert told["drawn"] == told["plots"] >= 14
     assert told["narrowest"] > 0.9 * PHONE
-
-
-@slow
-def test_text_is_legible_on_a_phone(told: dict[str, Any]) -> None:
-    assert told["small"] == []
     assert told["smallest"] >= 9
 
 

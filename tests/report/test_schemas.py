@@ -10,17 +10,14 @@ import jsonschema
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.result import Alternative
-from psa_casadi.effects import EFFECTS
-from psa_casadi.export.check.check import CheckReport
 from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import dumps
-from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.report.documents.files import FILES, check_file, identification_file, schema_texts
 from psa_casadi.strict_json import json_text
-from psa_casadi.variables import Publication
 from tests.model.evidence_models import evident_model
 from tests.report.report_cases import diagnosis, identification, with_periodic
 
@@ -46,11 +43,11 @@ def test_what_is_shipped_is_what_the_records_say() -> None:
         jsonschema.Draft202012Validator.check_schema(shipped(name))
 
 
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize("name", psa.STACKS)
 def test_model_files_are_as_their_schema_says(name: str) -> None:
-    model = stack_model(name).with_effect(EFFECTS["slow_creep"])
+    model = psa.stack_model(name).with_effect(psa.EFFECTS["slow_creep"])
     valid("model", dumps(model))
-    published = replace(model, publication=Publication(author="A", version="1"))
+    published = replace(model, publication=psa.Publication(author="A", version="1"))
     valid("model", dumps(published.with_starts({"z_c1": 1e-7})))
 
 
@@ -86,14 +83,14 @@ def test_identifications_are_as_their_schema_says() -> None:
 def test_checks_are_as_their_schema_says() -> None:
     rows = (CheckRow("trajectory", 1e-8, 1e-6, True, ""), stopped("calls", "it hung"))
     content = valid(
-        "check", json_text(check_file(CheckReport(Path("a.fmu"), rows, compared=False)))
+        "check", json_text(check_file(psa.CheckReport(Path("a.fmu"), rows, compared=False)))
     )
     assert [r["found"] for r in content["rows"]] == [1e-8, None]
     assert (content["passed"], content["fmu"]) == (False, "a.fmu")
 
 
 def test_what_is_otherwise_is_refused() -> None:
-    content = check_file(CheckReport(Path("a.fmu"), (), compared=True))
+    content = check_file(psa.CheckReport(Path("a.fmu"), (), compared=True))
     for spoil in ({"passed": "yes"}, {"more": 1}, {"rows": [{"name": "a"}]}):
         with pytest.raises(jsonschema.ValidationError):
             valid("check", json_text({**content, **spoil}))

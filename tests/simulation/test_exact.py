@@ -33,7 +33,7 @@ from psa_casadi.units import FloatArray
 from tests.export.c_host.build import tool
 from tests.model.sampled_models import loop
 from tests.model.stack_models import stack
-from tests.model.test_agreement import stack_values
+from tests.model.test_reference import stack_values
 from tests.simulation.exact_cases import (
     BEAT,
     CUBIC,
