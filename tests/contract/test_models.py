@@ -333,8 +333,9 @@ def test_a_model_of_ones_own_is_saved_with_its_equations_as_text(tmp_path: Path)
     psa.save_model(found, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == file.read_bytes()
     time = np.linspace(0.0, 20.0, 201)
-    runs = [psa.run(m, time, np.zeros((201, 0)), np.array([2.0, 0.0])).y for m in (model, found)]
-    np.testing.assert_allclose(*runs, rtol=1e-12, atol=1e-12)
+    x0, none = np.array([2.0, 0.0]), np.zeros((201, 0))
+    one, other = (psa.run(m, time, none, x0).y for m in (model, found))
+    np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
     fmus = [psa.export_fmu(m, tmp_path / f"{k}.fmu") for k, m in enumerate((model, found))]
     assert fmus[0].read_bytes() == fmus[1].read_bytes()
     assert "passed all" in done("check", fmus[0]).words
@@ -342,6 +343,30 @@ def test_a_model_of_ones_own_is_saved_with_its_equations_as_text(tmp_path: Path)
     done("export", "modelica", "--model", file, "-o", out)
     assert "der(v) = mu*(1 - x^2)*v - x" in out.read_text("utf-8")
     done("export", "c", "--model", file, "--step", "10ms", "-o", tmp_path / "c")
+
+
+def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
+    tmp_path: Path,
+) -> None:
+    x, force, k = ca.SX.sym("x"), ca.SX.sym("force"), ca.SX.sym("k")
+    model = psa.ode_model(
+        {"x": x, "u": force, "p": k, "ode": force - k * x, "y": x}, name="lag", values={"k": 2.5},
+        states=[psa.State("x", "m", "place", 1.0, start=0.1)],
+        inputs=[psa.Input("force", "N", "force")],
+        outputs=[psa.Output("place", "m", "place", display_unit="mm")],
+    )  # fmt: skip
+    psa.save_model(model, tmp_path / "m.json")
+    time = np.linspace(0.0, 4.0, 401)
+    ramp = write(tmp_path / "u.csv", {"time [ms]": 1e3 * time, "force [mN]": 1e3 * time})
+    done("simulate", "--model", tmp_path / "m.json", "--input", ramp, "-o", tmp_path / "x.csv")
+    columns = table(tmp_path / "x.csv")
+    decay = np.exp(-2.5 * time)
+    expected = 0.1 * decay + time / 2.5 - (1.0 - decay) / 2.5**2
+    np.testing.assert_allclose(columns["place [mm]"], 1e3 * expected, rtol=1e-5)
+    np.testing.assert_allclose(columns["force [N]"], time, rtol=1e-12)
+    for words in (("web", "-o", tmp_path / "w.html"), ("export", "ssp", "-o", tmp_path / "w.ssp")):
+        told = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
+        assert "A model of your own is for `psa identify`," in told
 
 
 def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
