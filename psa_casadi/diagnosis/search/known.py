@@ -7,7 +7,6 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
@@ -73,39 +72,10 @@ class Known:
     def conclude(self) -> None:
         """End the search: choose the answer, look at it, and ask what else is worth having."""
         self.view(self.best())
-        self.answer = self.in_order(self.likeliest())
+        self.answer = self.in_order(self.best())
         self.view(self.answer)
         self.tell(self.answer, "best")
         self.worthy = frozenset(n for n, h in self.found.items() if self.worth(h))
-
-    def likeliest(self) -> Hypothesis:
-        """Return the best hypothesis; where that removes too little, one that is nearly as likely.
-
-        Too little of the held-out error, so that its causes would not be named. Of records that are
-        held out whole the best one stays: they rank nothing.
-        """
-        best = self.best()
-        if self.scale.judge_only or not self.removes_little(best):
-            return best
-        own = self.scale.evidence(best)
-        least = self.scale.score(best) - self.task.limits.clearly * temperature(
-            own, self.task.limits
-        )
-
-        def near() -> list[Hypothesis]:
-            return [h for h in self.ranked() if h.causes and self.scale.score(h) > least]
-
-        self.finish([h for h in near() if not h.final])
-        enough = (h for h in near() if h.final and self.worth(h) and not self.removes_little(h))
-        return next(enough, best)
-
-    def removes_little(self, h: Hypothesis) -> bool:
-        """Whether structure remains and the causes remove too little to be named."""
-        root, noise = self.root.holdout_rms, self.scale.colour.rms
-        if not h.causes or root <= noise:
-            return False
-        share = (root**2 - h.holdout_rms**2) / (root**2 - noise**2)
-        return share < self.task.limits.enough and self.view(h).test.alarm
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with its causes in the order in which they explain most.
