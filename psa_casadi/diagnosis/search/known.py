@@ -41,8 +41,7 @@ class Known:
     """The hypotheses of a search, from a base fit on. Raises SimulationError where that one fails.
 
     `found` holds them by their causes, `views` those whose residual was looked at, `fitted` the
-    effects fitted beside each, `trials` what effects would add to the base. `closed` are the causes
-    of hypotheses that leave nothing, whatever more causes would explain. A search that has ended
+    effects fitted beside each, `trials` what effects would add to the base. A search that has ended
     has an `answer`, and the causes of all that is worth having (`worthy`).
     """
 
@@ -60,7 +59,6 @@ class Known:
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
-        self.closed: set[Names] = set()
         self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.tell(root, "finished")
 
@@ -172,12 +170,7 @@ class Known:
         return sorted(self.found.values(), key=lambda h: -self.scale.score(h))
 
     def best(self) -> Hypothesis:
-        """Return the answer so far: of the highest score and worth having, fitted to its end.
-
-        Where nothing is left of a hypothesis with fewer causes, that one.
-        """
-        for names in sorted(self.closed, key=len):
-            return self.found[names]
+        """Return the answer so far: of the highest score and worth having, fitted to its end."""
         while True:
             top = next(h for h in self.ranked() if self.worth(h))
             if top.final:
