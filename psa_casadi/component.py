@@ -133,16 +133,31 @@ class OnDemand(Symbols):
         return self._table.setdefault(name, ca.SX.sym(name))
 
 
+@dataclass(frozen=True)
+class FmuUsed:
+    """An imported FMU by the name of its file and the SHA-256 of that.
+
+    `parameters` are the names in there of those that the component declares, `values` numbers of
+    further ones.
+    """
+
+    file: str
+    sha256: str
+    parameters: tuple[str, ...] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False)
 class Foreign:
     """A compiled function `name` that equations call, and its derivative: an imported FMU.
 
     It has no formula, so that nothing is printed of it. `addresses` returns where the two are in
-    this process; what is compiled of a model calls them there.
+    this process; what is compiled of a model calls them there. `fmu` is what they are of.
     """
 
     name: str
     addresses: Callable[[], tuple[int, int]]
+    fmu: FmuUsed
 
 
 @dataclass(frozen=True, eq=False)

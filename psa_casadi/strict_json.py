@@ -132,6 +132,10 @@ def _has_no_default(field: Any) -> bool:
     return field.default is MISSING and field.default_factory is MISSING
 
 
+def _default(field: Any) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
+
+
 def _wanted(kind: Any) -> str:
     """Return what a message asks for where a type is declared."""
     origin, inner = get_origin(kind), get_args(kind)
@@ -150,7 +154,7 @@ def plain(value: Any) -> Any:
     """Return what a file has of a record: the names with values that are not the defaults."""
     if is_dataclass(value):
         own = [(f, getattr(value, f.name)) for f in fields(value)]
-        return {f.name: plain(v) for f, v in own if f.default is MISSING or v != f.default}
+        return {f.name: plain(v) for f, v in own if _has_no_default(f) or v != _default(f)}
     if isinstance(value, Mapping):
         return {name: plain(v) for name, v in value.items()}
     return [plain(v) for v in value] if isinstance(value, tuple) else value

@@ -75,7 +75,7 @@ def runs_of(
     """
     problems = Problems()
     fitted = {s.sha256: s.name for s in given}
-    parts = [[_in_units(model, s, problems) for s in part] for part in (given, holdout)]
+    parts = [[in_units(model, s, problems) for s in part] for part in (given, holdout)]
     for s in (s for part in parts for s in part):
         _check(model, s, problems)
     for s in [s for s in holdout if s.sha256 in fitted]:
@@ -152,7 +152,7 @@ def _units(model: Model) -> dict[str, str]:
     return {**{v.name: v.unit for v in inputs}, **{v.name: v.unit for v in outputs}}
 
 
-def _in_units(model: Model, s: Signals, problems: Problems) -> Signals:
+def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
     """Return the same samples in the units of a model; where that states none, in SI units."""
     columns, units, where = dict(s.columns), dict(s.units), s.source or s.name
     for name, own in _units(model).items():

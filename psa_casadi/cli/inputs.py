@@ -101,16 +101,19 @@ class Given:
         return found
 
     def model(self, path: Path | None) -> "psa.Model | None":
-        """Read a model that turns a voltage into a displacement; None where no file is named."""
+        """Read a stack's model; None where no file is named."""
+        from psa_casadi.simulation.start import is_stack
+
         if path is None:
             return None
         model = self.attempt(lambda: psa.load_model(path, self.own))
         if model is None:
             return None
-        if "voltage" not in model.input_names or "displacement" not in model.output_names:
+        if not is_stack(model):
             self.add(
-                f"{path}: this model has no voltage input or no displacement output, so it is no"
-                " stack; give a file that `psa identify` or `psa diagnose` wrote."
+                f"{path}: this model has no voltage input or no displacement of a stack, so it is"
+                " no stack; give a stack's file. A model of your own is for `psa identify`,"
+                " `diagnose`, `simulate`, `export`, `check` and `compare`."
             )
             return None
         return model

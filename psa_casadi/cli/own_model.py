@@ -14,7 +14,7 @@ from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading
 from psa_casadi.cli.screen import show, tell, tell_written, width, working
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
@@ -58,6 +58,8 @@ def _own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model |
 
 
 def _model(given: Given, path: Path) -> psa.Model | None:
+    from psa_casadi.simulation.start import is_stack
+
     match = _PYTHON.fullmatch(str(path))
     if match is not None:
         return _made(Path(match["file"]), match["name"] or "")
@@ -67,8 +69,7 @@ def _model(given: Given, path: Path) -> psa.Model | None:
         model = psa.load_model(path, given.own)
     except InputError:  # which is told where a stack's file is read
         return None
-    is_stack = "voltage" in model.input_names and "displacement" in model.output_names
-    return None if is_stack else model
+    return None if is_stack(model) else model
 
 
 def _made(file: Path, name: str) -> psa.Model:
@@ -166,6 +167,55 @@ def diagnosed_own(
     tell_written(json, report, quiet=given.quiet)
     case = verdict_case(d.verdict, own_verdict_sentence(d), wanted)
     judge("diagnose", ", ".join(p.name for p in records), [case], junit, began, tells=True)
+    return True
+
+
+def simulated_own(
+    path: Path | None,
+    input_: Path,
+    output: Path,
+    reading: Reading,
+    given: Given,
+    *,
+    others: Mapping[str, object],
+) -> bool:
+    """Simulate a model of one's own from its start values, and write its inputs and outputs.
+
+    False where the path names none. `others` are options that must be empty.
+    """
+    model = None if path is None else _model(given, path)
+    if model is None:
+        return False
+    import numpy as np
+
+    from psa_casadi.any_model.runs import in_units
+    from psa_casadi.units import convert
+
+    _refuse(given, others)
+    given.outputs({"--output": output}, [path, input_])
+    record = next(iter(_read(given, model, [input_], reading)), None)
+    problems = Problems()
+    samples = record and in_units(model, record, problems)
+    for sentence in problems.sentences():
+        given.add(sentence)
+    given.check()
+    if samples is None:
+        return True
+    s, time = model.structure, samples.time
+    with working("simulating", given.quiet):
+        u = np.reshape([samples.columns[i.name] for i in s.inputs], (-1, samples.n)).T
+        x0 = np.array([q.start for q in s.states])
+        found = psa.run(model, time - time[0], u, x0, hold=samples.hold)
+        written = {"time [s]": time}
+        shown: list[psa.Input | psa.Output] = [*s.inputs, *s.outputs]
+        for variable, values in zip(shown, (*u.T, *found.y.T), strict=True):
+            unit = variable.display_unit or variable.unit
+            written[f"{variable.name} [{unit}]"] = convert(values, variable.unit, unit)
+        psa.write_record(output, written)
+    show("start: the start values of the model", given.quiet)
+    show(f"{samples.n} samples over {samples.duration:.6g} s", given.quiet)
+    show(f"columns: {', '.join(written)}", given.quiet)
+    tell_written(output, quiet=given.quiet)
     return True
 
 

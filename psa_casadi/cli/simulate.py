@@ -5,6 +5,7 @@ from pathlib import Path
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading, StackName, Start
+from psa_casadi.cli.own_model import simulated_own
 from psa_casadi.cli.screen import show, tell_written, working
 
 
@@ -22,16 +23,24 @@ def simulate(
 
     The stack starts settled at the first voltage, its hysteresis and creep relaxed, or as --history
     leaves them. With --start-voltage, or a model file that has start values, it starts like an FMU
-    exported with the same options.
+    exported with the same options. A model of your own, a file of that, FILE.py:FUNCTION or an FMU,
+    starts at its start values; its inputs are lines between samples.
 
     Options:
-        input_: Record with time and voltage, and load_force if any.
+        input_: Record with time and voltage, and load_force if any; with the inputs of a model of
+            your own by their names.
         output: CSV to write.
         start_voltage: Voltage [V] that holds the stack when it starts, as in `psa export fmu`; by
             default the first one of the record.
     """
     from psa_casadi.units import convert
 
+    others = {
+        "--stack": stack, "--start-voltage": start.start_voltage is not None,
+        "--history": start.history,
+    }  # fmt: skip
+    if simulated_own(model, input_, output, reading, given, others=others):
+        return
     given.outputs({"--output": output}, [model, input_])
     chosen = given.model_or_stack(model, stack)
     columns = given.columns(reading.columns, [input_])

@@ -1,12 +1,18 @@
-"""MODEL.json: a model by the names of its components, with every value, interval and origin."""
+"""MODEL.json: a model by its components, with every value, interval and origin.
+
+Components of this package have their names there; others have their equations as text.
+"""
 
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import partial
+from importlib import import_module
+from pathlib import Path, PurePath
 from typing import Any, Literal
 
-from psa_casadi.component import Component
+from psa_casadi.component import Component, FmuUsed
 from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.mechanics import MODAL_SERIES
@@ -15,6 +21,7 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Evidence, contradictions
+from psa_casadi.model.own_components import OwnComponent, components_of, written
 from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.strict_json import (
     decode,
@@ -26,7 +33,7 @@ from psa_casadi.strict_json import (
     read_json,
     shown,
 )
-from psa_casadi.variables import Interval, Provenance, Publication
+from psa_casadi.variables import Interval, Parameter, Provenance, Publication
 
 FORMAT = "psa_casadi.model/1"
 #: What a diagnosis may add beside the effects of the table.
@@ -64,12 +71,16 @@ class IdentifiedFrom:
 
 @dataclass(frozen=True)
 class ModelFile:
-    """A model by the names of its components, with every value, interval and origin."""
+    """A model by the names of its components, with every value, interval and origin.
+
+    `own` are those of them that are not of this package, with their equations.
+    """
 
     format: Literal["psa_casadi.model/1"]
     components: tuple[str, ...]
     effects: tuple[str | OwnEffect, ...]
     parameters: Mapping[str, ModelParameter]
+    own: Mapping[str, OwnComponent] = field(default_factory=dict)
     name: str = "psa"
     description: str = ""
     publication: Publication = field(default_factory=Publication)
@@ -85,19 +96,12 @@ class ModelFile:
 def dumps(model: Model) -> str:
     """Return the text of MODEL.json; reading it back gives the same model exactly.
 
-    An effect that is not of this package is named with its module and the hash of what it declares.
-    Raises InputError for a model with a component that is in no table and of no module, and for
-    numbers and texts that no file can carry.
+    A component that is not of this package has its equations there as text, or the name and the
+    SHA-256 of its FMU; an effect of a module (`own_effects`) is named with that and the hash of
+    what it declares. Raises InputError for equations that no text can have, two components of
+    one name, and numbers and texts that no file can carry.
     """
-    foreign = foreign_components(model)
-    if foreign:
-        raise InputError(
-            f"The model '{model.name}' cannot be saved as MODEL.json: the file names components of"
-            f" this package and of modules with own effects, and neither holds"
-            f" {', '.join(foreign)} (made by ode_model or connect?). Keep the script that makes the"
-            " model, or export the model as an FMU."
-        )
-    origin = model.provenance
+    origin, own = model.provenance, _written(model)
     parameters = {
         p.name: {
             "value": model.values[p.name],
@@ -119,6 +123,7 @@ def dumps(model: Model) -> str:
             for c in model.effects
         ],
         "parameters": parameters,
+        **({"own": own} if own else {}),
         **({"starts": starts} if starts else {}),
         **({"interrupted": True} if origin.interrupted else {}),
         "force_scale": origin.force_scale,
@@ -136,10 +141,23 @@ def dumps(model: Model) -> str:
         ) from error
 
 
-def foreign_components(model: Model) -> tuple[str, ...]:
-    """Return the names of a model's components that MODEL.json cannot name."""
+def _written(model: Model) -> dict[str, Any]:
+    """Return what the file has of components that are in no table and of no module, by name."""
     known = (*COMPONENTS.values(), *EFFECTS.values(), *_BESIDE.values())
-    return tuple(c.name for c in model.components if c not in known and not c.home)
+    problems, found = Problems(), {}
+    about = f"The model {shown(model.name)} cannot be saved as MODEL.json:"
+    for name, count in Counter(c.name for c in model.components).items():
+        if count > 1:
+            problems.add(f"{about} {count} components are named '{name}'; rename them.")
+    for component in model.components:
+        try:
+            if component not in known and not component.home:
+                found[component.name] = plain(written(component, model.values))
+        except InputError as error:
+            for problem in error.problems:
+                problems.add(f"{about} {problem}")
+    problems.raise_if_any()
+    return found
 
 
 def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = ()) -> Model:
@@ -150,19 +168,30 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
     return model_of(parse_json(text, source, _ADVICE), source, effects)
 
 
-def model_of(content: Any, source: str, effects: Iterable[Component] = ()) -> Model:
-    """Return the model that the content of a file holds; raises InputError as `loads`."""
+def model_of(
+    content: Any, source: str, effects: Iterable[Component] = (), fmu: Path | None = None
+) -> Model:
+    """Return the model that the content of a file holds; raises InputError as `load_model`.
+
+    Without `fmu` no FMU is opened.
+    """
     found = content.get("format") if isinstance(content, dict) else type(content).__name__
     if not isinstance(content, dict) or found != FORMAT:
         raise InputError(
             f"{source} is not a model file: its format is {shown(found)}, expected '{FORMAT}';"
             f" {_ADVICE}"
         )
-    table = {**known_effects(effects), **_BESIDE}
-    _refuse(_problems(content, table), source)
+    declared = part(Mapping[str, OwnComponent], content.get("own", {})) or {}
+    try:
+        own = components_of(declared, partial(_opened, fmu))
+    except InputError as error:
+        _refuse(error.problems, source)
+        raise
+    table = {**COMPONENTS, **own}, {**known_effects(effects), **_BESIDE, **own}
+    _refuse(_problems(content, *table), source)
     file = decode(ModelFile, content, source)
-    components = [COMPONENTS[name] for name in file.components]
-    components += [table[_name_of(effect)] for effect in file.effects]
+    components = [table[0][name] for name in file.components]
+    components += [table[1][_name_of(effect)] for effect in file.effects]
     given = file.parameters
     try:
         values = {name: p.value for name, p in given.items()}
@@ -193,9 +222,38 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     atomic_write(path, dumps(model))
 
 
-def load_model(path: str | os.PathLike[str], effects: Iterable[Component] = ()) -> Model:
-    """Read MODEL.json; `effects` are own ones that it may have. Raises InputError."""
-    return model_of(read_json(path, _ADVICE), str(path), effects)
+def load_model(
+    path: str | os.PathLike[str],
+    effects: Iterable[Component] = (),
+    *,
+    fmu: str | os.PathLike[str] | None = None,
+) -> Model:
+    """Read MODEL.json; `effects` are own ones of modules that it may have.
+
+    Equations in the file are read as text, none of it is run. The binary of an FMU that the model
+    has runs in this process: `fmu` is that FMU or the folder with it, by default the folder of
+    MODEL.json.
+
+    Raises InputError with every unknown name, missing or bad value, and for an FMU that is not
+    there or has another SHA-256 than when the model was saved.
+    """
+    place = Path(path).parent if fmu is None else Path(fmu)
+    return model_of(read_json(path, _ADVICE), str(path), effects, place)
+
+
+def _opened(
+    place: Path | None, used: FmuUsed, name: str, parameters: tuple[Parameter, ...]
+) -> Component:
+    """Return the component of an FMU that lies at a place, or in it."""
+    if place is None or PurePath(used.file).name != used.file:
+        raise InputError(
+            f"the model has the FMU {shown(used.file)}, which is not opened from here; type"
+            " psa.load_model(MODEL, fmu=FMU)."
+        )
+    importer = import_module("psa_casadi.export.importer.fmu_model")  # which knows models
+    file = place / used.file if place.is_dir() else place
+    found: Component = importer.component_again(file, used, name, parameters)
+    return found
 
 
 def _refuse(sentences: Iterable[str], source: str) -> None:
@@ -210,13 +268,15 @@ def _name_of(effect: str | OwnEffect) -> str:
     return effect if isinstance(effect, str) else effect.name
 
 
-def _problems(content: dict[str, Any], effects: Mapping[str, Component]) -> list[str]:
-    """Return all mistakes in the content of a file; `effects` are those that it may name."""
+def _problems(
+    content: dict[str, Any], components: Mapping[str, Component], effects: Mapping[str, Component]
+) -> list[str]:
+    """Return all mistakes in the content of a file that may name these components and effects."""
     problems = list(mistakes(ModelFile, content))
     names = [n for n in _listed(content, "components") if isinstance(n, str)]
     references = [r for e in _listed(content, "effects") if (r := part(str | OwnEffect, e))]
-    problems += [_unknown(n, "components", COMPONENTS) for n in names if n not in COMPONENTS]
-    known = [COMPONENTS[n] for n in names if n in COMPONENTS]
+    problems += [_unknown(n, "components", components) for n in names if n not in components]
+    known = [components[n] for n in names if n in components]
     for reference in references:
         effect = effects.get(_name_of(reference))
         if effect is None:

@@ -64,9 +64,8 @@ def ode_model(
     what the solver's absolute tolerance is measured by. `values` are numbers of parameters in SI
     units.
 
-    The model cannot be saved as MODEL.json, which names components of this package: CasADi's own
-    format of expressions can be read neither in a diff nor by another version. The script that
-    makes the model is its source.
+    MODEL.json keeps it with its equations as text (`psa.save_model`); a usual size that is a
+    function of parameters is a number there.
 
     Raises InputError with every mistake: a symbol that is not in x, u, p or t; rows that do not
     fit; SX beside MX; what cannot be expanded to scalar operations; names used twice or reserved;
@@ -266,7 +265,7 @@ def _declared(
     for unknown in (k for k in values if k not in known and len(known) == f.numel_in("p")):
         problems.add(f"`values` has '{unknown}', which is no parameter; there are {[*known]}.")
     for variable in [v for rows in found.values() for v in rows]:
-        _check_variable(variable, {**known, **values}, problems)
+        check_variable(variable, {**known, **values}, problems)
     if f.numel_out("y") == 0:
         found["y"] = [
             Output(f"{s.name}_out", s.unit, s.description, s.nominal, s.display_unit)
@@ -302,8 +301,8 @@ def _is_identifier(name: str) -> bool:
     return re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) is not None
 
 
-def _check_variable(variable: Any, values: Mapping[str, float], problems: Problems) -> None:
-    """The name is an identifier and not reserved; units are known, numbers finite.
+def check_variable(variable: Any, values: Mapping[str, float], problems: Problems) -> None:
+    """Note a name that is no identifier or `time`, an unknown unit, a number that is not finite.
 
     A usual size may be a function of parameters; those must be parameters of this model.
     """

@@ -8,7 +8,7 @@ A model with ports is the same model, written so that others may add to it:
     shown_y   = true_y + ...     what the sensor shows of it
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -63,10 +63,15 @@ def ports_of(model: Model) -> tuple[Port, ...]:
         *(
             Port("rate", q.name, rate_unit(_si(q.unit)))
             for q in states
-            if not ca.SX(s.der[q.name]).is_symbolic()
+            if _is_physics(ca.SX(s.der[q.name]), q.name)
         ),
         *(Port("output", o.name, _si(o.unit)) for c in base for o in c.outputs),
     )
+
+
+def _is_physics(rate: Expression, state: str) -> bool:
+    """Whether a rate is more than a symbol, but for the sum at its port."""
+    return not rate.is_symbolic() or rate.name() == _PREFIX["rate"] + state
 
 
 def with_ports(model: Model, ports: Iterable[Port] | None = None) -> Model:
@@ -80,7 +85,12 @@ def with_ports(model: Model, ports: Iterable[Port] | None = None) -> Model:
 
 @cache
 def ported(component: Component, ports: frozenset[Port]) -> Component:
-    """Return a component with sums at those of the ports that are its own; once for all."""
+    """Return a component with sums at those of the ports that are its own; once for all.
+
+    Those that it has already stay.
+    """
+    if isinstance(component.equations, Opened):
+        ports, component = ports | {*component.equations.ports}, component.equations.component
     names = {
         "input": [i.name for i in component.inputs],
         "rate": [q.name for q in component.states],
@@ -96,7 +106,7 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
             true = true_output(p.variable)
             balances.append(Balance(true, p.unit, f"{p.words} before its sensor"))
         balances.append(Balance(p.balance, p.unit, about[p.kind] + p.words))
-    return replace(component, equations=_opened(component, own), balances=tuple(balances))
+    return replace(component, equations=Opened(component, tuple(own)), balances=tuple(balances))
 
 
 def state_unit(model: Model, name: str) -> str:
@@ -108,15 +118,20 @@ def _si(unit: str) -> str:
     return si_unit(unit) if unit else "1"
 
 
-def _opened(component: Component, ports: list[Port]) -> Callable[[Symbols], Equations]:
-    """Return the component's equations with sums in the places of what the ports stand for."""
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """The equations of a component with sums in the places of what its ports stand for."""
 
-    def equations(s: Symbols) -> Equations:
-        replaced = {p.variable: getattr(s, p.balance) for p in ports if p.kind == "input"}
-        plain = component.equations(_Replaced(s, replaced))
+    component: Component
+    ports: tuple[Port, ...]
+
+    def __call__(self, s: Symbols) -> Equations:
+        """Return the equations in these symbols."""
+        replaced = {p.variable: getattr(s, p.balance) for p in self.ports if p.kind == "input"}
+        plain = self.component.equations(_Replaced(s, replaced))
         add: dict[str, Expression] = dict(plain.add)
         der, out = dict(plain.der), dict(plain.out)
-        for p in ports:
+        for p in self.ports:
             if p.kind == "input":
                 add[p.balance] = getattr(s, p.variable)
             elif p.kind == "rate":
@@ -126,8 +141,6 @@ def _opened(component: Component, ports: list[Port]) -> Callable[[Symbols], Equa
                 add[true], add[p.balance] = out[p.variable], getattr(s, true)
                 out[p.variable] = getattr(s, p.balance)
         return replace(plain, der=der, add=add, out=out)
-
-    return equations
 
 
 class _Replaced(Symbols):

@@ -318,6 +318,77 @@ def van_der_pol() -> psa.Model:
     )
 
 
+def test_a_model_of_ones_own_is_saved_with_its_equations_as_text(tmp_path: Path) -> None:
+    model, file = van_der_pol().with_values({"mu": 4.0 / 3.0}), tmp_path / "m.json"
+    psa.save_model(model, file)
+    content, found = json.loads(file.read_text("utf-8")), psa.load_model(file)
+    assert content["components"] == ["VanDerPol"]
+    own = content["own"]["VanDerPol"]
+    assert own["equations"] == {
+        "der": {"x": "v", "v": "mu * (1 - x ** 2) * v - x"}, "out": {"position": "x"},
+    }  # fmt: skip
+    assert own["states"][0]["start"] == own["states"][0]["nominal"] == 2.0
+    assert own["parameters"][0]["bounds"] == [0.1, 10.0]
+    assert dict(found.values) == {"mu": 4.0 / 3.0}
+    psa.save_model(found, tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == file.read_bytes()
+    time = np.linspace(0.0, 20.0, 201)
+    x0, none = np.array([2.0, 0.0]), np.zeros((201, 0))
+    one, other = (psa.run(m, time, none, x0).y for m in (model, found))
+    np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
+    fmus = [psa.export_fmu(m, tmp_path / f"{k}.fmu") for k, m in enumerate((model, found))]
+    assert fmus[0].read_bytes() == fmus[1].read_bytes()
+    assert "passed all" in done("check", fmus[0]).words
+    out = tmp_path / "m.mo"
+    done("export", "modelica", "--model", file, "-o", out)
+    assert "der(v) = mu*(1 - x^2)*v - x" in out.read_text("utf-8")
+    done("export", "c", "--model", file, "--step", "10ms", "-o", tmp_path / "c")
+
+
+def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
+    tmp_path: Path,
+) -> None:
+    x, force, k = ca.SX.sym("x"), ca.SX.sym("force"), ca.SX.sym("k")
+    model = psa.ode_model(
+        {"x": x, "u": force, "p": k, "ode": force - k * x, "y": x}, name="lag", values={"k": 2.5},
+        states=[psa.State("x", "m", "place", 1.0, start=0.1)],
+        inputs=[psa.Input("force", "N", "force")],
+        outputs=[psa.Output("place", "m", "place", display_unit="mm")],
+    )  # fmt: skip
+    psa.save_model(model, tmp_path / "m.json")
+    time = np.linspace(0.0, 4.0, 401)
+    ramp = write(tmp_path / "u.csv", {"time [ms]": 1e3 * time, "force [mN]": 1e3 * time})
+    done("simulate", "--model", tmp_path / "m.json", "--input", ramp, "-o", tmp_path / "x.csv")
+    columns = table(tmp_path / "x.csv")
+    decay = np.exp(-2.5 * time)
+    expected = 0.1 * decay + time / 2.5 - (1.0 - decay) / 2.5**2
+    np.testing.assert_allclose(columns["place [mm]"], 1e3 * expected, rtol=1e-5)
+    np.testing.assert_allclose(columns["force [N]"], time, rtol=1e-12)
+    for words in (("web", "-o", tmp_path / "w.html"), ("export", "ssp", "-o", tmp_path / "w.ssp")):
+        told = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
+        assert "A model of your own is for `psa identify`," in told
+
+
+def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
+    file, trace = tmp_path / "m.json", tmp_path / "ran"
+    psa.save_model(van_der_pol(), file)
+    plain = json.loads(file.read_text("utf-8"))
+    code = f"__import__('pathlib').Path({str(trace)!r}).touch() or x"
+    for text, said in (
+        (code, "has a Python Call"),
+        ("x.real", "has a Python Attribute"),
+        ("open(x)", "calls open of 1"),
+        ("9" * 10_000, "at most 8000 are read"),
+        ("(" * 5_000, "which is no expression"),
+    ):
+        plain["own"]["VanDerPol"]["equations"]["der"]["v"] = text
+        file.write_text(json.dumps(plain), encoding="utf-8")
+        told = refused("export", "modelica", "--model", file, "-o", tmp_path / "x.mo")
+        assert said in told
+        assert "'own.VanDerPol.equations.der.v'" in told
+    assert not trace.exists()
+
+
 def test_a_model_of_ones_own_runs_as_scipy_runs_it_and_is_identified() -> None:
     time = np.linspace(0.0, 10.0, 1001)
     plant = solve_ivp(

@@ -1,5 +1,7 @@
 """Models that are FMUs: derivatives, parameters identified, defects named that a plant hides."""
 
+import hashlib
+import json
 import tempfile
 import zipfile
 from functools import cache
@@ -15,7 +17,7 @@ from fmpy.fmi2 import FMU2Model
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
-from psa_casadi.model.ports import ports_of
+from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import start_state
@@ -188,5 +190,47 @@ def test_what_has_no_equations_is_not_exported(tmp_path: Path) -> None:
             export(model, tmp_path / "again")
     with pytest.raises(psa.InputError, match=r"has an FMU in it"):
         psa.export_c(model, tmp_path, step=1e-3)
-    with pytest.raises(psa.InputError, match=r"cannot be saved as MODEL.json"):
-        psa.save_model(model, tmp_path / "model.json")
+
+
+def test_model_json_names_the_fmu_by_its_hash(tmp_path: Path) -> None:
+    fmu, file = tmp_path / "swing.fmu", tmp_path / "model.json"
+    fmu.write_bytes(pendulum().read_bytes())
+    model = psa.fmu_model(fmu, free=FREE, values={"gravity": 1.62}, name="swing")
+    model = with_ports(model.with_values({"length": 1.0 / 3.0}))
+    psa.save_model(model, file)
+    used = json.loads(file.read_text("utf-8"))["own"]["swing"]["fmu"]
+    assert used == {
+        "file": "swing.fmu", "sha256": hashlib.sha256(fmu.read_bytes()).hexdigest(),
+        "parameters": ["length", "damping"], "values": {"gravity": 1.62},
+    }  # fmt: skip
+    found = psa.load_model(file)
+    assert dict(found.values) == dict(model.values)
+    assert found.structure.parameters == model.structure.parameters
+    assert found.own_starts() == model.own_starts() == {"body_phi": 0.1}
+    assert ports_of(found) == ports_of(model)
+    at = (0.2, AT, 1.3, model.parameter_vector())
+    for mine, its in zip(model.structure.f(*at), found.structure.f(*at), strict=True):
+        np.testing.assert_array_equal(np.array(its), np.array(mine))
+    psa.save_model(found, tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == file.read_bytes()
+
+
+def test_another_fmu_than_the_saved_one_is_refused(tmp_path: Path) -> None:
+    fmu, file = tmp_path / "swing.fmu", tmp_path / "model.json"
+    fmu.write_bytes(pendulum().read_bytes())
+    psa.save_model(psa.fmu_model(fmu, free=FREE), file)
+    (tmp_path / "there").mkdir()
+    moved = fmu.rename(tmp_path / "there" / "other.fmu")
+    with pytest.raises(psa.InputError, match=r"swing\.fmu is not there; .*type psa\.load_model"):
+        psa.load_model(file)
+    assert psa.load_model(file, fmu=moved).output_names == ("reach", "speed")
+    fmu.write_bytes(moved.read_bytes() + b" ")
+    with pytest.raises(psa.InputError, match="is another FMU than the one it was saved with"):
+        psa.load_model(file)
+    moved.rename(tmp_path / "there" / "swing.fmu")
+    assert psa.load_model(file, fmu=tmp_path / "there").state_names == ("body_phi", "body_w")
+    content = json.loads(file.read_text("utf-8"))
+    content["own"]["Pendulum"]["fmu"]["file"] = "there/swing.fmu"
+    file.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(psa.InputError, match=r"'there/swing\.fmu', which is not opened from here"):
+        psa.load_model(file)

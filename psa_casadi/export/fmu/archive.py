@@ -31,7 +31,7 @@ from psa_casadi.export.fmu.sources import (
 from psa_casadi.export.fmu.terminals import terminal_entries
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import dumps, foreign_components
+from psa_casadi.model.model_file import dumps
 from psa_casadi.simulation.stepper import SimulationError
 
 #: Where an FMU carries the model it was made from.
@@ -135,8 +135,7 @@ def _companions(model: Model, fmi: int, samples: int, fixed: FixedStep | None) -
     entries[LICENSE_ENTRY] = license_text(model, fmi).encode("utf-8")
     drawing = png(ICONS[drawing_of(model)])
     entries |= {"model.png": drawing} if fmi == 2 else terminal_entries(model)
-    if not foreign_components(model):
-        entries[MODEL_ENTRY] = dumps(model).encode("utf-8")
+    entries[MODEL_ENTRY] = dumps(model).encode("utf-8")
     return entries
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.component import Component, Equations, Expression, FmuUsed, Symbols
 from psa_casadi.errors import InputError, Problems, PsaError
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.imported import (
@@ -222,8 +222,8 @@ def fmu_model(
     underscores: `body.phi[1]` is `body_phi_1`; a state that is an output too is NAME_state.
 
     The FMU is unpacked and its binary runs in this process, without protection: load none that you
-    would not run. The model is neither exported nor saved, as it has no equations to print; two
-    models of one FMU share instances.
+    would not run. The model is not exported, as it has no equations to print; MODEL.json names the
+    FMU's file and its SHA-256. Two models of one FMU share instances.
 
     Raises InputError for a file that is no such FMU, has no binary for this machine, events, inputs
     that are no real numbers, or only one instance for each process, and for wrong names or bounds.
@@ -254,6 +254,29 @@ def fmu_model(
         raise InputError(f"{fmu.path}: cannot be initialised ({error}); check `values`.") from error
     model = compose([component], name=own)
     return model.with_starts(dict(zip((s.name for s in read.states), starts, strict=True)))
+
+
+def component_again(
+    file: Path, used: FmuUsed, name: str, parameters: Sequence[Parameter]
+) -> Component:
+    """Return the component of an FMU with these parameters, if the file is that FMU.
+
+    Raises InputError where there is no such file or it has another SHA-256, and as `fmu_model`.
+    """
+    there = file.is_file()
+    if not there or digest_of(file) != used.sha256:
+        why = "is another FMU than the one it was saved with" if there else "is not there"
+        raise InputError(
+            f"the model has the FMU '{used.file}' (sha256 {used.sha256}), and {file} {why}; put"
+            " that FMU there, or type psa.load_model(MODEL, fmu=FMU) with the place where it is."
+        )
+    if len(parameters) != len(used.parameters):
+        raise InputError(
+            f"the FMU '{used.file}' has {len(used.parameters)} parameters named and"
+            f" {len(parameters)} declared; declare each."
+        )
+    free = dict(zip(used.parameters, parameters, strict=True))
+    return fmu_model(file, free=free, values=used.values, name=name).components[0]
 
 
 def _sizes(read: Read) -> tuple[float, ...]:

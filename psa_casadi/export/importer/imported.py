@@ -19,7 +19,7 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import Foreign
+from psa_casadi.component import FmuUsed, Foreign
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError, Instance
 from psa_casadi.simulation.compiler import shared_library
@@ -71,10 +71,12 @@ class Selected:
 class Imported:
     """The function of one FMU with some of its variables; it lives as long as the process.
 
-    `sizes` are the usual sizes of states, inputs and parameters, `name` is that of the function.
+    `digest` is the SHA-256 of its file, `name` that of the function; `sizes` are the usual sizes of
+    states, inputs and parameters.
     """
 
     fmu: Fmu
+    digest: str
     name: str
     selected: Selected
     sizes: Sequence[float]
@@ -85,7 +87,7 @@ class Imported:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle where the FMU is and what is in it: it is opened again, if it is the same."""
         path = Path(self.fmu.path).resolve()
-        return _again, (path, digest_of(path), self.selected, self.sizes)
+        return _again, (path, self.digest, self.selected, self.sizes)
 
     @cached_property
     def path(self) -> str:
@@ -120,7 +122,9 @@ class Imported:
     @property
     def foreign(self) -> Foreign:
         """What a component declares of it."""
-        return Foreign(self.name, self._addresses)
+        s, file = self.selected, Path(self.fmu.path)
+        used = FmuUsed(file.name, self.digest, s.parameters, dict(s.fixed))
+        return Foreign(self.name, self._addresses, used)
 
     def _addresses(self) -> tuple[int, int]:  # a method, as it is pickled
         names = (self.name, f"fwd1_{self.name}")
@@ -190,7 +194,7 @@ def imported_of(fmu: Fmu, digest: str, selected: Selected, sizes: tuple[float, .
     """Return the function of an FMU; one for models with the same variables and fixed values."""
     told = repr((digest, str(fmu.path), selected, sizes))
     name = f"fmu_{hashlib.sha256(told.encode()).hexdigest()[:16]}"
-    return Imported(fmu, name, selected, sizes)
+    return Imported(fmu, digest, name, selected, sizes)
 
 
 def _again(file: Path, digest: str, selected: Selected, sizes: tuple[float, ...]) -> Imported:

@@ -1,34 +1,21 @@
 """CasADi expressions as Modelica text, with the fewest parentheses that keep their order.
 
-CasADi's own operations are reduced to those that Modelica has: `2 x` for its twice, `x^2` for its
-square, `1/x` for its inverse, and an if-expression for a pair of its conditional zeros. Every tool
-reads `a*(-b)`, `(-2)^2` and `(a^b)^c` alike; none of them is written without its parentheses. A
-comparison is a Boolean; where a number is wanted it becomes an if-expression. `==` of Real
-variables is not Modelica outside functions: `a <= b and a >= b` says the same.
+A pair of CasADi's conditional zeros becomes an if-expression. Every tool reads `a*(-b)`, `(-2)^2`
+and `(a^b)^c` alike; none of them is written without its parentheses. A comparison is a Boolean;
+where a number is wanted it becomes an if-expression. `==` of Real variables is not Modelica outside
+functions: `a <= b and a >= b` says the same.
 
 Source: Modelica Language Specification 3.6, sections 2.3 (words), 3.2 (precedence), 3.7.
 """
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 
 import casadi as ca
 
-from psa_casadi.component import Expression
 from psa_casadi.errors import InputError
-
-
-@dataclass(frozen=True)
-class Node:
-    """An operation on nodes, by their numbers; a symbol by its name; a constant by its value."""
-
-    operation: str
-    arguments: tuple[int, ...] = ()
-    name: str = ""
-    value: float = 0.0
-
+from psa_casadi.model.graph import PLAINLY, ExpressionGraph, square
 
 #: CasADi's operations that are printed, all of them under their own names, but for these.
 _OWN_NAMES = (
@@ -44,123 +31,31 @@ _OPERATIONS: dict[int, str] = {
     ca.OP_IF_ELSE_ZERO: "if",
 }
 
-#: Names of the operations in a sentence that refuses them.
-_CODES = {getattr(ca, n): n[3:].lower() for n in dir(ca) if n.startswith("OP_")}
 
-_LOG10 = 1 / math.log(10)
-
-
-class Graph:
-    """Nodes by number; the arguments of a node have smaller numbers than the node."""
-
-    def __init__(self) -> None:
-        self.nodes: list[Node] = []
-        self._numbers: dict[Node, int] = {}
-
-    def add(self, operation: str, *arguments: int, name: str = "", value: float = 0.0) -> int:
-        """Return the number of an operation on nodes, of a "symbol" or of a "constant"."""
-        node = Node(operation, arguments, name, value)
-        if node not in self._numbers:
-            self._numbers[node] = len(self.nodes)
-            self.nodes.append(node)
-        return self._numbers[node]
-
-    def read(self, expressions: Sequence[Expression]) -> list[int]:
-        """Return the numbers of scalar expressions; a symbol is known by its name.
-
-        Raises InputError for a constant that is not finite and for an operation that Modelica does
-        not have.
-        """
-        dense = [ca.densify(ca.SX(e)) for e in expressions]
-        symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *dense))
-        names = [s.name() for s in symbols]
-        function = ca.Function("f", [ca.vertcat(*symbols)], dense)
-        registers: dict[int, int] = {}
-        results: dict[int, int] = {}
-        for k in range(function.n_instructions()):
-            code = function.instruction_id(k)
-            inputs, outputs = function.instruction_input(k), function.instruction_output(k)
-            if code == ca.OP_OUTPUT:
-                results[outputs[0]] = registers[inputs[0]]
-            elif code == ca.OP_INPUT:
-                registers[outputs[0]] = self.add("symbol", name=names[inputs[1]])
-            elif code == ca.OP_CONST:
-                value = function.instruction_constant(k)
-                if not math.isfinite(value):
-                    raise InputError(
-                        f"An equation holds the constant {value:g}, which Modelica cannot write;"
-                        " divide by nothing that is zero and bound by nothing infinite."
-                    )
-                registers[outputs[0]] = self.add("constant", value=value)
-            else:
-                registers[outputs[0]] = self._operation(code, [registers[i] for i in inputs])
-        return [results[i] for i in range(len(dense))]
-
-    def below(self, roots: Iterable[int]) -> set[int]:
-        """Return the numbers of the roots and of all that they are made of."""
-        found: set[int] = set()
-        waiting = list(roots)
-        while waiting:
-            number = waiting.pop()
-            if number not in found:
-                found.add(number)
-                waiting.extend(self.nodes[number].arguments)
-        return found
-
-    def _operation(self, code: int, arguments: list[int]) -> int:
-        """Return the number of one of CasADi's operations, reduced to those that are printed."""
-        if code == ca.OP_ASSIGN:
-            return arguments[0]
-        if code in _OPERATIONS:
-            return self._simplified(_OPERATIONS[code], arguments)
-        if code in _REWRITTEN:
-            return _REWRITTEN[code](self, *arguments)
-        raise InputError(
-            f"An equation uses '{_CODES.get(code, code)}', which Modelica does not have; write it"
-            " with other functions."
-        )
-
-    def _simplified(self, operation: str, arguments: list[int]) -> int:
-        """Write log(x) / log(10) as log10(x), (-a) b as -(a b), and a pair of ifs as one if.
-
-        (if c then a else 0) + (if not c then b else 0) is if c then a else b.
-        """
-        if operation not in ("add", "mul"):
-            return self.add(operation, *arguments)
-        nodes = [self.nodes[a] for a in arguments]
-        for first, second in (nodes, nodes[::-1]):
-            if operation == "mul" and first.operation == "log" and second.value == _LOG10:
-                return self.add("log10", *first.arguments)
-            pair = operation == "add" and first.operation == second.operation == "if"
-            if pair and second.arguments[0] == self.add("not", first.arguments[0]):
-                return self.add("if", *first.arguments, second.arguments[1])
-        if operation == "mul" and nodes[0].operation == "neg":
-            return self.add("neg", self.add("mul", nodes[0].arguments[0], arguments[1]))
-        return self.add(operation, *arguments)
-
-
-def _square(graph: Graph, x: int) -> int:
-    return graph.add("pow", x, graph.add("constant", value=2.0))
-
-
-def _asinh(graph: Graph, x: int) -> int:
+def _asinh(graph: ExpressionGraph, x: int) -> int:
     """Return sign(x) ln(|x| + sqrt(x^2 + 1)), which cancels nothing for negative x."""
     one = graph.add("constant", value=1.0)
-    root = graph.add("sqrt", graph.add("add", _square(graph, x), one))
+    root = graph.add("sqrt", graph.add("add", square(graph, x), one))
     size = graph.add("log", graph.add("add", graph.add("abs", x), root))
     return graph.add("mul", graph.add("sign", x), size)
 
 
 #: Operations of CasADi that Modelica says in other words.
 _REWRITTEN: dict[int, Callable[..., int]] = {
-    ca.OP_TWICE: lambda g, x: g.add("mul", g.add("constant", value=2.0), x),
-    ca.OP_SQ: _square,
-    ca.OP_INV: lambda g, x: g.add("div", g.add("constant", value=1.0), x),
+    **PLAINLY,
     ca.OP_LOG1P: lambda g, x: g.add("log", g.add("add", g.add("constant", value=1.0), x)),
     ca.OP_EXPM1: lambda g, x: g.add("sub", g.add("exp", x), g.add("constant", value=1.0)),
-    ca.OP_HYPOT: lambda g, x, y: g.add("sqrt", g.add("add", _square(g, x), _square(g, y))),
+    ca.OP_HYPOT: lambda g, x, y: g.add("sqrt", g.add("add", square(g, x), square(g, y))),
     ca.OP_ASINH: _asinh,
 }
+
+
+class Graph(ExpressionGraph):
+    """Expressions in the operations of Modelica."""
+
+    language = "Modelica"
+    operations = _OPERATIONS
+    rewritten = _REWRITTEN
 
 
 _WORDS = """

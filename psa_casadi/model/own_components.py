@@ -1,0 +1,198 @@
+"""Components of MODEL.json that no table has: their declarations, and their equations as text."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, TypeVar
+
+from psa_casadi.component import Balance, Component, FmuUsed, KeptEquations
+from psa_casadi.errors import InputError, Problems
+from psa_casadi.model.equation_text import EquationTexts, equations_of, texts_of
+from psa_casadi.model.ode_model import check_variable
+from psa_casadi.model.ports import Opened, Port, ported
+from psa_casadi.variables import Input, Output, Parameter, State, Values, nominal_value
+
+T = TypeVar("T")
+
+#: How many variables and sums components of a file may declare.
+_VARIABLES = 2_000
+
+
+@dataclass(frozen=True)
+class OwnParameter:
+    """What a component declares of a parameter; `value` is its default, null no bound."""
+
+    name: str
+    value: float
+    unit: str
+    bounds: tuple[float | None, float | None]
+    description: str
+    display_unit: str | None = None
+    log: bool = False
+    scale: float | None = None
+    fitted: bool = True
+    limit: bool = False
+
+
+@dataclass(frozen=True)
+class OwnOutput:
+    """What a component declares of an output; `nominal` is its usual size."""
+
+    name: str
+    unit: str
+    description: str
+    nominal: float
+    display_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class OwnInput(OwnOutput):
+    """What a component declares of an input."""
+
+    start: float = 0.0
+
+
+@dataclass(frozen=True)
+class OwnState(OwnInput):
+    """What a component declares of a state, continuous or sampled."""
+
+    memory: bool = False
+    settles: bool = True
+    whole: float | None = None
+
+
+@dataclass(frozen=True)
+class OwnComponent:
+    """A component with its equations as text, or with the FMU that has them.
+
+    Its `ports` are places where the components of effects add to these equations: to `applied_U`,
+    which takes the place of an input U, to `rate_X`, the rate of a state X, or to `shown_Y`, what a
+    sensor shows of an output Y.
+    """
+
+    description: str
+    source: str
+    equations: EquationTexts = field(default_factory=EquationTexts)
+    fmu: FmuUsed | None = None
+    parameters: tuple[OwnParameter, ...] = ()
+    states: tuple[OwnState, ...] = ()
+    sampled: tuple[OwnState, ...] = ()
+    inputs: tuple[OwnInput, ...] = ()
+    outputs: tuple[OwnOutput, ...] = ()
+    balances: tuple[Balance, ...] = ()
+    ports: tuple[Port, ...] = ()
+    sample_period: str | None = None
+    gain: str | None = None
+    linear: tuple[str, ...] = ()
+    belongs_to: Literal["plant", "drive", "sensor", "environment"] = "plant"
+    looks_like: str = ""
+    equation_text: str = ""
+
+
+#: What is the same in a file and in a component.
+_SAME = ("description", "source", "balances", "sample_period", "gain", "linear", "belongs_to",
+         "looks_like", "equation_text")  # fmt: skip
+#: The variables of a component, and how a file declares them.
+_KINDS: dict[str, tuple[type, type]] = {
+    "parameters": (Parameter, OwnParameter),
+    "states": (State, OwnState),
+    "sampled": (State, OwnState),
+    "inputs": (Input, OwnInput),
+    "outputs": (Output, OwnOutput),
+}
+#: Opens an FMU of a file as a component with parameters.
+Opener = Callable[[FmuUsed, str, tuple[Parameter, ...]], Component]
+
+
+def written(component: Component, values: Values) -> OwnComponent:
+    """Return what a file has of a component; usual sizes are those at these values.
+
+    Raises InputError for equations that no text can have.
+    """
+    ports: tuple[Port, ...] = ()
+    if isinstance(opened := component.equations, Opened):
+        component, ports = opened.component, opened.ports
+    same: dict[str, Any] = {name: getattr(component, name) for name in _SAME}
+    if component.foreign is not None:
+        return OwnComponent(
+            **same, ports=ports, fmu=component.foreign.fmu,
+            parameters=tuple(_declared(OwnParameter, p, values) for p in component.parameters),
+        )  # fmt: skip
+    try:
+        equations = texts_of(KeptEquations.of(component))
+    except InputError as error:
+        raise InputError([f"'{component.name}': {p}" for p in error.problems]) from error
+    variables: dict[str, Any] = {
+        kind: tuple(_declared(own, v, values) for v in getattr(component, kind))
+        for kind, (_, own) in _KINDS.items()
+    }
+    return OwnComponent(**same, **variables, ports=ports, equations=equations)
+
+
+def _declared(kind: type[T], variable: Any, values: Values) -> T:
+    """Return a variable as a file declares it."""
+    found: dict[str, Any] = {f.name: getattr(variable, f.name) for f in fields(kind)}  # type: ignore[arg-type]
+    for name in ("nominal", "scale", "whole"):
+        if found.get(name) is not None:
+            found[name] = nominal_value(found[name], values)
+    if "bounds" in found:
+        found["bounds"] = tuple(b if math.isfinite(b) else None for b in found["bounds"])
+    return kind(**found)
+
+
+def components_of(own: Mapping[str, OwnComponent], opener: Opener) -> dict[str, Component]:
+    """Return the components that a file declares, by name.
+
+    Raises InputError with a sentence for each mistake, which begins with its place in the file.
+    """
+    count = sum(len(getattr(c, k)) for c in own.values() for k in (*_KINDS, "balances", "ports"))
+    if count > _VARIABLES:
+        raise InputError(f"'own' declares {count} variables; at most {_VARIABLES} are read.")
+    problems, found = Problems(), {}
+    for name, declared in own.items():
+        try:
+            found[name] = _component(name, declared, opener)
+        except InputError as error:
+            for problem in error.problems:
+                problems.add(problem)
+    problems.raise_if_any()
+    return found
+
+
+def _component(name: str, declared: OwnComponent, opener: Opener) -> Component:
+    place = f"own.{name[:80]}"
+    variables: dict[str, Any] = {
+        kind: tuple(_variable(made, v) for v in getattr(declared, kind))
+        for kind, (made, _) in _KINDS.items()
+    }
+    problems = Problems()
+    table = {p.name: p.value for p in variables["parameters"]}
+    every = [v for group in variables.values() for v in group]
+    sums = [Output(b.name, b.unit, b.description) for b in declared.balances]
+    places = [Output(p.variable, p.unit, p.words) for p in declared.ports]
+    for variable in (Output(name, "1", ""), *every, *sums, *places):
+        check_variable(variable, table, problems)
+    for named in (declared.gain, *declared.linear):
+        if named is not None and named not in table:
+            problems.add(f"'{named}' is a gain or linear, and no parameter of it; declare it.")
+    if problems:
+        raise InputError([f"'{place}': {p}" for p in problems.sentences()])
+    same: dict[str, Any] = {n: getattr(declared, n) for n in _SAME}
+    if declared.fmu is not None:
+        found = opener(declared.fmu, name, variables["parameters"])
+    else:
+        equations = equations_of(declared.equations, f"{place}.equations")
+        found = Component(name=name, equations=equations, **same, **variables)
+    opened = ported(found, frozenset(declared.ports))
+    kept = opened.equations.ports if isinstance(opened.equations, Opened) else ()
+    for port in set(declared.ports) - set(kept):
+        raise InputError(f"'{place}.ports' has {port.words}, which it does not have; leave it out.")
+    return opened
+
+
+def _variable(kind: type[T], declared: Any) -> T:
+    found = {f.name: getattr(declared, f.name) for f in fields(declared)}
+    if "bounds" in found:
+        low, high = found["bounds"]
+        found["bounds"] = (-math.inf if low is None else low, math.inf if high is None else high)
+    return kind(**found)
