@@ -133,6 +133,8 @@ def _binned(
 
 
 _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
+#: A difference below this share of the readings is rounding, which looks like the residual's.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,8 +311,11 @@ def changes(
             )
             if step:  # what is shown beyond what the fit shows
                 offset = 0.0 if f.number else fit.offset(k)
-                total = total + (offset - e.measured(f.number)[at])[:, None]
-                parts.append(total / e.share(f.number) + residual[:, None])
+                readings = e.measured(f.number)[at]
+                total = total + (offset - readings)[:, None]
+                beyond = total / e.share(f.number) + residual[:, None]
+                least = _ROUNDING * float(np.max(np.abs(readings))) / e.share(f.number)
+                parts.append(beyond if np.max(np.abs(beyond)) > least else np.zeros_like(beyond))
             else:
                 parts.append(total / e.share(f.number))
         columns.append(f.left_of(np.concatenate(parts)))
