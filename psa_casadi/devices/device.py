@@ -90,7 +90,7 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
 
 
 def _worked_own(task: DeviceTask, model: Model, began: float) -> DeviceOutcome:
-    """Work with a model of one's own, of which there is no file: its values are in the result's."""
+    """Work with a model of one's own; an imported FMU has no file of its model."""
     o = task.options
     records = read_signals(
         task.job.files, inputs=model.input_names, outputs=model.output_names,
@@ -98,13 +98,17 @@ def _worked_own(task: DeviceTask, model: Model, began: float) -> DeviceOutcome:
     )  # fmt: skip
     _refuse_same(records)
     if o.work == "diagnose":
-        return _done(
-            task, began, ((DIAGNOSIS, any_diagnose(model, records, **o.words).to_json()),), records
-        )
-    found = any_identify(model, records, **o.words)
-    if found.fit.interrupted:
-        raise KeyboardInterrupt
-    return _done(task, began, ((IDENTIFICATION, json_text(identification_file(found))),), records)
+        d = any_diagnose(model, records, **o.words)
+        name, text, last = DIAGNOSIS, d.to_json(), d.model
+    else:
+        found = any_identify(model, records, **o.words)
+        if found.fit.interrupted:
+            raise KeyboardInterrupt
+        name, text, last = IDENTIFICATION, json_text(identification_file(found)), found.model
+    files = [(name, text)]
+    if not last.structure.foreign:
+        files.append((MODEL, dumps(last)))
+    return _done(task, began, tuple(files), records)
 
 
 def _started(o: Options, effects: Sequence[Component]) -> Model | None:

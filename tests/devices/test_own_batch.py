@@ -35,6 +35,8 @@ def test_a_heavy_motor_stands_out_of_a_population(tmp_path: Path) -> None:
     alone = psa.identify(motor(), folder / "m1.csv", starts=1, known_start=True)
     for name, parameter in told["parameters"].items():
         assert parameter["value"] == pytest.approx(alone.model.values[name], rel=1e-6)
+    saved = psa.load_model(tmp_path / "results" / "m1" / "model.json")
+    assert saved.values == pytest.approx(alone.model.values, rel=1e-6)
     found = population(done.findings)
     assert {(o.device, o.parameter) for o in found.outliers} == {("m4", "J")}
     psa.write_population(found, tmp_path / "page.html")
