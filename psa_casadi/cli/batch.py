@@ -10,6 +10,7 @@ import typer
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Hysteresis, Reading
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, tell_written, working
 
 #: Devices without a result that are told one by one.
@@ -28,6 +29,7 @@ def batch(
     stiffness: float | None = None,
     hysteresis: Hysteresis = None,
     reading: Reading,
+    fitting: Fitting,
     given: Given,
 ) -> None:
     """Identify or diagnose many devices, each by itself, on all cores or a cluster.
@@ -44,22 +46,25 @@ def batch(
         workers: Devices at a time; by default one for each core.
         dask: Address of a Dask scheduler that hands the devices out, such as tcp://HOST:8786, or
             local for a cluster on this machine (extra dask).
-        model: MODEL.json whose values every fit starts from.
+        model: MODEL.json whose values every fit starts from, or a model of your own.
     """
     from psa_casadi.devices.executors import dask_client
     from psa_casadi.devices.jobs import jobs_given
     from psa_casadi.population.population import population
 
     given.stiffness(stiffness)
-    given.columns(reading.columns)
+    own = own_model(given, model, fitting)
+    if own is None:
+        given.columns(reading.columns)
+        given.model(model)
     given.outputs({"--report": report}, [model])
-    given.model(model)
     jobs = given.attempt(lambda: jobs_given(records))
     given.check()
+    text = model.read_text(encoding="utf-8-sig") if model and own is None else None
     options = psa.Options(
-        work=work, model=model.read_text(encoding="utf-8-sig") if model else None,
-        stiffness=stiffness, hysteresis=hysteresis, columns=reading.columns,
-        sample_time=reading.sample_time, modules=tuple(given.effects or ()),
+        work=work, model=own or text, stiffness=stiffness, hysteresis=hysteresis,
+        columns=reading.columns, sample_time=reading.sample_time,
+        modules=tuple(given.effects or ()), words=fitting.words,
     )  # fmt: skip
     found = None
     with ExitStack() as held, working("batch", given.quiet) as progress:

@@ -113,7 +113,7 @@ class Given:
             self.add(
                 f"{path}: this model has no voltage input or no displacement of a stack, so it is"
                 " no stack; give a stack's file. A model of your own is for `psa identify`,"
-                " `diagnose`, `simulate`, `export`, `check` and `compare`."
+                " `diagnose`, `batch`, `simulate`, `export`, `check` and `compare`."
             )
             return None
         return model

@@ -16,6 +16,7 @@ from psa_casadi.cli.options import Reading
 from psa_casadi.cli.screen import show, tell, tell_written, width, working
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
+from psa_casadi.strict_json import json_text
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
@@ -44,7 +45,7 @@ class Fitting:
         return {name: value for name, value in asdict(self).items() if value}
 
 
-def _own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | None:
+def own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | None:
     """Return the model that a path names where it is no stack's; None for a stack's or none.
 
     A model that cannot be made ends the command.
@@ -102,26 +103,31 @@ def identified_own(
     reading: Reading,
     given: Given,
     *,
-    report: Path | None,
+    files: Mapping[str, Path | None],
     others: Mapping[str, object],
 ) -> bool:
-    """Fit a model of one's own, show its parameters, and write the page.
+    """Fit a model of one's own, show its parameters: `files` are --json and --report.
 
     False where the path names none. `others` are options that must be empty.
     """
-    model = _own_model(given, path, fitting)
+    model = own_model(given, path, fitting)
     if model is None:
         return False
+    from psa_casadi.report.documents.files import identification_file
+
     _refuse(given, others)
-    given.outputs({"--report": report}, list(records))
+    given.outputs(files, list(records))
     measured = _read(given, model, records, reading)
     given.check()
     with working("identifying", given.quiet):
         found = psa.identify(model, measured, **fitting.words)
+    json, report = files.values()
+    if json is not None:
+        atomic_write(json, json_text(identification_file(found)))
     if report is not None:
         psa.write_fit_report(found, report)
     show(repr(found), given.quiet)
-    tell_written(report, quiet=given.quiet)
+    tell_written(json, report, quiet=given.quiet)
     return True
 
 
@@ -142,7 +148,7 @@ def diagnosed_own(
 
     False where the path names none. `others` are options that must be empty.
     """
-    model = _own_model(given, path, fitting)
+    model = own_model(given, path, fitting)
     if model is None:
         return False
     from psa_casadi.cli.diagnosis_files import expected, verdict_case

@@ -332,7 +332,8 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     model, record = _oven(tmp_path)
     asked = ("--model", f"{model}:make", "--hold", "zero", "--known-start")
     fit, page, told = (tmp_path / n for n in ("fit.html", "page.html", "told.json"))
-    said = done("identify", record, *asked, "--report", fit).out
+    values, both = tmp_path / "values.json", tmp_path / "both.html"
+    said = done("identify", record, *asked, "--report", fit, "--json", values).out
     assert "identified 'oven'" in said
     assert "'warmth' is missed by" in said
     assert "oven" in fit.read_text("utf-8")
@@ -342,6 +343,16 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     found = json.loads(told.read_text("utf-8"))
     assert [cause["effect"] for cause in found["causes"]] == ["bend_of_warmth"]
     assert found["values"]["T"] == pytest.approx(5.0, rel=0.01)
+    (row,) = json.loads(values.read_text("utf-8"))["records"]
+    assert (row["output"], row["unit"], row["samples"]) == ("warmth", "K", 1200)
+    done("compare", values, told, "-o", both)
+    assert "values" in both.read_text("utf-8")
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "one.csv").write_bytes(record.read_bytes())
+    said = done("batch", tmp_path / "records", "-o", tmp_path / "out", *asked, "--workers", "1").out
+    assert "1 devices: 1 done." in said
+    one = json.loads((tmp_path / "out" / "one" / "identification.json").read_text("utf-8"))
+    assert one["parameters"] == json.loads(values.read_text("utf-8"))["parameters"]
     assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
     ended = command("diagnose", record, *asked, *words, "--expect", "adequate")
     assert ended.code == 1
