@@ -24,7 +24,7 @@ from psa_casadi.posterior.chains import (
 from psa_casadi.posterior.task import Task, own_task_of, task_of
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import DISPLACEMENT
-from psa_casadi.shown import Shown, frame
+from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.side_by_side import one_thread, one_thread_of_algebra
 from psa_casadi.simulation.start import is_stack
 
@@ -60,7 +60,7 @@ class Figures:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Posterior(Shown):
+class Posterior(Reported):
     """Draws of parameters, starts and offsets, given records, with all that stands behind them.
 
     `model` has the values of the fit that the chains start at; `tree` is an

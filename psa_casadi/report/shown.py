@@ -20,7 +20,7 @@ from psa_casadi.records.signals import Signals
 from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
 from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
-from psa_casadi.report.page.results import write_fit_report, write_report
+from psa_casadi.report.page.results import write_fit_report, write_posterior, write_report
 from psa_casadi.report.plots.figures import Plotted, figure_of, one_output
 from psa_casadi.report.words.phrases import number, percent, plain
 from psa_casadi.report.words.tables import parameter_table
@@ -34,7 +34,13 @@ _WORDS: dict[type, Callable[..., str]] = {
 }
 Told = DiagnosisFile | OwnModelFile
 Reported = (
-    Diagnosis | OdeDiagnosis | Identification | OdeIdentification | Population | Sequence[Finding]
+    Diagnosis
+    | OdeDiagnosis
+    | Identification
+    | OdeIdentification
+    | Posterior
+    | Population
+    | Sequence[Finding]
 )
 
 
@@ -51,6 +57,8 @@ def report(result: Reported, path: str | os.PathLike[str], *, still: bool = Fals
         write_report(result, path, still=still)
     elif isinstance(result, Identification | OdeIdentification):
         write_fit_report(result, path, still=still)
+    elif isinstance(result, Posterior):
+        write_posterior(result, path)
     elif isinstance(result, Population):
         write_population(result, path)
     else:

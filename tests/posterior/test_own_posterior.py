@@ -11,6 +11,7 @@ import psa_casadi as psa
 from psa_casadi.posterior.task import Task, own_task_of
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
+from tests.report.html_page import Page
 
 TRUTH = {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}
 
@@ -72,6 +73,13 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
     assert tree.posterior_predictive.w_2.attrs["units"] == "rad/s"
     levels = tree.posterior_predictive.noise_w.to_numpy().mean(axis=(0, 1))
     np.testing.assert_allclose(levels, [0.3, 1.2], rtol=0.1)
+    found.report(tmp_path / "page.html")
+    page = Page((tmp_path / "page.html").read_text("utf-8"))
+    assert (
+        "The posterior of motor, given 2 records: 2 chains of 250 draws, 0 divergent." in page.text
+    )
+    assert "run_2 w" in page.text
+    assert page.loaded == []
     assert list(found.to_frame()["name"]) == list(TRUTH)
     assert "run_2" in found.plot()._suptitle.get_text()  # type: ignore[attr-defined]
 

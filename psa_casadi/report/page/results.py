@@ -16,12 +16,13 @@ from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.model.compose import Model
+from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
 from psa_casadi.report.plots import findings, records
-from psa_casadi.report.plots.figures import record_figure, size_sentence
-from psa_casadi.report.words import fit_words, own_words, phrases, tables, verdict_words
+from psa_casadi.report.plots.figures import posterior_figure, record_figure, size_sentence
+from psa_casadi.report.words import fit_words, own_words, phrases, tables, text, verdict_words
 from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.report.words.misfit_words import AXES, weight
 from psa_casadi.report.words.phrases import added, lowered, number, plain
@@ -282,6 +283,28 @@ def _own_fit_page(found: OdeIdentification) -> str:
         verdict=own_words.own_fit_sentence(found),
         errors=own_words.own_fit_table(found, series),
     )
+
+
+def write_posterior(found: Posterior, path: str | os.PathLike[str]) -> None:
+    """Write the page of a posterior, whole or not at all: picture, parameters, what is left.
+
+    Raises InputError when `path` cannot be written to.
+    """
+    experiments, name = found.task.experiments, plain(found.model.name)
+    count = len(experiments)
+    records = f"{count} record{'s' if count > 1 else ''}"
+    page = render(
+        "posterior.html",
+        f"Posterior of {name}",
+        [records],
+        found=found,
+        verdict=f"The posterior of {name}, given {records}: {text.drawn(found)}.",
+        figure=posterior_figure(found),
+        parameters=text.posterior_table(found),
+        left=text.left_table(found),
+        used=tables.record_table(experiments, "measured"),
+    )
+    atomic_write(path, page)
 
 
 def _shared(

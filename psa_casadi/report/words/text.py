@@ -194,7 +194,7 @@ def _errors(e: Errors, scale: Scale) -> str:
     )
 
 
-def _posterior_table(found: Posterior) -> Table:
+def posterior_table(found: Posterior) -> Table:
     """Return every parameter with mean, sd, 94 % interval, effective draws and r-hat."""
     rows = []
     for f in found.figures:
@@ -209,12 +209,27 @@ def _posterior_table(found: Posterior) -> Table:
     return Table(head, tuple(rows))
 
 
+def drawn(found: Posterior) -> str:
+    """Return how much was drawn."""
+    return f"{found.chains} chains of {found.draws} draws, {found.divergences} divergent"
+
+
+def left_table(found: Posterior) -> Table:
+    """Return the rms that the fit leaves of every output of every record, and how many samples."""
+    rows = []
+    for b in found.task.density.blocks:
+        e, channel = found.task.experiments[b.record], found.task.channel(b)
+        samples, worth = str(int(e.at(b.channel).sum())), number(b.alike)
+        rows.append((e.record.name, channel.column, number(b.level), channel.unit, samples, worth))
+    head = ("record", "output", "rms left", "unit", "samples", "that count as one")
+    return Table(head, tuple(rows))
+
+
 def posterior_text(found: Posterior, *, origin: str = "measured", width: int = 100) -> str:
     """Return a posterior: records, chains, the parameters, warnings."""
-    drawn = f"{found.chains} chains of {found.draws} draws, {found.divergences} divergent"
-    head = [("records", _records_text(found.task.experiments, origin)), ("drawn", drawn)]
+    head = [("records", _records_text(found.task.experiments, origin)), ("drawn", drawn(found))]
     tail = [("warning", w) for w in found.warnings] + [("note", n) for n in found.sentences]
-    return _around(head, _posterior_table(found), tail, width)
+    return _around(head, posterior_table(found), tail, width)
 
 
 def _around(head: Lines, table: Table, tail: Lines, width: int) -> str:
