@@ -234,9 +234,10 @@ def batch(
     """Identify or diagnose many devices; write each result to the folder `output` when it is there.
 
     `jobs` is a folder of records, a table of jobs (`jobs.csv`) or a list of `Job`. `options` say
-    what is done with every device. `executor` is any object with `submit`: an executor of
-    `concurrent.futures`, a client of Dask, mpi4py's; without one, `workers` processes (one for each
-    core) do the work, each on one thread. At most `at_once` devices are submitted at a time.
+    what is done with every device, and with which model, a stack's or one of one's own. `executor`
+    is any object with `submit`: an executor of `concurrent.futures`, a client of Dask, mpi4py's;
+    without one, `workers` processes (one for each core) do the work, each on one thread. At most
+    `at_once` devices are submitted at a time.
 
     A device that fails is a result, and the others go on. A run that was cut off goes on where it
     stopped: a result whose files and options are still the same is kept, unless it had failed for

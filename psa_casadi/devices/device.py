@@ -2,19 +2,26 @@
 
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 
+from psa_casadi.any_model.diagnose import diagnose as any_diagnose
+from psa_casadi.any_model.diagnose import identify as any_identify
+from psa_casadi.component import Component
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError, MachineError, PsaError
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.interruption import Work, interruptible_work
+from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.own_effects import known_effects, own_effects
-from psa_casadi.records import read_records
+from psa_casadi.records import Record, read_records, read_signals
+from psa_casadi.records.signals import Signals
 from psa_casadi.report.documents.files import Status, identification_file
 from psa_casadi.simulation.side_by_side import compiled, one_thread
+from psa_casadi.simulation.start import is_stack
 from psa_casadi.strict_json import json_text
 
 IDENTIFICATION, DIAGNOSIS, MODEL = "identification.json", "diagnosis.json", "model.json"
@@ -61,18 +68,13 @@ def stop(run: str) -> None:
 def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
     o = task.options
     effects = [c for module in o.modules for c in own_effects(module).values()]
-    start = None if o.model is None else loads(o.model, effects=effects)
+    start = _started(o, effects)
+    if start is not None and not is_stack(start):
+        return _worked_own(task, start, began)
     records = read_records(
         task.job.files, need_excitation=True, columns=o.columns, sample_time=o.sample_time
     )
-    seen: dict[str, str] = {}
-    for r in records:
-        if r.sha256 in seen:
-            raise InputError(
-                f"{r.source}: holds the same data as {seen[r.sha256]}; a record counts once: remove"
-                " one of the two."
-            )
-        seen[r.sha256] = r.source
+    _refuse_same(records)
     if o.work == "diagnose":
         d = diagnose(
             records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis,
@@ -84,11 +86,55 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
         if found.interrupted:
             raise KeyboardInterrupt
         name, text, model = IDENTIFICATION, json_text(identification_file(found)), found.model
+    return _done(task, began, ((name, text), (MODEL, dumps(model))), records)
+
+
+def _worked_own(task: DeviceTask, model: Model, began: float) -> DeviceOutcome:
+    """Work with a model of one's own, of which there is no file: its values are in the result's."""
+    o = task.options
+    records = read_signals(
+        task.job.files, inputs=model.input_names, outputs=model.output_names,
+        columns=o.columns, sample_time=o.sample_time,
+    )  # fmt: skip
+    _refuse_same(records)
+    if o.work == "diagnose":
+        return _done(
+            task, began, ((DIAGNOSIS, any_diagnose(model, records, **o.words).to_json()),), records
+        )
+    found = any_identify(model, records, **o.words)
+    if found.fit.interrupted:
+        raise KeyboardInterrupt
+    return _done(task, began, ((IDENTIFICATION, json_text(identification_file(found))),), records)
+
+
+def _started(o: Options, effects: Sequence[Component]) -> Model | None:
+    """Return the model to start from."""
+    return loads(o.model, effects=effects) if isinstance(o.model, str) else o.model
+
+
+def _refuse_same(records: Sequence[Record | Signals]) -> None:
+    """Refuse records that hold the same data. Raises InputError."""
+    seen: dict[str, str] = {}
+    for r in records:
+        if r.sha256 in seen:
+            raise InputError(
+                f"{r.source}: holds the same data as {seen[r.sha256]}; a record counts once: remove"
+                " one of the two."
+            )
+        seen[r.sha256] = r.source
+
+
+def _done(
+    task: DeviceTask,
+    began: float,
+    files: tuple[tuple[str, str], ...],
+    records: Sequence[Record | Signals],
+) -> DeviceOutcome:
     return DeviceOutcome(
         task.job.device,
         "done",
         time.monotonic() - began,
-        files=((name, text), (MODEL, dumps(model))),
+        files=files,
         records=tuple((r.name, r.sha256) for r in records),
     )
 
@@ -99,6 +145,9 @@ def make_ready(job: Job, options: Options) -> None:
     They lie in the cache of the user, where every process on this machine finds them.
     """
     with suppress(PsaError, MachineError):
+        if isinstance(options.model, Model) and not is_stack(options.model):
+            compiled([options.model])
+            return
         records = read_records(job.files, columns=options.columns, sample_time=options.sample_time)
         start = starting_model(records, options.stiffness)
         models = [start]

@@ -14,15 +14,18 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from datetime import date, datetime
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from psa_casadi.characters import plain
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.identification.start.ordinary import Hysteresis
+from psa_casadi.model.compose import Model
+from psa_casadi.model.own_effects import declaration_hash
 from psa_casadi.records.read.formats import READERS
 from psa_casadi.report.documents.files import Status, Work
 from psa_casadi.version import __version__
@@ -207,17 +210,19 @@ def _check_names(jobs: Sequence[Job], problems: Problems) -> None:
 class Options:
     """How every device is worked on; plain values, so that a process elsewhere can take them.
 
-    `model` is the text of the MODEL.json to start from, `stiffness` in N/m, `columns` and
-    `sample_time` [s] as for `read_record`, `modules` those that hold own effects.
+    `model` is the text of the MODEL.json to start from, or a model; `stiffness` in N/m, `columns`
+    and `sample_time` [s] as for `read_record`, `modules` those that hold own effects. `words` are
+    those that `identify` and `diagnose` take with a model of one's own, such as `known_start`.
     """
 
     work: Work = "identify"
-    model: str | None = None
+    model: str | Model | None = None
     stiffness: float | None = None
     hysteresis: Hysteresis | None = None
     columns: str | None = None
     sample_time: float | None = None
     modules: tuple[str, ...] = ()
+    words: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -248,5 +253,11 @@ def key_of(job: Job, options: Options) -> str:
         OSError: a file cannot be read.
     """
     files = [(Path(f).name, sha256(Path(f).read_bytes()).hexdigest()) for f in job.files]
-    told = {"version": __version__, "options": asdict(options), "files": files}
+    model = options.model
+    if isinstance(model, Model):  # by what it says, as a text does
+        model = repr(
+            ([declaration_hash(c) for c in model.components], sorted(model.values.items()))
+        )
+    content = asdict(replace(options, model=model))
+    told = {"version": __version__, "options": content, "files": files}
     return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()

@@ -191,8 +191,7 @@ class Correction:
 
     `predicted` [m] are whole records with the correction, `added` its own part of them; `weights`
     those of the kind's columns; `holdout_rms` [m] the error in held-out samples; `moved` is how far
-    the model's own theta follows; `copies` the share of what named causes add that it can add as
-    well.
+    the model's own theta follows.
     """
 
     kind: Kind
@@ -202,19 +201,12 @@ class Correction:
     predicted: tuple[FloatArray, ...]
     added: tuple[FloatArray, ...]
     moved: FloatArray
-    copies: float = 0.0
 
 
 def corrections(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    colour: Colour,
-    named: Sequence[FloatArray] | None = None,
+    fit: Fit, experiments: Sequence[Experiment], colour: Colour
 ) -> tuple[Correction, ...]:
-    """Return all corrections beside a fit, the one of the highest evidence first.
-
-    `named` are the predictions [m] of whole records with named causes, for `Correction.copies`.
-    """
+    """Return all corrections beside a fit, the one of the highest evidence first."""
     try:
         full = fit.predictions(experiments)
         signals = Signals(experiments, [p.displacement for p in full], _responses(fit, experiments))
@@ -222,7 +214,7 @@ def corrections(
         return ()
     follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
     fast = shows_ringing(experiments)
-    found = [_correction(kind, signals, follow, named) for kind in KINDS if fast or not kind.fast]
+    found = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
     return tuple(sorted(found, key=lambda c: -c.evidence))
 
 
@@ -266,9 +258,7 @@ class _Following:
         return theta
 
 
-def _correction(
-    kind: Kind, signals: Signals, follow: _Following, named: Sequence[FloatArray] | None
-) -> Correction:
+def _correction(kind: Kind, signals: Signals, follow: _Following) -> Correction:
     experiments = signals.experiments
     parts = [kind.columns(signals, k) for k in range(len(experiments))]
     shape = kind.shape(parts[0].shape[1])
@@ -279,15 +269,8 @@ def _correction(
     moved = follow.moved(used @ weights)
     changes = [j @ moved for j in follow.whole]
     predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, own, strict=True))
-    copied = 0.0
-    if named is not None:  # the share of what they add that the columns can add as well
-        pairs = zip(named, signals.predicted, experiments, strict=True)
-        target = follow.beside(np.concatenate([(n - p)[e.used] for n, p, e in pairs]))
-        power = float(target @ target)
-        if power > 0:
-            copied = float(np.sum((independent(free).T @ target) ** 2)) / power
     held = held_out_rms(experiments, predicted)
-    return Correction(kind, evidence, held, weights * shape, predicted, own, moved, copied)
+    return Correction(kind, evidence, held, weights * shape, predicted, own, moved)
 
 
 def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from psa_casadi.diagnosis.corrections import Correction, corrections
 from psa_casadi.diagnosis.held_out import Share, removed_from
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.diagnosis.screening import credible_set, temperature
+from psa_casadi.diagnosis.screening import credible_set
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.steps import Step
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
@@ -18,9 +18,8 @@ from psa_casadi.records.split import Experiment
 class Weighed:
     """Causes against the unnamed corrections beside the model without them.
 
-    `evidence` of the causes together over that model, `whole` over the plain base where that model
-    is another; `share` that they remove of its held-out excess; `shares` those that the
-    `corrections` would.
+    `evidence` of the causes together over that model; `share` that they remove of its held-out
+    excess; `shares` those that the `corrections` would.
     """
 
     evidence: float
@@ -28,7 +27,6 @@ class Weighed:
     share: float
     corrections: Sequence[Correction]
     shares: Sequence[float]
-    whole: float
     limits: Thresholds
 
     @property
@@ -39,24 +37,13 @@ class Weighed:
     def beaten_by(self) -> Correction | None:
         """Return the unnamed correction that takes the names away, if there is one.
 
-        It has clearly more evidence, a price paid for it too, and removes more of the held-out
-        excess than they do, by more than what their form may cost. One that can add what they add,
-        of all corrections best or but for their form, takes nothing while they do as much: it only
-        has more freedom.
+        It has more evidence, a price paid for it too, and they remove less than `enough` of what it
+        removes of the held-out excess: it has more freedom.
         """
         limits = self.limits
         own = self.evidence - limits.price * self.causes
-        best = max((c.copies for c in self.corrections), default=0.0)
-        alike = min(best, 1.0 - limits.form)
         for c, share in zip(self.corrections, self.shares, strict=True):
-            clearly = limits.clearly * temperature(
-                max(self.evidence, self.whole, c.evidence), limits
-            )
-            enough = share - limits.form
-            if c.copies >= alike:
-                enough = limits.enough * share
-            removes_more = share > 0.0 and self.share < enough
-            if removes_more and c.evidence - limits.price > own + clearly:
+            if self.share < limits.enough * max(share, 0.0) and c.evidence - limits.price > own:
                 return c
         return None
 
@@ -126,7 +113,7 @@ def withdrawn_names(
         why = note("beaten", by=beaten.kind.name, port=beaten.kind.port,
                    evidence=beaten.evidence, share=share)  # fmt: skip
     elif vague:
-        why = _each(vague, weighed.limits)
+        why = _each(vague)
     else:
         why, kept = note("little", least=weighed.limits.enough), weighed.adds
     return (
@@ -135,17 +122,14 @@ def withdrawn_names(
     )  # fmt: skip
 
 
-def vague_note(vague: Mapping[str, Correction], limits: Thresholds) -> tuple[Note, ...]:
+def vague_note(vague: Mapping[str, Correction]) -> tuple[Note, ...]:
     """Return which causes stay in the model without a name, as corrections describe them better."""
-    return (note("vague", names=tuple(vague), why=_each(vague, limits)),) if vague else ()
+    return (note("vague", names=tuple(vague), why=_each(vague)),) if vague else ()
 
 
-def _each(vague: Mapping[str, Correction], limits: Thresholds) -> Note:
-    free = 1.0 - limits.form
-    return note(
-        "better_unnamed",
-        each=tuple((c.kind.name, c.kind.port, n, c.copies >= free) for n, c in vague.items()),
-    )
+def _each(vague: Mapping[str, Correction]) -> Note:
+    each = tuple((c.kind.name, c.kind.port, n) for n, c in vague.items())
+    return note("better_unnamed", each=each)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,20 +145,14 @@ class Balance:
 
         Without any corrections where it is not `beside` them.
         """
-        found = (
-            corrections(before.fit, self.experiments, self.scale.colour, after.predicted)
-            if beside
-            else ()
-        )
+        found = corrections(before.fit, self.experiments, self.scale.colour) if beside else ()
         removed = removed_from(self.experiments, before.predicted, self.noise)
-        whole = self.scale.evidence(after)
         return Weighed(
-            evidence=whole - self.scale.evidence(before),
+            evidence=self.scale.evidence(after) - self.scale.evidence(before),
             causes=len(after.causes) - len(before.causes),
             share=removed.from_base(after.predicted),
             corrections=found,
             shares=[removed.from_base(c.predicted) for c in found],
-            whole=whole,
             limits=self.scale.limits,
         )
 

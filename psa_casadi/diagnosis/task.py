@@ -39,9 +39,9 @@ class Thresholds:
     * `static`: share of what a cause with a memory adds that may be a curve of the voltage alone.
       Memories of plants and of measured stacks: 5 to 86 %; gains and loads that a memory imitates:
       91 to 94 %.
-    * `form`: share by which a form may miss a contribution: a correction that imitates all but so
-      much of the causes is the same explanation; and where structure remains, a further cause that
-      removes less, and less than `enough` of what the largest does, is in the model and not named.
+    * `form`: share of the excess that a form may cost: where structure remains, a further cause
+      that removes less, and less than `enough` of what the largest does, is in the model and not
+      named; a free function takes names away only where it removes so much more than they do.
     * `held_out`: gain in log-likelihood that held-out samples must show, and all samples together.
     * `most_causes`: of one hypothesis.
     * `ringing`: a resonance near the band is tried where its ringing explains this share of what
@@ -54,9 +54,10 @@ class Thresholds:
       largest, before it becomes a probability. From the reliability table of the benchmark
       `diagnose`: the effects are not the true equations.
     * `credible`: probability that the set of effects that cannot be told apart holds the cause.
-    * `clearly`: tempered odds [nats] at which an unnamed correction takes names away: 20 to 1.
+    * `clearly`: tempered odds [nats] below which another correction is as likely as the best one,
+      and at which a free function takes names away: 20 to 1.
     * `enough`: share of the held-out excess that causes must remove to be named where structure
-      remains; and of what an unnamed correction of their own kind removes, which has more freedom.
+      remains; and of what an unnamed correction removes, which has more freedom.
       Of the names that were told although structure remained (study, sets of causes, exam) all 16
       that removed less than 66 % were wrong, right ones removed 82 % and more. Beside a correction
       all that removed 52 % and less were wrong, right ones 83 % and more (46 cases).

@@ -360,7 +360,7 @@ def conclude(
             *(
                 withdrawn_names(steps, weighed, beaten, vague, doubt)
                 if verdict == "unexplained"
-                else vague_note(vague, limits)
+                else vague_note(vague)
             ),
             *(note("small", effect=c.what, share=max(c.share, 0.0)) for c in small),
             *coverage_notes(experiments),

@@ -13,11 +13,11 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.fitting.prediction import measured, predict
+from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.interruption import current_work
-from psa_casadi.model.compose import Model
-from psa_casadi.posterior.task import Task
+from psa_casadi.posterior.task import Block, Task
+from psa_casadi.records.split import DISPLACEMENT, Channel
 from psa_casadi.units import FloatArray
 from psa_casadi.version import __version__
 
@@ -37,14 +37,14 @@ def sampler_and_arviz() -> tuple[Any, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """Draws that were predicted: `theta` (draws, size), and per record displacement and noise.
+    """Draws that were predicted: `theta` (draws, size), and of every block readings and noise.
 
-    `displacement` (draws, samples) [m] holds noise of the level `noise` (draws,) [m]. `failed` of
-    the draws could not be simulated and are left out.
+    `readings` (draws, samples of the record) hold noise of the level `noise` (draws,), both in the
+    channel's unit. `failed` of the draws could not be simulated and are left out.
     """
 
     theta: FloatArray
-    displacement: tuple[FloatArray, ...]
+    readings: tuple[FloatArray, ...]
     noise: tuple[FloatArray, ...]
     failed: int
 
@@ -66,47 +66,51 @@ def prior_draws(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
 def predictive(
     task: Task, draws: FloatArray, rng: np.random.Generator, *, fit_offset: bool
 ) -> Predictive:
-    """Predict all records at draws of theta (n, size), with white noise at the records' level.
+    """Predict all records at draws of theta (n, size), with white noise at the blocks' levels.
 
     The level is drawn from its conditional posterior, sigma^2 = S / (c chi^2) with the sum of
-    squares S at the draw, c samples counting as one, and n / c degrees of freedom. With
-    `fit_offset`, for draws of the prior, whose offsets are flat, the sensor's offset is the one
-    that fits best, and the level is that of the fit.
+    squares S at the draw, c samples counting as one, and the block's degrees of freedom; so is an
+    offset that was projected out. With `fit_offset`, for draws of the prior, whose offsets are
+    flat, a sensor's offset is the one that fits best, and the level is that of the fit.
     """
-    kept, shown, noise = [], [], []
+    kept, shown, noise, blocks = [], [], [], task.density.blocks
     for theta in draws:
         try:
             parts = predict(
                 task.model, task.experiments, task.unknowns, theta,
                 way=task.way, everything=True, differentiated=False,
+                further=any(b.channel for b in blocks),
             )  # fmt: skip
         except PsaError:
             continue
-        clean = [p.displacement for p in parts]
-        left = [
-            (measured(e.record) - y)[e.used] for e, y in zip(task.experiments, clean, strict=True)
-        ]
-        if fit_offset:
-            clean = [y + np.mean(r) for y, r in zip(clean, left, strict=True)]
-            levels = list(task.levels)
-        else:
-            levels = [
-                float(np.sqrt(float(r @ r) / c / rng.chisquare(len(r) / c)))
-                for r, c in zip(left, task.inflation, strict=True)
-            ]
+        clean, levels = [], []
+        for b in blocks:
+            e, part, channel = task.experiments[b.record], parts[b.record], task.channel(b)
+            y = part.further[channel.outputs[0]][0] if b.channel else part.displacement
+            left, free = (e.measured(b.channel) - y)[e.at(b.channel)], channel.offset
+            if free and (fit_offset or b.channel):
+                y, left = y + np.mean(left), left - np.mean(left)
+            level = b.level
+            if not fit_offset:
+                level = float(np.sqrt(left @ left / b.alike / rng.chisquare(b.count)))
+                if free and b.channel:
+                    y = y + level * rng.standard_normal() / np.sqrt(len(left) / b.alike)
+            clean.append(y)
+            levels.append(level)
         kept.append(theta)
         noise.append(levels)
         shown.append(
             [y + s * rng.standard_normal(len(y)) for y, s in zip(clean, levels, strict=True)]
         )
-    count = len(task.experiments)
     return Predictive(
         theta=np.array(kept).reshape(len(kept), draws.shape[1]),
-        displacement=tuple(
-            np.array([own[k] for own in shown]).reshape(len(kept), e.record.n)
-            for k, e in enumerate(task.experiments)
+        readings=tuple(
+            np.array([own[k] for own in shown]).reshape(
+                len(kept), task.experiments[b.record].record.n
+            )
+            for k, b in enumerate(blocks)
         ),
-        noise=tuple(np.array([own[k] for own in noise]) for k in range(count)),
+        noise=tuple(np.array([own[k] for own in noise]) for k, _ in enumerate(blocks)),
         failed=len(draws) - len(kept),
     )
 
@@ -214,11 +218,15 @@ def chains_of(
 _RECORD = "record"
 
 
-def columns_of_records(task: Task) -> tuple[str, ...]:
-    """Return the name of each record's displacement in the tree."""
-    if len(task.experiments) == 1:
-        return ("displacement",)
-    return tuple(f"displacement_{k + 1}" for k in range(len(task.experiments)))
+def column_of(task: Task, block: Block) -> str:
+    """Return the name of a block's readings in the tree."""
+    name = task.channel(block).column
+    return name if len(task.experiments) == 1 else f"{name}_{block.record + 1}"
+
+
+def _of(what: str, channel: Channel) -> str:
+    """Return the name of what every record has of a channel; plain for a displacement's."""
+    return what if channel == DISPLACEMENT else f"{what}_{channel.column}"
 
 
 def data_tree(
@@ -226,42 +234,61 @@ def data_tree(
 ) -> Any:
     """Return an `arviz.InferenceData` of all groups; `theta` is (chains, draws, size)."""
     _, arviz = sampler_and_arviz()
-    told = _units(task.model, task.unknowns)
-    dims = {n: [_RECORD] for n in told if n.startswith("start_") or n in ("offset", "noise")}
-    seen, applied, times = {}, {}, {}
-    for column, e in zip(columns_of_records(task), task.experiments, strict=True):
-        time = f"time_{column}"
-        seen[column], times[time] = measured(e.record), e.record.time
-        applied[f"voltage_{column}"] = e.record.voltage
-        dims |= {column: [time], f"voltage_{column}": [time]}
-    predictions = [
-        {
-            **{c: y[None] for c, y in zip(seen, p.displacement, strict=True)},
-            "noise": np.stack(p.noise, axis=-1)[None],
-        }
-        for p in (posterior, prior)
-    ]
+    draws, before = quantities(task, theta), quantities(task, prior.theta[None])
+    seen, applied, times = _recorded(task)
+    told, blocks = _units(task), task.density.blocks
+    dims = {n: [_RECORD] for n in told if n not in task.unknowns.names}
+    for name, (time, _, unit, meaning) in (seen | applied).items():
+        dims[name], told[name], told[time] = [time], (unit, meaning), ("s", "Time")
+    predictions = []
+    for p in (posterior, prior):
+        shown = {column_of(task, b): y[None] for b, y in zip(blocks, p.readings, strict=True)}
+        for b, level in zip(blocks, p.noise, strict=True):
+            name, count = _of("noise", task.channel(b)), len(task.experiments)
+            shown.setdefault(name, np.full((1, len(level), count), np.nan))[0, :, b.record] = level
+        predictions.append(shown)
     tree = arviz.from_dict(
-        posterior=quantities(task, theta),
+        posterior=draws,
         sample_stats=chains.statistics,
-        prior=quantities(task, prior.theta[None]),
+        prior=before,
         posterior_predictive=predictions[0],
         prior_predictive=predictions[1],
-        observed_data=seen,
-        constant_data=applied,
+        observed_data={n: values for n, (_, values, *_) in seen.items()},
+        constant_data={n: values for n, (_, values, *_) in applied.items()},
         coords={_RECORD: [e.record.name for e in task.experiments], **times},
         dims=dims,
     )
-    kinds = {"displacement": ("m", "Displacement"), "voltage": ("V", "Voltage")}
-    kinds["time"] = ("s", "Time")
     for group in tree.groups():
         for name in tree[group].variables:
-            unit, meaning = kinds.get(name.partition("_")[0], told.get(name, ("", "")))
+            unit, meaning = told.get(name, ("", ""))
             if unit:
                 tree[group][name].attrs |= {"units": unit, "long_name": meaning}
     tree.posterior.attrs["inference_library"] = "nutpie"
     tree.posterior.attrs["created_by"] = f"psa_casadi {__version__}"
     return tree
+
+
+#: The name of a column's times, its values (n,), unit and meaning.
+_Columns = dict[str, tuple[str, FloatArray, str, str]]
+
+
+def _recorded(task: Task) -> tuple[_Columns, _Columns, dict[str, FloatArray]]:
+    """Return what was measured and what was applied, by names in the tree, and the times."""
+    seen: _Columns = {}
+    applied: _Columns = {}
+    times = {}
+    for k, e in enumerate(task.experiments):
+        first = next((column_of(task, b) for b in task.of_record(k)), "")
+        for b in task.of_record(k):
+            times[f"time_{first}"], c = e.record.time, task.channel(b)
+            told = e.measured(b.channel), c.unit, c.column
+            seen[column_of(task, b)] = (f"time_{first}", *told)
+        for given in task.model.structure.inputs:
+            values = e.record.column(given.name)
+            if first and values is not None:
+                told = values, given.unit, given.description
+                applied[f"{given.name}_{first}"] = (f"time_{first}", *told)
+    return seen, applied, times
 
 
 def quantities(task: Task, theta: FloatArray) -> dict[str, FloatArray]:
@@ -274,8 +301,10 @@ def quantities(task: Task, theta: FloatArray) -> dict[str, FloatArray]:
     for name in _states(u):
         own = [[s.get(name, np.nan) for s in each] for each in starts]
         found[f"start_{name}"] = np.array(own).reshape(*shape, u.records)
-    offsets = [[u.offset(t, k) for k in range(u.records)] for t in flat]
-    found["offset"] = np.array(offsets).reshape(*shape, u.records)
+    first = task.experiments[0].channels[0]
+    if first.offset:
+        offsets = [[u.offset(t, k) for k in range(u.records)] for t in flat]
+        found[_of("offset", first)] = np.array(offsets).reshape(*shape, u.records)
     return found
 
 
@@ -283,13 +312,19 @@ def _states(u: Unknowns) -> tuple[str, ...]:
     return tuple(dict.fromkeys(n for started in u.started for n in started))
 
 
-def _units(model: Model, u: Unknowns) -> dict[str, tuple[str, str]]:
+def _units(task: Task) -> dict[str, tuple[str, str]]:
     """Return unit and meaning of every variable."""
+    u, model = task.unknowns, task.model
     told = {n: (model.parameter(n).unit, model.parameter(n).description) for n in u.names}
     states = {s.name: s for s in model.structure.states}
     for name in _states(u):
         meaning = f"Start of a record: {states[name].description}, as a deviation from rest"
         told[f"start_{name}"] = (states[name].unit, meaning)
-    told["offset"] = ("m", "Offset of the displacement sensor in a record")
-    told["noise"] = ("m", "Standard deviation of the noise of a record")
+    for k, channel in enumerate(task.experiments[0].channels):
+        sensor = channel.column if channel.column != "displacement" else "displacement sensor"
+        if k == 0 and channel.offset:
+            told[_of("offset", channel)] = (channel.unit, f"Offset of the {sensor} in a record")
+        if not channel.factors:
+            meaning = "Standard deviation of the noise of a record"
+            told[_of("noise", channel)] = (channel.unit, meaning)
     return told

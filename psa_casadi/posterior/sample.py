@@ -1,7 +1,7 @@
-"""`psa.sample`: the whole posterior of a stack's parameters, given its records."""
+"""`psa.sample`: the whole posterior of a model's parameters, given its records."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,16 +15,18 @@ from psa_casadi.notes import Note, note, texts
 from psa_casadi.posterior.chains import (
     Chains,
     chains_of,
+    column_of,
     data_tree,
     predictive,
     prior_draws,
     sampler_and_arviz,
 )
-from psa_casadi.posterior.task import Task, task_of
-from psa_casadi.records.read.reading import Records, records_given
+from psa_casadi.posterior.task import Task, own_task_of, task_of
+from psa_casadi.records.read.reading import records_given
+from psa_casadi.records.split import DISPLACEMENT
 from psa_casadi.shown import Shown, frame
 from psa_casadi.simulation.side_by_side import one_thread, one_thread_of_algebra
-from psa_casadi.simulation.simulate import output_of
+from psa_casadi.simulation.start import is_stack
 
 #: Share of the highest density interval, and its ends.
 HDI = 0.94
@@ -154,9 +156,11 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
         doubts.append(note("few_draws", names=few, limit=LEAST_ESS))
     if not task.converged:
         doubts.append(note("start_cut_off"))
-    for e, worth in zip(task.experiments, task.inflation, strict=True):
-        if worth > _COLOURED:
-            doubts.append(note("coloured", record=e.record.name, worth=worth))
+    for b in task.density.blocks:
+        if b.alike > _COLOURED:
+            named = column_of(task, b) if task.channel(b) != DISPLACEMENT else None
+            record = task.experiments[b.record].record.name
+            doubts.append(note("coloured", record=record, worth=b.alike, output=named))
     held = [f.name for f in figures if f.prior_share > _PRIOR_SHARE]
     if held:
         doubts.append(note("of_the_prior", names=held))
@@ -173,7 +177,7 @@ _PREDICTED = 100
 @one_thread_of_algebra()
 def sample(
     model: Model,
-    records: Records,
+    records: Any,
     *,
     free: Sequence[str] | None = None,
     prior: Mapping[str, float] | None = None,
@@ -184,23 +188,29 @@ def sample(
     seed: int = 0,
     cores: int | None = None,
     progress: Progress = lambda _: None,
+    **words: Any,
 ) -> Posterior:
-    """Draw parameters, initial states and offsets of a stack's model from their posterior.
+    """Draw parameters, initial states and offsets of a model from their posterior.
 
     p(theta | y) is proportional to prod_r |y_r - x_r(theta)|^-(n_r / c_r) times the weak priors of
     an identification, theta_k / w_k normal about 0 within the parameters' bounds: the noise level
-    of every record has the prior 1 / sigma and is integrated out, and c_r samples count as one
-    where residuals are correlated (their long-run variance over their variance, at the fit). The
-    chains start around the fit that is found from the model's values, in coordinates that its
-    covariance whitens; the gradient is exact, from the sensitivities.
+    of every output in every record r has the prior 1 / sigma and is integrated out (but those of a
+    stack's columns beside the displacement, which are known), and c_r samples count as one where
+    residuals are correlated (their long-run variance over their variance, at the fit). The chains
+    start around the fit that is found from the model's values, of a model of one's own from several
+    starts, in coordinates that its covariance whitens; the gradient is exact, from the
+    sensitivities.
 
     Args:
-        model: A stack's model, as `psa.identify` returns it or `psa.stack_model`.
+        model: A stack's model, as `psa.identify` returns it or `psa.stack_model`, or one of one's
+            own.
         records: Those of one device, as `psa.identify` takes them.
         free: Names of the parameters that are sampled; by default those that the model was fitted
-            in, else those that voltage and displacement can tell.
-        prior: Values that the priors are centred at, in SI units; by default those of a stack of
-            the records' size, as a search begins with, and declared ones of effects.
+            in, else those that voltage and displacement can tell; of a model of one's own those
+            that are `fitted`.
+        prior: Values that the priors are centred at, in the parameters' units; by default those of
+            a stack of the records' size, as a search begins with, and declared ones of effects and
+            of models of one's own.
         widths: Standard deviations of the priors: of ln(value) for parameters that span decades, in
             ordinary changes for others; by default 3 and 10, and 1 for lags.
         chains: Number of chains.
@@ -209,15 +219,20 @@ def sample(
         seed: Seed of all that is random.
         cores: Chains at a time; by default one for each core.
         progress: Is told what is being done.
+        words: Of a model of one's own those of `psa.identify`: `starts`, `zeros`, `known_start`,
+            `hold`.
 
     Raises:
-        InputError: The extra `sample` is not installed, the model is no stack's, a name is unknown.
+        InputError: The extra `sample` is not installed, a name is unknown.
         SimulationError: The model cannot be simulated at its values.
     """
     sampler_and_arviz()
-    _refuse(model, chains, draws, tune)
+    _refuse(model, chains, draws, tune, words)
     progress("fitting")
-    task = task_of(model, records_given(records), free=free, prior=prior, widths=widths)
+    if is_stack(model):
+        task = task_of(model, records_given(records), free=free, prior=prior, widths=widths)
+    else:
+        task = own_task_of(model, records, free=free, prior=prior, widths=widths, **words)
     rng = np.random.default_rng(seed)
     with one_thread():
         found = chains_of(
@@ -247,14 +262,19 @@ def sample(
     )
 
 
-def _refuse(model: Model, chains: int, draws: int, tune: int) -> None:
-    """Refuse a model that is no stack's, and too few draws. Raises InputError."""
+#: The words for the records of a model of one's own, and its search.
+_OWN = ("starts", "zeros", "known_start", "hold")
+
+
+def _refuse(model: Model, chains: int, draws: int, tune: int, words: Iterable[str]) -> None:
+    """Refuse too few draws, and words that the model does not take. Raises InputError."""
     problems = Problems()
-    if "voltage" not in model.input_names or output_of(model) is None:
-        problems.add(
-            f"The model '{model.name}' has no voltage or no displacement, so it is no stack; a"
-            " posterior is drawn of a stack's parameters. `psa.identify` fits any model."
-        )
+    for word in words:
+        if word not in _OWN or is_stack(model):
+            problems.add(
+                f"'{word}' is not among the words for the model '{model.name}'; of a model of your"
+                f" own there are also {', '.join(_OWN)}."
+            )
     if chains < 1 or draws < 4 or tune < 1:
         problems.add(
             f"{chains} chains of {draws} draws after {tune} give no posterior; take one chain, four"

@@ -2,13 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.any_model.identify import free_of, identify_ode
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.identification.fitting.fit import (
+    Fit,
     Objective,
     accurate_minimum,
     unknowns_around,
@@ -19,14 +21,14 @@ from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Mini
 from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
-from psa_casadi.identification.refitting import noise_levels
+from psa_casadi.identification.refitting import noise_levels, weighted
 from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note
 from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, whole, without_gaps
+from psa_casadi.records.split import Channel, Experiment, whole, without_gaps
 from psa_casadi.simulation.simulate import Way
 from psa_casadi.units import FloatArray
 
@@ -76,13 +78,19 @@ class Within:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """The weighted residuals `rows` of one record, whose noise level is unknown.
+    """The weighted residuals `rows` of one channel in one record, whose noise level is unknown.
 
-    `count` is how many independent samples they are worth: fewer than rows where they are coloured.
+    `count` is how many independent samples they are worth, less one where an offset was projected
+    out of them: `alike` samples count as one where they are coloured. `level` is their rms, in the
+    channel's unit.
     """
 
     rows: slice
     count: float
+    record: int = 0
+    channel: int = 0
+    alike: float = 1.0
+    level: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +98,11 @@ class Density:
     """ln p(u | records), up to a constant, with its gradient, in whitened coordinates u.
 
     ln p = -sum_b (m_b / 2) ln |r_b|^2 - |r_p|^2 / 2 + ln |d theta / d z|, with the weighted
-    residuals r_b of every block and m_b the samples that they are worth: each record's noise level
+    residuals r_b of every block and m_b the samples that they are worth: each block's noise level
     has Jeffreys' prior 1 / sigma and is integrated out. r_p are the rows outside the blocks: weak
-    priors and further columns, whose levels are known. theta lies within its bounds (`Within`), and
-    z = z_0 + L u, with the factor L of the covariance at the fit, so that u has nearly the
-    covariance 1. The gradient is that of J^T r, with the sensitivities' exact Jacobian.
+    priors and a stack's further columns, whose levels are known. theta lies within its bounds
+    (`Within`), and z = z_0 + L u, with the factor L of the covariance at the fit, so that u has
+    nearly the covariance 1. The gradient is that of J^T r, with the sensitivities' exact Jacobian.
     """
 
     evaluate: Evaluate
@@ -146,9 +154,8 @@ _TAIL = 0.1
 class Task:
     """A posterior to sample: `density` in u, and the fit that it is centred on.
 
-    `theta` (size,) are the coordinates of the fit, `covariance` theirs, white residuals assumed;
-    `inflation` is by how much colour makes every record's samples count less, `levels` the residual
-    rms of every record [m]. `sentences` tell what was done to the records.
+    `theta` (size,) are the coordinates of the fit, `covariance` theirs, white residuals assumed.
+    `sentences` tell what was done to the records.
     """
 
     model: Model
@@ -157,11 +164,17 @@ class Task:
     density: Density
     theta: FloatArray
     covariance: FloatArray
-    levels: tuple[float, ...]
-    inflation: tuple[float, ...]
     way: Way
     converged: bool
     sentences: tuple[Note | str, ...]
+
+    def of_record(self, record: int) -> tuple[Block, ...]:
+        """Return the blocks of one record, that of the first channel foremost."""
+        return tuple(b for b in self.density.blocks if b.record == record)
+
+    def channel(self, block: Block) -> Channel:
+        """Return the channel of a block."""
+        return self.experiments[block.record].channels[block.channel]
 
 
 def task_of(
@@ -187,17 +200,64 @@ def task_of(
     names = tuple(free or model.provenance.free or free_parameters(columns.model, fitted))
     _refuse(columns.model, names, {**(prior or {}), **(widths or {})})
     centre = columns.model.with_values(_centres(columns.model, fitted, names, prior or {}))
-    values = {n: columns.model.values[n] for n in names}
-    sigma = noise_levels(experiments)
+    return _around(
+        centre, experiments, {n: columns.model.values[n] for n in names}, widths or {},
+        noise_levels(experiments), None,
+        (*said, *(s for _, own in ready for s in own), *columns.left_out),
+    )  # fmt: skip
+
+
+def own_task_of(
+    model: Model,
+    records: Any,
+    *,
+    free: Sequence[str] | None = None,
+    prior: Mapping[str, float] | None = None,
+    widths: Mapping[str, float] | None = None,
+    **words: Any,
+) -> Task:
+    """Identify a model of one's own and set up the density around that fit.
+
+    The priors are centred at the declared values. `words` are those of `identify_ode`, the rest as
+    in `task_of`.
+    """
+    names = free_of(model, free or model.provenance.free or None)
+    _refuse(model, names, {**(prior or {}), **(widths or {})})
+    found = identify_ode(model, records, free=names, **words)
+    if found.fit.interrupted:
+        raise KeyboardInterrupt
+    told = found.fit.model
+    declared = {n: told.parameter(n).value for n in names}
+    return _around(
+        told.with_values({**declared, **(prior or {})}), weighted(found.fit, found.experiments),
+        {n: told.values[n] for n in names}, widths or {}, found.fit.sigma, found.fit, found.remarks,
+    )  # fmt: skip
+
+
+def _around(
+    centre: Model,
+    experiments: Sequence[Experiment],
+    values: Mapping[str, float],
+    widths: Mapping[str, float],
+    sigma: Sequence[float],
+    begun: Fit | None,
+    sentences: tuple[Note | str, ...],
+) -> Task:
+    """Fit from the values, with priors about those of `centre`, and set up the density there.
+
+    Every record begins as in the fit `begun`, if there is one.
+    """
+    names = tuple(values)
     unknowns = unknowns_around(centre, names, experiments, sigma, placed=centre)
-    for name, width in (widths or {}).items():
+    for name, width in widths.items():
         if not width > 0.0:
             raise InputError(f"The prior of '{name}' has the width {width:g}; give one above 0.")
         unknowns.prior[names.index(name)] = width
     theta = np.zeros(unknowns.size)
     theta[: len(names)] = unknowns.coordinates(values)
     for r in range(unknowns.records):
-        unknowns.place(theta, r, {}, 0.0)
+        start, offset = (begun.start(r), begun.offset(r)) if begun else ({}, 0.0)
+        unknowns.place(theta, r, start, offset)
     for _ in range(_ROUNDS):  # levels of records and of columns that the residuals suggest
         found, way, _ = accurate_minimum(
             centre, experiments, unknowns, theta, sigma,
@@ -206,16 +266,16 @@ def task_of(
         if found.interrupted:
             raise KeyboardInterrupt
         theta, weights = found.theta, weights_of(experiments, sigma)
-        ends = np.cumsum([e.used.sum() for e in experiments])
+        ends = np.cumsum([e.at(0).sum() for e in experiments])
         own = np.split(found.residual[: len(weights)] * weights, ends[:-1])
-        sigma = [max(float(np.sqrt(np.mean(r**2))), 1e-15) for r in own]
+        sigma = [
+            max(float(np.sqrt(np.mean(r**2))), 1e-15) if r.size else s
+            for r, s in zip(own, sigma, strict=True)
+        ]
         shown = predict(centre, experiments, unknowns, theta, way=way, further=True)
         levels = [f.relevelled() for f in further_of(experiments, shown)]
         experiments = tuple(e.beside(levels) for e in experiments)
-    return _task(
-        centre, experiments, unknowns, found, way, sigma,
-        (*said, *(s for _, own in ready for s in own), *columns.left_out),
-    )  # fmt: skip
+    return _task(centre, tuple(experiments), unknowns, found, way, sigma, sentences)
 
 
 def _refuse(model: Model, names: Sequence[str], given: Mapping[str, float]) -> None:
@@ -262,24 +322,30 @@ def _task(
     sigma: Sequence[float],
     sentences: tuple[Note | str, ...],
 ) -> Task:
-    counts = [int(e.used.sum()) for e in experiments]
     evaluate = Objective(model, experiments, unknowns, sigma, way)
     low, high = unknowns.bounds()
     again = evaluate(found.theta)
     if again is None:
         raise InputError("The model cannot be simulated at its fit; start from another model.")
     residual, jacobian = again
-    blocks, inflation, precision = [], [], np.zeros((unknowns.size, unknowns.size))
-    edges = np.cumsum([0, *counts])
-    for first, last in pairwise(edges.tolist()):
-        rows = slice(first, last)
-        lags = autocovariance(residual[rows])  # how many neighbouring samples count as one
-        ratio = float(2.0 * np.sum(lags) / lags[0] - 1.0) if lags[0] > 0.0 else 1.0
-        coloured = max(1.0, ratio)
-        inflation.append(coloured)
-        blocks.append(Block(rows, (last - first) / coloured))
-        precision += jacobian[rows].T @ jacobian[rows] / coloured
-    rest = jacobian[edges[-1] :]
+    blocks, precision, last = [], np.zeros((unknowns.size, unknowns.size)), 0
+    for j, channel in enumerate(experiments[0].channels):
+        for r, e in enumerate(experiments):
+            first, last = last, last + int(e.at(j).sum())
+            rows, own = slice(first, last), residual[first:last]
+            if not own.size:
+                continue
+            alike, projected = 1.0, float(j > 0 and channel.offset)
+            if not channel.factors:
+                lags = autocovariance(own)  # how many neighbouring samples count as one
+                ratio = float(2.0 * np.sum(lags) / lags[0] - 1.0) if lags[0] > 0.0 else 1.0
+                alike = max(1.0, ratio)
+                level = (channel.level if j else sigma[r]) * e.share(j)
+                level *= float(np.sqrt(np.mean(own**2)))
+                count = (len(own) - projected) / alike
+                blocks.append(Block(rows, count, r, j, alike, level))
+            precision += jacobian[rows].T @ jacobian[rows] / alike
+    rest = jacobian[last:]
     precision += rest.T @ rest
     within = Within(low, high)
     covariance: FloatArray = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=np.float64)
@@ -291,8 +357,6 @@ def _task(
         density=Density(evaluate, tuple(blocks), within, centre, factor),
         theta=found.theta,
         covariance=covariance,
-        levels=tuple(sigma),
-        inflation=tuple(inflation),
         way=way,
         converged=found.converged,
         sentences=sentences,

@@ -63,10 +63,10 @@ def bouc_wen(seed: int, noise: float = 8e-6) -> Signals:
     return Signals(name="multisine", time=t, columns={"force": u, "position": measured})
 
 
-def motor(seed: int, friction: float = 0.012, noise: float = 1.0) -> Signals:
+def motor(seed: int, friction: float = 0.012, noise: float = 1.0, inertia: float = 3e-5) -> Signals:
     """A DC motor with dry friction [N.m] at its shaft: voltage, speed [rad/s] and current [A].
 
-    `noise` is over that of ordinary sensors.
+    `noise` is over that of ordinary sensors, `inertia` in kg.m2.
     """
     rng, t = np.random.default_rng(seed), np.arange(3000, dtype=np.float64) * 1e-3
     tones = ((6.0, 1.1, 0.0), (4.0, 3.7, 1.0), (2.0, 0.4, 0.0))
@@ -75,7 +75,7 @@ def motor(seed: int, friction: float = 0.012, noise: float = 1.0) -> Signals:
     def rates(s: float, q: Any) -> list[float]:
         i, w = q
         torque = 0.05 * i - 2e-5 * w - friction * np.tanh(w / 0.2)
-        return [(np.interp(s, t, u) - 1.2 * i - 0.05 * w) / 2e-3, torque / 3e-5]
+        return [(np.interp(s, t, u) - 1.2 * i - 0.05 * w) / 2e-3, torque / inertia]
 
     i, w = _solved(rates, t, [0.0, 0.0], 1e-3)
     columns = {

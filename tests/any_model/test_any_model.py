@@ -50,7 +50,7 @@ def test_a_clean_model_of_two_outputs_is_identified_with_its_errors(tmp_path: Pa
     assert found.model.provenance.identified_from[0][0] == "drive"
     found.report(tmp_path / "fit.html")
     page = Page((tmp_path / "fit.html").read_text("utf-8"))
-    assert "w by 0.300 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
+    assert "w by 0.301 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
     assert "R 1.200 1.199 to 1.200 Ohm fit" in page.text
     assert page.loaded == []
 
@@ -93,7 +93,7 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
         "The cause is hysteresis of x in v (the rate of v, confidence 99 %: virtually certain):"
         f" it removes {d.budget.together.percents[0]} % of the base" in page.text
     )
-    assert "position: error on held-out samples, rms base model 159 µm" in page.text
+    assert "position: error on held-out samples, rms base model 160 µm" in page.text
     assert f"extended model {rms:.2f} µm" in page.text
     rival = replace(d.causes[0], confidence=0.6, cannot_be_told_from=("stop_of_x",))
     said = "(the rate of v, confidence 60 %: more likely than not; or stop of x)"
@@ -109,7 +109,7 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert path.stat().st_size < 3_000_000
     told = psa.story(d, width=300).splitlines()
     assert told[0].startswith("verdict    cause named. The cause is hysteresis of x in v")
-    assert f"error      position: held-out rms 159 µm of the base, {rms:.2f} µm of the e" in told[3]
+    assert f"error      position: held-out rms 160 µm of the base, {rms:.2f} µm of the e" in told[3]
     linear = psa.run(
         d.model.with_values({"hysteresis_of_x_in_v_size": 0.0}), run.record.time,
         record_inputs(d.model, run.record, run.record.n),

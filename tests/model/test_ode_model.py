@@ -127,7 +127,6 @@ def test_a_kink_that_is_named_is_met_with_care_and_is_an_event_of_the_fmu() -> N
 
 
 X, K = ca.SX.sym("x"), ca.SX.sym("k")
-BALANCE = ca.SX.sym("displacement")
 
 
 def _solved() -> dict[str, Any]:
@@ -162,9 +161,6 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     "out of bounds": (
         lambda: {"x": X, "p": K, "ode": X},
         {"parameters": [psa.Parameter("k", 2.0, "1", (0.0, 1.0), "k")]}, "outside its bounds"),
-    "reserved": (lambda: {"x": BALANCE, "ode": BALANCE}, {}, "choose another name"),
-    "velocity": (
-        lambda: {"x": X, "ode": X, "y": X}, {"outputs": ["velocity"]}, "named 'velocity'"),
     "name clash": (
         lambda: {"x": X, "ode": X, "y": X}, {"outputs": ["x"]}, "Two variables are named 'x'"),
     "not an identifier": (lambda: {"x": X, "ode": X}, {"states": ["x 1"]}, "cannot name a var"),
@@ -328,3 +324,25 @@ def test_a_module_that_does_not_do_is_told_in_a_sentence(
     with pytest.raises(psa.InputError, match=message):
         psa.own_effects("gratings")
     _forget()
+
+
+def test_names_that_stacks_have_are_free(tmp_path: Path) -> None:
+    """A state, an input, a parameter and an output bear the names of a stack's sums."""
+    force, v, pull, k = (ca.SX.sym(n) for n in ("free_force", "v", "displacement", "tip_force"))
+    model = psa.ode_model(
+        {"x": [force, v], "u": pull, "p": k, "y": v, "ode": [v, pull - k * force - v]},
+        name="any", outputs=["velocity"], values={"tip_force": 4.0},
+    )  # fmt: skip
+    t = 0.02 * np.arange(201.0)
+    u = np.sin(2.0 * t)
+    shown = psa.run(model, t, u[:, None], np.zeros(2), rtol=1e-9, hold="zero").y[:, 0]
+    path = tmp_path / "any.fmu"
+    psa.export_fmu(model, path)
+    played = simulate_fmu(
+        str(path), stop_time=4.0, output_interval=0.02, relative_tolerance=1e-8,
+        input=np.array(
+            list(zip(t, u, strict=True)), dtype=[("time", float), ("displacement", float)]
+        ),
+    )  # fmt: skip
+    again = np.interp(t, played["time"], played["velocity"])
+    assert np.max(np.abs(again - shown)) < 1e-5 * np.ptp(shown)

@@ -136,7 +136,7 @@ def test_a_seed_gives_the_same_bytes_and_the_truth_stays_apart(tmp_path: Path) -
     case = next(c for c in cases_of(5, 10) if c.kind == "clean")
     first, again = tmp_path / "first", tmp_path / "again"
     for folder in (first, again):
-        writing.write_case(folder, (1, case))
+        writing.write_case(folder, 1, case)
         writing.write_sums(folder)
     sums = (first / "SHA256SUMS").read_text("utf-8")
     assert sums == (again / "SHA256SUMS").read_text("utf-8")

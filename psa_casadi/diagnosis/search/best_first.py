@@ -97,8 +97,6 @@ class _Search:
         for own in way:
             if own is not None and (own is best or own.names in self.expanded) and self.unseen(own):
                 return own
-        if any(self.explains(own) for own in way[:-1] if own is not None):
-            return self.next()
         if best.causes and self.once("exchange", best.names):
             if "exchange" not in self.task.method.without:
                 exchange(best, self.known, self.task)
@@ -143,21 +141,6 @@ class _Search:
             return True
         return h is self.known.best() and self.known.gained(last, h)
 
-    def explains(self, h: Hypothesis) -> bool:
-        """Whether nothing is left of a hypothesis whose fit is better than when it was seen.
-
-        It is the answer then, whatever more causes would explain.
-        """
-        old = self.known.views.get(h.names)
-        return h.names not in self.known.closed and old is not None and self.closed(old.of, h)
-
-    def closed(self, before: Hypothesis, h: Hypothesis) -> bool:
-        """Close a hypothesis of which nothing is left and which has gained; whether that is so."""
-        if not self.known.gained(before, h) or self.known.view(h).leaves:
-            return False
-        self.known.closed.add(h.names)
-        return True
-
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""
         series = has_series(h)
@@ -168,8 +151,8 @@ class _Search:
         if not series and self.resonances(h, view):
             self.done.discard(("challenged", h.names))
             return
-        seen, self.expanded[h.names] = self.expanded.get(h.names), h
-        if (seen is not None and self.closed(seen, h)) or self.several_modes(h, view):
+        self.expanded[h.names] = h
+        if self.several_modes(h, view):
             return
         if view.shows and len(h.causes) < self.task.limits.most_causes:
             if h.causes and not series:

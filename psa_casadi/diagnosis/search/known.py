@@ -8,7 +8,6 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
@@ -41,8 +40,7 @@ class Known:
     """The hypotheses of a search, from a base fit on. Raises SimulationError where that one fails.
 
     `found` holds them by their causes, `views` those whose residual was looked at, `fitted` the
-    effects fitted beside each, `trials` what effects would add to the base. `closed` are the causes
-    of hypotheses that leave nothing, whatever more causes would explain. A search that has ended
+    effects fitted beside each, `trials` what effects would add to the base. A search that has ended
     has an `answer`, and the causes of all that is worth having (`worthy`).
     """
 
@@ -59,7 +57,6 @@ class Known:
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
-        self.closed: set[Names] = set()
         self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.tell(root, "finished")
 
@@ -71,41 +68,10 @@ class Known:
     def conclude(self) -> None:
         """End the search: choose the answer, look at it, and ask what else is worth having."""
         self.view(self.best())
-        self.answer = self.in_order(self.likeliest())
+        self.answer = self.in_order(self.best())
         self.view(self.answer)
         self.tell(self.answer, "best")
         self.worthy = frozenset(n for n, h in self.found.items() if self.worth(h))
-
-    def likeliest(self) -> Hypothesis:
-        """Return the best hypothesis; where that removes too little, one that is nearly as likely.
-
-        Too little of the held-out error, so that its causes would not be named. Of records that are
-        held out whole the best one stays: they rank nothing.
-        """
-        best = self.best()
-        if self.scale.judge_only or not self.removes_little(best):
-            return best
-        own = self.scale.evidence(best)
-        least = self.scale.score(best) - self.task.limits.clearly * temperature(
-            own, self.task.limits
-        )
-
-        def near() -> list[Hypothesis]:
-            return [h for h in self.ranked() if h.causes and self.scale.score(h) > least]
-
-        self.finish([h for h in near() if not h.final])
-        enough = (h for h in near() if h.final and self.worth(h) and not self.removes_little(h))
-        return next(enough, best)
-
-    def removes_little(self, h: Hypothesis) -> bool:
-        """Whether structure remains and the causes remove too little to be named."""
-        noise = np.array([own.rms for own in self.scale.colour.each])
-        root, left = (np.square(x.held / np.maximum(noise, 1e-300)) for x in (self.root, h))
-        excess = float(np.sum(np.maximum(root - 1.0, 0.0)))
-        if not h.causes or excess <= 0.0:
-            return False
-        share = float(np.sum(root - left)) / excess
-        return share < self.task.limits.enough and self.view(h).test.alarm
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with its causes in the order in which they explain most.
@@ -202,12 +168,7 @@ class Known:
         return sorted(self.found.values(), key=lambda h: -self.scale.score(h))
 
     def best(self) -> Hypothesis:
-        """Return the answer so far: of the highest score and worth having, fitted to its end.
-
-        Where nothing is left of a hypothesis with fewer causes, that one.
-        """
-        for names in sorted(self.closed, key=len):
-            return self.found[names]
+        """Return the answer so far: of the highest score and worth having, fitted to its end."""
         while True:
             top = next(h for h in self.ranked() if self.worth(h))
             if top.final:

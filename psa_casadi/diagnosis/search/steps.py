@@ -15,7 +15,6 @@ from psa_casadi.diagnosis.screening import (
     credible_set,
     levelled,
     probabilities,
-    temperature,
 )
 from psa_casadi.diagnosis.search.fits import to_end, with_cause, without
 from psa_casadi.diagnosis.search.hypothesis import (
@@ -146,11 +145,6 @@ def _step(found: Known, task: Task, view: View, chosen: Hypothesis | None) -> St
     beside = {**_fitted(found, less), cause.name: found.answer}
     evidence = {**there.estimated(), **{n: gain(c, less) for n, c in beside.items()}}
     whole = found.scale.evidence(found.answer)
-    # only an estimate says that these are as likely as the cause
-    least = evidence[cause.name] - task.limits.clearly * temperature(whole, task.limits)
-    for name in [n for n, e in evidence.items() if n not in beside and e > least]:
-        more = with_cause(less, task.experiments, there.starts_of(name))
-        evidence[name] = -np.inf if more is None else gain(more, less)
     refused = {n for n, c in beside.items() if c.names not in found.worthy} - {cause.name}
     step = Step(view, fitted, chosen, less, there, beside, alone)
     return _judged(step, evidence, beside, refused, whole, task)
@@ -174,21 +168,9 @@ def _judged(
 
     `whole` is the evidence over the plain base of the model with the cause.
 
-    Effects that bend the same curve are refused together, and share what the best of them has.
+    Effects that bend the same curve share what the best of them has.
     """
-    alike = task.alike(step.fit)
-    good = set(fitted) - refused
-    fit = {
-        n
-        for n, h in fitted.items()
-        if task.pack.in_character(h.fit, next(c for c in h.causes if c.name == n), task.experiments)
-    }
-    for group in alike:
-        if good & set(group):
-            refused = refused - (set(group) & fit)
-        elif refused & set(group):
-            refused = refused | set(group)
-    shared = levelled(evidence, alike, good)
+    shared = levelled(evidence, task.alike(step.fit), set(fitted) - refused)
     chances = probabilities(
         {n: v for n, v in shared.items() if n not in refused}, whole, task.limits
     )

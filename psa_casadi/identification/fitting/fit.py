@@ -594,7 +594,7 @@ def unknowns_around(
         offset = experiments[0].channels[0].offset
         return coordinates_of(
             model, free, [starts(e) for e in experiments],
-            (span_of(experiments, 0) if offset else 0.0) or 1.0, np.inf if offset else 1.0,
+            (span_of(experiments, 0) or 1.0) if offset else 0.0, np.inf if offset else 1.0,
         ).without([k for k, e in enumerate(experiments) if not e.at(0).any()])  # fmt: skip
     scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
     motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]

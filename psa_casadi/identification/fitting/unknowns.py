@@ -174,7 +174,7 @@ class Unknowns:
             offset += self.compliance * (found[_CARRIED] - a * self.first_voltage[record])
             found[_CARRIED] *= self._a_ref / a
         theta[first:last] = np.array(list(found.values())) / self.start_scale[record]
-        theta[last] = offset / self.offset_scale
+        theta[last] = offset / self.offset_scale if self.offset_scale else 0.0
 
     def place_slopes(self, theta: FloatArray, record: int) -> tuple[FloatArray, FloatArray]:
         """Return d start / d theta, shape (started, size), and d offset / d theta (size,)."""
@@ -276,8 +276,7 @@ def coordinates_of(
 ) -> Unknowns:
     """Set up the coordinates around a model's values: parameters on the scale that they declare.
 
-    `starts` are those that are searched in each record; its offset is searched where the prior is
-    infinite, else it stays at 0.
+    `starts` are those that are searched in each record; its offset stays at 0 where its scale is 0.
     """
     values: Mapping[str, float] = model.values
     parameters = [model.parameter(n) for n in free]

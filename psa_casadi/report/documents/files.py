@@ -13,6 +13,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeBudget, OutputError, PortCause
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
 from psa_casadi.diagnosis.result import Candidate, Cause, Verdict, unnamed_causes
@@ -313,7 +314,10 @@ class FoundParameter:
 
 @dataclass(frozen=True)
 class FittedRecord:
-    """A record: SHA-256 of its file, samples used, residual rms and noise level [m], and range."""
+    """A record: SHA-256 of its file, samples used, residual rms and noise level, and range.
+
+    Those of its `output`, in the `unit`: m for a displacement, whatever the names of the fields.
+    """
 
     name: str
     sha256: str
@@ -321,6 +325,8 @@ class FittedRecord:
     rms_m: float
     noise_m: float
     rms_percent_of_range: float
+    output: str = "displacement"
+    unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -360,8 +366,10 @@ class IdentificationFile:
     profiles: Mapping[str, ProfileInterval]
 
 
-def identification_file(found: Identification, profiles: Iterable[Profile] = ()) -> dict[str, Any]:
-    """Return what `--json` writes of an identification."""
+def identification_file(
+    found: Identification | OdeIdentification, profiles: Iterable[Profile] = ()
+) -> dict[str, Any]:
+    """Return what `--json` writes of an identification, of any model."""
     intervals = found.model.provenance.intervals
     parameters = {
         p.name: FoundParameter(
@@ -373,13 +381,25 @@ def identification_file(found: Identification, profiles: Iterable[Profile] = ())
         )
         for p in found.model.structure.parameters
     }
+    stack = found if isinstance(found, Identification) else None
     records = []
-    residuals = found.fit.residuals_of(found.experiments)
-    for e, r, sigma in zip(found.experiments, residuals, found.fit.sigma, strict=True):
-        rms = float(np.sqrt(np.mean(r**2)))
-        share, samples = 100.0 * rms / e.record.range_m, int(e.used.sum())
-        named = (e.record.name, e.record.sha256)
-        records.append(FittedRecord(*named, samples, rms, float(sigma), share))
+    for output in found.fit.channels:
+        j, channel = output.number, output.channel
+        for k, part in zip(output.records, output.parts, strict=True):
+            if channel.factors:
+                continue
+            e, sigma = found.experiments[k], found.fit.sigma[k]
+            rms = float(np.sqrt(np.mean(part**2))) * e.share(j)
+            if isinstance(found, OdeIdentification):
+                sigma = found.noise[channel.column] * e.share(j)
+            readings = e.measured(j)[e.at(j, e.record.mask)]
+            share = 100.0 * rms / float(np.ptp(readings))
+            records.append(
+                FittedRecord(
+                    e.record.name, e.record.sha256, len(part), rms, float(sigma), share,
+                    channel.column, channel.unit,
+                )
+            )  # fmt: skip
     content = IdentificationFile(
         format=IDENTIFICATION_FORMAT,
         package_version=__version__,
@@ -387,11 +407,14 @@ def identification_file(found: Identification, profiles: Iterable[Profile] = ())
         parameters=parameters,
         rms_m=found.fit.rms,
         converged=found.fit.converged,
-        interrupted=found.interrupted,
+        interrupted=stack.interrupted if stack else found.fit.interrupted,
         records=tuple(records),
         warnings=found.warnings,
-        notes=found.sentences,
-        advice=tuple(AdvisedRecord(a.sentence, a.parameters, a.repeats) for a in found.advice),
+        notes=stack.sentences if stack else (),
+        advice=tuple(
+            AdvisedRecord(a.sentence, a.parameters, a.repeats)
+            for a in (stack.advice if stack else ())
+        ),
         profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
     )
     return asdict(content)
@@ -422,13 +445,18 @@ class SampledParameter:
 
 @dataclass(frozen=True)
 class SampledRecord:
-    """A record: SHA-256 of its file, samples used, how many count as one, residual rms [m]."""
+    """A record: SHA-256 of its file, samples used, how many count as one, residual rms.
+
+    That of its `output`, in the `unit`: m for a displacement, whatever the name of the field.
+    """
 
     name: str
     sha256: str
     samples: int
     samples_as_one: float
     rms_m: float
+    output: str = "displacement"
+    unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -452,9 +480,13 @@ def posterior_file(found: Posterior) -> dict[str, Any]:
     """Return what `--json` writes of a posterior."""
     task = found.task
     records = tuple(
-        SampledRecord(e.record.name, e.record.sha256, int(e.used.sum()), float(worth), float(rms))
-        for e, worth, rms in zip(task.experiments, task.inflation, task.levels, strict=True)
-    )
+        SampledRecord(
+            e.record.name, e.record.sha256, int(e.at(b.channel).sum()), b.alike, b.level,
+            task.channel(b).column, task.channel(b).unit,
+        )
+        for b in task.density.blocks
+        for e in (task.experiments[b.record],)
+    )  # fmt: skip
     parameters = {
         f.name: SampledParameter(
             f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),

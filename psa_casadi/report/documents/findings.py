@@ -8,8 +8,13 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from psa_casadi.any_model.identify import OdeIdentification
+from psa_casadi.any_model.result import FORMAT as OWN_DIAGNOSIS
+from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.identify import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import FORMAT as MODEL
 from psa_casadi.model.model_file import model_of
@@ -23,13 +28,22 @@ from psa_casadi.population.finding import (
 )
 from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
 from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
-from psa_casadi.report.documents.files import DeviceFile, DiagnosisFile, IdentificationFile, damage
+from psa_casadi.report.documents.files import (
+    DeviceFile,
+    DiagnosisFile,
+    IdentificationFile,
+    OwnModelFile,
+    damage,
+    identification_file,
+)
 from psa_casadi.strict_json import decode, read_json
 
 #: The file in a device's folder that says how its work ended.
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 _DIAGNOSIS = "psa_casadi.diagnosis/1"
+#: What `identify` and `diagnose` return.
+Result = Diagnosis | OdeDiagnosis | Identification | OdeIdentification
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
@@ -37,23 +51,25 @@ _PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
 
 
 def read_findings(
-    paths: Iterable[str | os.PathLike[str]],
+    paths: Iterable[str | os.PathLike[str] | Result],
     effects: Sequence[Component] = (),
     *,
     traces: bool = True,
 ) -> tuple[Finding, ...]:
-    """Return the findings in files, in their order.
+    """Return the findings in files, or of results at hand, in their order.
 
-    A path is a DIAGNOSIS.json, what `psa identify --json` wrote, a MODEL.json, or a device's folder
-    of `psa batch`. A model of the same records as a diagnosis or identification is part of it.
-    `traces` says whether models play the records that their files carry. `effects` are own ones.
+    A result, of a stack or of a model of one's own, is what `identify` and `diagnose` return; it
+    has the name of its first record. A path is a DIAGNOSIS.json, what `psa identify --json` wrote,
+    a MODEL.json, or a device's folder of `psa batch`. A model of the same records as a diagnosis or
+    identification is part of it. `traces` says whether models play the records that their files
+    carry. `effects` are own ones.
 
     Raises:
         InputError: what cannot be read, all of it.
     """
     found: list[_Read] = []
     problems: list[str] = []
-    for path in map(Path, paths):
+    for path in paths:
         try:
             found += _read(path, effects, traces)
         except InputError as error:
@@ -75,10 +91,20 @@ def device_finding(
     return replace(found[1], device=told.device, batch=told.batch, day=day)
 
 
-def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]:
-    path = path / DEVICE_FILE if path.is_dir() else path
-    source = str(path)
-    content = read_json(path, _ADVICE)
+def _read(
+    given: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
+) -> list[_Read]:
+    content: Any
+    if isinstance(given, Identification | OdeIdentification):
+        path, source = Path(given.experiments[0].record.name), "identification"
+        content = identification_file(given)
+    elif isinstance(given, Diagnosis | OdeDiagnosis):
+        path, source = Path(given.experiments[0].record.name), "diagnosis"
+        content = given.to_dict()
+    else:
+        path = Path(given) / DEVICE_FILE if Path(given).is_dir() else Path(given)
+        source = str(path)
+        content = read_json(path, _ADVICE)
     kind = content.get("format") if isinstance(content, dict) else None
     if kind == DEVICE:
         told = decode(DeviceFile, content, source)
@@ -88,6 +114,8 @@ def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]
         return [(path, device_finding(path.parent, told, effects, traces=traces))]
     if kind == _DIAGNOSIS:
         return [(path, _diagnosis(decode(DiagnosisFile, content, source)))]
+    if kind == OWN_DIAGNOSIS:
+        return [(path, _any_diagnosis(decode(OwnModelFile, content, source)))]
     if kind == IDENTIFICATION:
         return [(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
@@ -95,7 +123,7 @@ def _read(path: Path, effects: Sequence[Component], traces: bool) -> list[_Read]
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
 
 
-def _diagnosis(d: DiagnosisFile) -> Finding:
+def _any_diagnosis(d: DiagnosisFile | OwnModelFile) -> Finding:
     b = d.budget
     shares = [] if b is None else [*b.causes, *([b.unnamed] if b.unnamed else [])]
     return Finding(
@@ -106,11 +134,19 @@ def _diagnosis(d: DiagnosisFile) -> Finding:
         },
         records=tuple((r.name, r.sha256) for r in d.records),
         verdict=d.verdict,
-        doubt=d.doubt,
         causes=tuple(
             NamedCause(c.effect, c.confidence, c.explained_share, c.cannot_be_told_from)
             for c in d.causes
         ),
+        budget=tuple(BudgetShare(s.what, s.share, s.interval) for s in shares),
+        notes=d.notes,
+    )
+
+
+def _diagnosis(d: DiagnosisFile) -> Finding:
+    return replace(
+        _any_diagnosis(d),
+        doubt=d.doubt,
         errors=HeldOutErrors(
             d.errors.base.holdout_rms_m,
             d.errors.extended.holdout_rms_m,
@@ -118,8 +154,6 @@ def _diagnosis(d: DiagnosisFile) -> Finding:
             d.errors.base.holdout_nrmse_percent,
             d.errors.extended.holdout_nrmse_percent,
         ),
-        budget=tuple(BudgetShare(s.what, s.share, s.interval) for s in shares),
-        notes=d.notes,
     )
 
 
@@ -131,8 +165,8 @@ def _identification(i: IdentificationFile) -> Finding:
             n: Found(p.value, p.unit, p.interval, p.determined in ("determined", "weak"), p.meaning)
             for n, p in i.parameters.items()
         },
-        records=tuple((r.name, r.sha256) for r in i.records),
-        rms_m=i.rms_m,
+        records=tuple(dict.fromkeys((r.name, r.sha256) for r in i.records)),
+        rms_m=i.rms_m if all(r.output == "displacement" for r in i.records) else None,
         rms_percent=max((r.rms_percent_of_range for r in i.records), default=None),
         notes=(*i.warnings, *i.notes),
     )

@@ -17,10 +17,10 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import Identification
-from psa_casadi.posterior.chains import columns_of_records
+from psa_casadi.posterior.chains import column_of
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
+from psa_casadi.posterior.task import Block
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.plots import records
 from psa_casadi.report.plots.findings import evidence_plot, signature_plot
@@ -285,7 +285,7 @@ def _curve(axes: Axes, time: FloatArray, values: FloatArray, name: str, unit: st
 
 def posterior_figure(found: Posterior) -> Figure:
     """Return what prior and posterior predict of the record missed most, and the parameters."""
-    shown = int(np.argmax(found.task.levels))
+    shown = _missed_most(found)
     figures = found.figures[:_MOST_PARAMETERS]
     rows = -(-len(figures) // _COLUMNS)
     figure = sheet((SIZE_INCHES[0], 4.6 + 2.6 * rows), DPI)
@@ -298,7 +298,7 @@ def posterior_figure(found: Posterior) -> Figure:
         _draw_parameter(each, found, f)
     for each in axes[len(figures) :]:
         each.set_axis_off()
-    name = found.task.experiments[shown].record.name
+    name = found.task.experiments[shown.record].record.name
     more = len(found.figures) - len(figures)
     rest = f"; {more} more parameters are in the table" if more else ""
     figure.suptitle(
@@ -307,49 +307,73 @@ def posterior_figure(found: Posterior) -> Figure:
     return figure
 
 
-def _band(found: Posterior, group: str, record: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the ends of the band that holds 94 % of what is predicted, and the median [m]."""
-    column = columns_of_records(found.task)[record]
-    draws = (
-        found.tree[group][column].to_numpy().reshape(-1, found.task.experiments[record].record.n)
-    )
+def _missed_most(found: Posterior) -> Block:
+    """Return the output of a record that the model misses most, over the output's range."""
+
+    def share(b: Block) -> float:
+        parts = [e.measured(b.channel)[e.at(b.channel)] for e in found.task.experiments]
+        return b.level / max(float(np.ptp(np.concatenate(parts))), 1e-300)
+
+    return max(found.task.density.blocks, key=share)
+
+
+def _readings(found: Posterior, b: Block) -> tuple[FloatArray, FloatArray]:
+    """Return times (n,) [s] and readings (n,) of a block in its unit."""
+    e = found.task.experiments[b.record]
+    return e.record.time, e.measured(b.channel)
+
+
+def _scale(found: Posterior, b: Block, size: float) -> phrases.Scale:
+    """Return what numbers of a block of this size are shown in."""
+    unit = found.task.channel(b).unit
+    return phrases.length_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
+
+
+def _band(found: Posterior, group: str, b: Block) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the ends of the band that holds 94 % of what is predicted, and the median."""
+    draws = found.tree[group][column_of(found.task, b)].to_numpy()
+    draws = draws.reshape(-1, draws.shape[-1])
     low, high = 0.5 * (1.0 - HDI), 0.5 * (1.0 + HDI)
     ends: FloatArray = np.quantile(draws, [low, high, 0.5], axis=0)
     return ends[0], ends[1], ends[2]
 
 
-def _draw_prior(axes: Axes, found: Posterior, record: int) -> None:
-    r = found.task.experiments[record].record
-    y = measured(r)
+def _draw_prior(axes: Axes, found: Posterior, block: Block) -> None:
+    time, y = _readings(found, block)
     if not found.tree["prior_predictive"].sizes["draw"]:
         style(axes, "No draw of the prior can be simulated", "time [s]", "")
         return
-    low, high, _ = _band(found, "prior_predictive", record)
+    low, high, _ = _band(found, "prior_predictive", block)
     span = float(np.nanmax(y) - np.nanmin(y))
-    scale = phrases.length_scale(3.0 * span)
+    scale = _scale(found, block, 3.0 * span)
     band = f"prior, {100.0 * HDI:.0f} %"
     ends = (scale.factor * low, scale.factor * high)
-    axes.fill_between(r.time, *ends, color=colours.BASE, alpha=0.3, label=band)
-    axes.plot(r.time, scale.factor * y, color=colours.MEASURED, linewidth=1.0, label="measured")
+    axes.fill_between(time, *ends, color=colours.BASE, alpha=0.3, label=band)
+    axes.plot(time, scale.factor * y, color=colours.MEASURED, linewidth=1.0, label="measured")
     middle = 0.5 * float(np.nanmax(y) + np.nanmin(y))
     axes.set_ylim(scale.factor * (middle - 1.5 * span), scale.factor * (middle + 1.5 * span))
-    style(axes, "Prior predictive", "time [s]", f"displacement [{scale.unit}]")
+    style(
+        axes,
+        "Prior predictive",
+        "time [s]",
+        phrases.in_brackets(found.task.channel(block).column, scale.unit),
+    )
     axes.legend(fontsize=FONT - 1, loc="upper right")
 
 
-def _draw_posterior(axes: Axes, found: Posterior, record: int) -> None:
-    r = found.task.experiments[record].record
-    low, high, middle = _band(found, "posterior_predictive", record)
-    left = measured(r) - middle
-    scale = phrases.length_scale(float(np.nanmax(np.abs(left))))
+def _draw_posterior(axes: Axes, found: Posterior, block: Block) -> None:
+    time, y = _readings(found, block)
+    low, high, middle = _band(found, "posterior_predictive", block)
+    left = y - middle
+    scale = _scale(found, block, float(np.nanmax(np.abs(left))))
     band = f"posterior, {100.0 * HDI:.0f} %"
-    axes.plot(r.time, scale.factor * left, color=colours.MEASURED, linewidth=0.8, label="measured")
+    axes.plot(time, scale.factor * left, color=colours.MEASURED, linewidth=0.8, label="measured")
     axes.fill_between(
-        r.time, scale.factor * (low - middle), scale.factor * (high - middle),
+        time, scale.factor * (low - middle), scale.factor * (high - middle),
         color=colours.EXTENDED, alpha=0.4, label=band, zorder=3,
     )  # fmt: skip
     title = "Posterior predictive, less its median"
-    style(axes, title, "time [s]", f"difference [{scale.unit}]")
+    style(axes, title, "time [s]", phrases.in_brackets("difference", scale.unit))
     axes.legend(fontsize=FONT - 1, loc="upper right")
 
 

@@ -172,8 +172,11 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
         " are rough; take more draws (--draws)."
     ),
     "start_cut_off": "The fit that the chains start from was cut off before it converged.",
-    "coloured": "Residuals of '{record}' are correlated: {worth:.3g} samples count as one, and the"
-    " model lacks something there; `psa diagnose` looks for the cause.",
+    "coloured": lambda record, worth, output: (
+        f"Residuals of '{record}'{f', {output},' if output else ''} are correlated: {worth:.3g}"
+        " samples count as one, and the model lacks something there; `psa diagnose` looks for the"
+        " cause."
+    ),
     "of_the_prior": lambda names: (
         f"The records hardly tell {_quoted(names)}: the posterior is that of the prior."
     ),

@@ -199,10 +199,7 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
     "vague": "{names}: in the extended model and not named: {why}.",
     "better_unnamed": lambda each: (
         "beside the model without it, an unnamed correction explains more ("
-        + "; ".join(
-            f"{correction(kind, port)}, {'freer in form than' if freer else 'instead of'} {name}"
-            for kind, port, name, freer in each
-        )
+        + "; ".join(f"{correction(kind, port)}, instead of {name}" for kind, port, name in each)
         + ")"
     ),
     "beaten": lambda by, port, evidence, share: (

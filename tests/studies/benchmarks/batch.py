@@ -9,59 +9,51 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import mannwhitneyu
 
-from psa_casadi.devices.batch import BatchRun, batch
+import psa_casadi as psa
 from psa_casadi.devices.executors import LOCAL, dask_client
 from psa_casadi.population.population import Population, population
 from psa_casadi.report.words.phrases import number
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share, table_of
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, share
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.make import write_csv
-from tests.studies.plants.stack import FloatArray, Stack, draw_stack
-
-
-@dataclass
-class Killer:
-    """Kills a worker, as a machine that is lost would be, when a share of the devices is there."""
-
-    workers: dict[str, int]
-    devices: int
-    share: float = 1.0 / 3.0
-    done: int = 0
-    killed: list[int] = field(default_factory=list)
-
-    def __call__(self, told: str, progress: Progress) -> None:
-        """Count the devices by what is told after each; kill the first worker when it is time."""
-        progress(told)
-        self.done += " devices" in told
-        if self.done >= self.share * self.devices and not self.killed:
-            pid = min(self.workers.values())
-            os.kill(pid, signal.SIGKILL)
-            self.killed.append(pid)
+from tests.studies.plants.stack import Stack, draw_stack
 
 
 def on_dask(
     records: Path, output: Path, workers: int, progress: Progress, *, kill: bool = False
-) -> tuple[BatchRun, str]:
-    """Return a batch on a new cluster of so many workers, and what became of them."""
-    devices = len(list(records.glob("*.csv"))) - 1  # jobs.csv
+) -> tuple[psa.BatchRun, str]:
+    """Return a batch on a new cluster of so many workers, and what became of them.
+
+    With `kill` a worker is killed, as a machine that is lost would be, when a third of the devices
+    is there, by what is told after each.
+    """
+    devices, done, killed = len(list(records.glob("*.csv"))) - 1, 0, list[int]()  # one is jobs.csv
     with dask_client(LOCAL, workers) as client:
-        before: dict[str, int] = client.run(os.getpid)  # by the worker's address
-        killer = Killer(before, devices)
-        say: Progress = partial(killer, progress=progress) if kill else progress
-        found = batch(records, output, executor=client, progress=say)
+        before: set[int] = set(client.run(os.getpid).values())
+
+        def say(told: str) -> None:
+            nonlocal done
+            progress(told)
+            done += " devices" in told
+            if kill and 3 * done >= devices and not killed:
+                killed.append(min(before))
+                os.kill(killed[0], signal.SIGKILL)
+
+        found = psa.batch(records, output, executor=client, progress=say)
         after = set(client.run(os.getpid).values())
-    gone = sorted(set(before.values()) - after)
-    if kill and gone != killer.killed:
-        raise RuntimeError(f"Workers {killer.killed} were killed, and {gone} are gone.")
-    new = len(after - set(before.values()))
-    return found, f", {len(gone)} worker killed, {new} new in its place" if kill else ""
+    if kill and sorted(before - after) != killed:
+        raise RuntimeError(f"Workers {killed} were killed, and {before - after} are gone.")
+    new = len(after - before)
+    return found, f", {len(killed)} worker killed, {new} new in its place" if kill else ""
 
 
 #: Samples of a record, time between them [s], noise over the stroke.
@@ -82,38 +74,32 @@ DEFECTS: dict[str, Callable[[Stack], Stack]] = {
 def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> dict[str, str]:
     """Write a record for each device, and a table of jobs; return the defects by name, "" for none.
 
-    The same seed gives the same bytes.
+    A sound device has its own force, hysteresis, asymmetry and bend. The voltage has loops that
+    shrink: every one turns at voltages of its own. The same seed gives the same bytes.
     """
-    rng = np.random.default_rng(seed)
-    usual = draw_stack(np.random.default_rng(7))
+    folder.mkdir()
+    rng, usual = np.random.default_rng(seed), draw_stack(np.random.default_rng(7))
     times: FloatArray = STEP * np.arange(SAMPLES, dtype=np.float64)
-    bad = set(rng.choice(count, defects, replace=False).tolist())
-    kinds = list(DEFECTS)
+    swing = (1.0 - np.cos(4.0 * np.pi * times)) * np.exp(-0.25 * times)
+    bad = dict(zip(sorted(rng.choice(count, defects, replace=False).tolist()),
+                   list(DEFECTS) * count, strict=False))  # fmt: skip
     found, rows = {}, ["device,batch,date,files"]
     for k in range(count):
-        stack = _drawn(usual, rng)
-        defect = kinds[len([b for b in bad if b < k]) % len(kinds)] if k in bad else ""
+        force, wide, skew, bend = np.exp(SPREAD * rng.standard_normal(4)).tolist()
+        stack = _hysteresis(usual, wide)
+        stack = replace(
+            stack, k_l=usual.k_l * force, delta=stack.delta * skew,
+            n=usual.n * bend if usual.n > 1.1 else usual.n,
+        )  # fmt: skip
+        name, defect = f"S{k:04d}", bad.get(k, "")
         stack = DEFECTS[defect](stack) if defect else stack
-        run = simulate_base(stack, times, _voltage(times, usual.u_rated))
+        run = simulate_base(stack, times, np.asarray(0.5 * usual.u_rated * swing))
         noise = NOISE * usual.stroke * rng.standard_normal(SAMPLES)
-        name = f"S{k:04d}"
         write_csv(folder / f"{name}.csv", times, run.command, run.displacement + noise)
         rows.append(f"{name},B{k * 10 // count},2026-{k * 12 // count + 1:02d}-15,{name}.csv")
         found[name] = defect
     (folder / "jobs.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     return found
-
-
-def _drawn(usual: Stack, rng: np.random.Generator) -> Stack:
-    """Return a sound device: its own force, hysteresis, asymmetry and bend."""
-    factors = np.exp(SPREAD * rng.standard_normal(4))
-    stack = _hysteresis(usual, float(factors[1]))
-    return replace(
-        stack,
-        k_l=usual.k_l * float(factors[0]),
-        delta=stack.delta * float(factors[2]),
-        n=usual.n * float(factors[3]) if usual.n > 1.1 else usual.n,
-    )
 
 
 def _hysteresis(s: Stack, factor: float) -> Stack:
@@ -122,38 +108,27 @@ def _hysteresis(s: Stack, factor: float) -> Stack:
     return replace(s, a=a, beta=b, gamma=g, h_ref=h)
 
 
-def _voltage(times: FloatArray, span: float) -> FloatArray:
-    """Return loops that shrink: every one turns at voltages of its own."""
-    return np.asarray(0.5 * span * (1.0 - np.cos(4.0 * np.pi * times)) * np.exp(-0.25 * times))
-
-
 #: Devices, of which one in twenty has a defect; devices of the runs with one, two and four workers.
 DEVICES, QUICK, PART = 100, 24, 24
 #: Workers of Dask; without Dask all devices are worked on by this machine's processes.
 WORKERS = 4
 
 
-def run(progress: Progress, quick: bool) -> Outcome:
-    """Return the tables for the usual number of devices."""
-    return run_sized(progress, QUICK if quick else DEVICES)
-
-
-def run_sized(progress: Progress, count: int) -> Outcome:
-    """Return the tables for `count` devices."""
+def run(progress: Progress, quick: bool, size: int = DEVICES) -> Outcome:
+    """Return the tables for `size` devices."""
+    count = QUICK if quick else size
 
     def own(what: str, records: Path, output: Path, workers: int) -> _Cost:
-        work = partial(batch, records, output, workers=workers, progress=progress)
+        work = partial(psa.batch, records, output, workers=workers, progress=progress)
         return _measured(what, lambda: (work(), ""))
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         records, part, results = folder / "records", folder / "part", folder / "results"
         progress("making the devices")
-        records.mkdir()
         devices = write_devices(records, count, max(4, count // 20))
-        part.mkdir()
         write_devices(part, PART, 0, seed=21)
-        batch(part, folder / "warm", progress=progress)  # compiles
+        psa.batch(part, folder / "warm", progress=progress)  # compiles
         costs = [
             own(f"{n} process{'es' if n > 1 else ''}", part, folder / f"with{n}", n)
             for n in (1, 2, WORKERS)
@@ -171,59 +146,48 @@ def run_sized(progress: Progress, count: int) -> Outcome:
     return Outcome((_roc(devices, population(whole.findings)), _cost(costs)))
 
 
-@dataclass(frozen=True)
-class _Cost:
-    """A run with its wall and processor times [s] and the largest memory of processes [MiB].
+class _Cost(NamedTuple):
+    """A run with its wall and processor times [s], a device's, and largest memories [MiB].
 
-    `memory` is that of a worker, `own` that of the process that hands out the work. Each is the
-    largest so far.
+    `worker` is that of a worker, `own` that of the process that hands out the work; so far.
     """
 
     what: str
-    run: BatchRun
+    run: psa.BatchRun
     wall: float
     processor: float
-    memory: float
+    each: float
+    worker: float
     own: float
 
-    @property
-    def each(self) -> float:
-        """Processor time of a device [s]."""
-        return self.processor / len(self.run.devices)
 
+def _measured(by: str, work: Callable[[], tuple[psa.BatchRun, str]]) -> _Cost:
+    who = (resource.RUSAGE_CHILDREN, resource.RUSAGE_SELF)
 
-def _measured(by: str, work: Callable[[], tuple[BatchRun, str]]) -> _Cost:
-    before, began = _processor(), time.perf_counter()
+    def processor() -> float:
+        """Return the processor time of this process and of all that it has waited for [s]."""
+        return sum(r.ru_utime + r.ru_stime for r in map(resource.getrusage, who))
+
+    before, began = processor(), time.perf_counter()
     found, remark = work()
-    wall, spent = time.perf_counter() - began, _processor() - before
-    children, own = (
-        resource.getrusage(who).ru_maxrss / 1024.0
-        for who in (resource.RUSAGE_CHILDREN, resource.RUSAGE_SELF)
-    )
-    what = f"{len(found.devices)} devices, {by}{remark}"
-    return _Cost(what, found, wall, spent, children, own)
-
-
-def _processor() -> float:
-    """Return the processor time of this process and of all that it has waited for [s]."""
-    rows = [resource.getrusage(r) for r in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(r.ru_utime + r.ru_stime for r in rows)
+    wall, spent = time.perf_counter() - began, processor() - before
+    memory = (resource.getrusage(w).ru_maxrss / 1024.0 for w in who)
+    count = len(found.devices)
+    return _Cost(f"{count} devices, {by}{remark}", found, wall, spent, spent / count, *memory)
 
 
 def _cost(costs: Sequence[_Cost]) -> TitledTable:
-    return table_of(
+    rows = [
+        {"run": c.what, "wall [s]": number(c.wall), "processor [s]": number(c.processor),
+         "for a device [s]": number(c.each, 2),
+         "over one process": number(c.each / costs[0].each, 2),
+         "ended": ", ".join(f"{n} {status}" for status, n in c.run.counts.items()),
+         "largest worker [MiB]": number(c.worker), "own process [MiB]": number(c.own)}
+        for c in costs
+    ]  # fmt: skip
+    return TitledTable(
         "Cost",
-        costs,
-        {
-            "run": lambda c: c.what,
-            "wall [s]": lambda c: number(c.wall),
-            "processor [s]": lambda c: number(c.processor),
-            "for a device [s]": lambda c: number(c.each, 2),
-            "over one process": lambda c: number(c.each / costs[0].each, 2),
-            "ended": lambda c: ", ".join(f"{n} {status}" for status, n in c.run.counts.items()),
-            "largest worker [MiB]": lambda c: number(c.memory),
-            "own process [MiB]": lambda c: number(c.own),
-        },
+        rows,
         "Processor times are of all processes, their start included, and do not depend on what else"
         " the machine does, as wall times do. Over one process: what a device costs more with more"
         " workers; its inverse bounds the parallel efficiency where every worker has a core of its"
@@ -238,25 +202,19 @@ def _roc(devices: Mapping[str, str], found: Population) -> TitledTable:
         for k, p in zip(s.estimates.places, s.far.p, strict=True):
             name = found.findings[k].device
             smallest[name] = min(smallest[name], float(p))
-    score = {name: -np.log(max(p, 1e-300)) for name, p in smallest.items()}
     told = {o.device for o in found.outliers}
+    groups = {"any": [n for n, defect in devices.items() if defect]}
+    groups |= {kind: [n for n, defect in devices.items() if defect == kind] for kind in DEFECTS}
     sound = [name for name, defect in devices.items() if not defect]
-
-    def those(wanted: str) -> list[str]:
-        return [name for name, defect in devices.items() if defect and wanted in ("any", defect)]
-
-    def area(wanted: str) -> str:
-        auc, error = _auc([score[n] for n in those(wanted)], [score[n] for n in sound])
-        return f"{auc:.3f} ± {1.96 * error:.3f}"
-
-    def named(wanted: str) -> str:
-        return share(sum(n in told for n in those(wanted)), len(those(wanted)))
-
-    return table_of(
+    rows = []
+    for kind, own in groups.items():
+        auc, error = _auc(*([-smallest[n] for n in names] for names in (own, sound)))
+        rows.append({"defect": kind, "told": share(n in told for n in own),
+                     "area under the ROC curve": f"{auc:.3f} ± {1.96 * error:.3f}"})  # fmt: skip
+    return TitledTable(
         f"Defects among {len(devices)} devices",
-        ("any", *DEFECTS),
-        {"defect": str, "told": named, "area under the ROC curve": area},
-        f"False alarms: {share(sum(n in told for n in sound), len(sound))} of the sound devices."
+        rows,
+        f"False alarms: {share(n in told for n in sound)} of the sound devices."
         " Told: p below 0.05, adjusted by Benjamini and Hochberg over all devices and parameters."
         " The area under the ROC curve is of the smallest p of a device (interval: Hanley and"
         " McNeil 1982).",
@@ -265,11 +223,10 @@ def _roc(devices: Mapping[str, str], found: Population) -> TitledTable:
 
 def _auc(bad: Sequence[float], good: Sequence[float]) -> tuple[float, float]:
     """Return the area under the ROC curve (Mann and Whitney) and its standard error."""
-    if not bad or not good:
-        return float("nan"), float("nan")
-    difference = np.subtract.outer(np.array(bad), np.array(good))
-    a = float(np.mean((difference > 0) + 0.5 * (difference == 0)))
-    q1, q2 = a / (2.0 - a), 2.0 * a**2 / (1.0 + a)
     m, n = len(bad), len(good)
+    if not m or not n:
+        return float("nan"), float("nan")
+    a = float(mannwhitneyu(bad, good).statistic) / (m * n)
+    q1, q2 = a / (2.0 - a), 2.0 * a**2 / (1.0 + a)
     variance = (a * (1 - a) + (m - 1) * (q1 - a**2) + (n - 1) * (q2 - a**2)) / (m * n)
     return a, float(np.sqrt(max(0.0, variance)))

@@ -8,66 +8,19 @@ covariance of the fit gives it. Every stack has its own draws. Beside the share 
 stands what these draws alone give (`coverage_control`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+import psa_casadi as psa
 from psa_casadi.diagnosis.colour import whiteness
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.identify import Identification, identify
-from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.records import Record
 from psa_casadi.records.split import whole
 from tests.studies.benchmarks.records import Values, clean_set, with_noise
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, table_of
-
-FloatArray = npt.NDArray[np.float64]
-_STEP, _RTOL = 1e-5, 1e-8
-
-
-def drawn_scores(
-    model: Model,
-    clean: Sequence[Record],
-    noisy: Sequence[Record],
-    names: Sequence[str],
-    level: float,
-    quantities: Callable[[Values], Values],
-) -> dict[str, float]:
-    """Return by how many standard errors the draws move each quantity, at the truth.
-
-    `model` carries the truth, `names` are the parameters that are fitted, `level` [m] is the
-    noise's; `quantities` makes the compared quantities of parameter values.
-    """
-    experiments = [whole(r) for r in clean]
-    at = fit(model, experiments, names, sigma=[level] * len(clean), evaluations=1, rtol=_RTOL)
-    noise = np.concatenate([measured(n) - measured(c) for n, c in zip(noisy, clean, strict=True)])
-    scaled, count = at.jacobian / level, len(names)
-    covariance = np.linalg.pinv(
-        scaled.T @ scaled + np.diag(1.0 / at.unknowns.prior**2), hermitian=True
-    )
-    moved = covariance @ (scaled.T @ (noise / level))
-    slopes = gradients(model.values, names, quantities) @ at.unknowns.slopes(at.theta)
-    errors = np.sqrt(np.einsum("qk,kl,ql->q", slopes, covariance[:count, :count], slopes))
-    scores = slopes @ moved[:count] / errors
-    return dict(zip(quantities(model.values), scores.tolist(), strict=True))
-
-
-def gradients(
-    values: Values, names: Sequence[str], quantities: Callable[[Values], Values]
-) -> FloatArray:
-    """Return d quantity / d parameter (quantities, k), by central differences."""
-    columns = []
-    for name in names:
-        h = _STEP * max(abs(values[name]), 1e-300)
-        up, down = (quantities({**values, name: values[name] + s}) for s in (h, -h))
-        columns.append([(up[q] - down[q]) / (2.0 * h) for q in up])
-    return np.array(columns).T
-
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, on_all_cores
 
 NOISE, SEEDS, QUICK_SEEDS = 1e-3, 50, 2
 QUICK_STACKS = ("P-885.51", "PTBS200")
@@ -76,6 +29,39 @@ _NORMAL_95 = 1.96
 _WEAK = 0.1
 #: Residuals with a smaller p-value of the portmanteau test do not count as white.
 _WHITE = 0.01
+_STEP, _RTOL = 1e-5, 1e-8
+
+
+def drawn_scores(
+    model: psa.Model, clean: Sequence[psa.Record], noisy: Sequence[psa.Record],
+    names: Sequence[str], level: float, size: float,
+) -> dict[str, float]:  # fmt: skip
+    """Return by how many standard errors the draws move each quantity, at the truth.
+
+    `model` carries the truth, `names` are the parameters that are fitted, `level` [m] is the
+    noise's, `size` [m] that of `quantities`.
+    """
+    experiments = [whole(r) for r in clean]
+    at = fit(model, experiments, names, sigma=[level] * len(clean), evaluations=1, rtol=_RTOL)
+    noise = np.concatenate([measured(n) - measured(c) for n, c in zip(noisy, clean, strict=True)])
+    scaled, count = at.jacobian / level, len(names)
+    precision = scaled.T @ scaled + np.diag(1.0 / at.unknowns.prior**2)
+    covariance = np.linalg.pinv(precision, hermitian=True)
+    moved = covariance @ (scaled.T @ (noise / level))
+    slopes = gradients(model.values, names, size) @ at.unknowns.slopes(at.theta)
+    errors = np.sqrt(np.einsum("qk,kl,ql->q", slopes, covariance[:count, :count], slopes))
+    scores = slopes @ moved[:count] / errors
+    return dict(zip(quantities(model.values, size), scores.tolist(), strict=True))
+
+
+def gradients(values: Values, names: Sequence[str], size: float) -> FloatArray:
+    """Return d quantity / d parameter (quantities, k), by central differences."""
+    columns = []
+    for name in names:
+        h = _STEP * max(abs(values[name]), 1e-300)
+        up, down = (quantities({**values, name: values[name] + s}, size) for s in (h, -h))
+        columns.append([(up[q] - down[q]) / (2.0 * h) for q in up])
+    return np.array(columns).T
 
 
 @dataclass(frozen=True)
@@ -124,46 +110,35 @@ class Run:
         return [f for f in self.found if f.determined]
 
 
-def run(progress: Progress, quick: bool) -> Outcome:
-    """Identify every named stack from `SEEDS` sets of records, or two of them from two."""
-    return _over(QUICK_STACKS, QUICK_SEEDS, progress) if quick else run_sized(progress, SEEDS)
-
-
-def run_sized(progress: Progress, count: int) -> Outcome:
-    """Identify every named stack from `count` sets of records."""
-    return _over(tuple(STACKS), count, progress)
-
-
-def _over(names: Sequence[str], seeds: int, progress: Progress) -> Outcome:
-    """Identify the named stacks from `seeds` sets of records each, on all cores."""
-    jobs = [(name, seed) for name in names for seed in range(seeds)]
-    runs = on_all_cores(one_run, jobs, lambda run: run.stack, progress)
-    return Outcome([by_stack(runs)])
+def run(progress: Progress, quick: bool, size: int = SEEDS) -> Outcome:
+    """Identify every named stack from `size` sets of records, or two of them from two."""
+    seeds = range(QUICK_SEEDS if quick else size)
+    jobs = [(n, seed) for n in (QUICK_STACKS if quick else psa.STACKS) for seed in seeds]
+    return Outcome([by_stack(on_all_cores(one_run, jobs, progress, lambda r: r.stack))])
 
 
 def one_run(name: str, seed: int) -> Run:
     """Identify one named stack from one set of noisy records, and compare with the truth."""
-    truth = {key: f.value for key, f in STACKS[name].values.items()}
+    model = psa.stack_model(name)
+    truth = model.values
     clean = clean_set(truth)
     level = NOISE * max(r.range_m for r in clean)
-    records = with_noise(clean, NOISE, (tuple(STACKS).index(name), seed))
-    found = identify(records, stiffness=truth["k_B"])
+    records = with_noise(clean, NOISE, (tuple(psa.STACKS).index(name), seed))
+    found = psa.identify(records, stiffness=truth["k_B"])
     size = static_compliance(truth) * truth["h_ref"]
     told = found.determinacy.names
-    drawn = drawn_scores(
-        stack_model(name), clean, records, told, level, lambda p: quantities(p, size)
-    )
+    drawn = drawn_scores(model, clean, records, told, level, size)
     white = tuple(whiteness(r)[0] > _WHITE for r in found.fit.residuals_of(found.experiments))
     quality = (found.fit.rms / level, white, found.fit.converged)
     return Run(name, compared(found, truth, drawn), *quality)
 
 
-def compared(found: Identification, truth: Values, drawn: Values) -> tuple[Found, ...]:
+def compared(found: psa.Identification, truth: Values, drawn: Values) -> tuple[Found, ...]:
     """Return every quantity with its truth and its standard error (delta method)."""
     known, p = found.determinacy, found.model.values
     size = static_compliance(truth) * truth["h_ref"]
     true, value = quantities(truth, size), quantities(p, size)
-    slopes = gradients(p, known.names, lambda values: quantities(values, size))
+    slopes = gradients(p, known.names, size)
     errors = np.sqrt(np.einsum("qk,kl,ql->q", slopes, known.covariance, slopes))
     open_ones = {*known.undetermined, *known.on_bound}
     results = []
@@ -181,20 +156,10 @@ def quantities(p: Values, size: float) -> dict[str, float]:
     """
     c = static_compliance(p)
     bend = c * (size / (c * p["h_ref"])) ** p["n"]
-    return {
-        "k_L": c * p["k_L"],
-        "A": c * p["A"],
-        "beta": bend * p["beta"],
-        "gamma": bend * p["gamma"],
-        "delta": c * p["delta"],
-        "n": p["n"],
-        "tau": p["tau"],
-        "R_s": p["R_s"] * p["C_p"],
-        "c_P": p["c_P"] / p["k_P"],
-        "m_P": p["m_P"] / p["k_P"],
-        "c_B": p["c_B"] / p["k_B"],
-        "m_B": p["m_B"] / p["k_B"],
-    }
+    factors = {"k_L": c, "A": c, "beta": bend, "gamma": bend, "delta": c, "n": 1.0, "tau": 1.0}
+    found = {name: factor * p[name] for name, factor in factors.items()}
+    found["R_s"] = p["R_s"] * p["C_p"]
+    return found | {f"{q}_{part}": p[f"{q}_{part}"] / p[f"k_{part}"] for part in "PB" for q in "cm"}
 
 
 def share_sentence(runs: Sequence[Run]) -> str:
@@ -215,27 +180,20 @@ def share_sentence(runs: Sequence[Run]) -> str:
 
 def by_stack(runs: Sequence[Run]) -> TitledTable:
     """Return how many intervals of each stack hold the truth, and what the fits leave."""
-    of = {n: [r for r in runs if r.stack == n] for n in dict.fromkeys(r.stack for r in runs)}
-
-    def held(n: str) -> str:
-        found = [f.covered for r in of[n] for f in r.told]
-        return f"{sum(found)} of {len(found)}, {100.0 * np.mean(found):.1f} %"
-
-    def drawn(n: str) -> str:
-        return f"{100.0 * np.mean([f.covered_by_draws for r in of[n] for f in r.told]):.1f} %"
-
-    def left(n: str) -> str:
-        ratios = [r.rms_ratio for r in of[n]]
-        return f"{min(ratios):.3f} to {max(ratios):.3f}"
-
-    def white(n: str) -> str:
-        found = [w for r in of[n] for w in r.white]
-        return f"{sum(found)} of {len(found)}"
-
-    columns: dict[str, Callable[[str], str]] = {
-        "stack": str, "intervals that hold the truth": held, "by the draws alone": drawn,
-        "residual over noise": left, "white records": white,
-    }  # fmt: skip
+    rows = []
+    for name in dict.fromkeys(r.stack for r in runs):
+        of = [r for r in runs if r.stack == name]
+        held = [(f.covered, f.covered_by_draws) for r in of for f in r.told]
+        inside, drawn = 100.0 * np.mean(held, axis=0)
+        ratios, white = [r.rms_ratio for r in of], [w for r in of for w in r.white]
+        rows.append({
+            "stack": name,
+            "intervals that hold the truth": f"{sum(h for h, _ in held)} of {len(held)},"
+            f" {inside:.1f} %",
+            "by the draws alone": f"{drawn:.1f} %",
+            "residual over noise": f"{min(ratios):.3f} to {max(ratios):.3f}",
+            "white records": f"{sum(white)} of {len(white)}",
+        })  # fmt: skip
     note = " White: portmanteau test of 25 lags with p above 1 %, so that 99 % of pure noise pass."
     title = "Identified from scratch, against the truth"
-    return table_of(title, of, columns, share_sentence(runs) + note)
+    return TitledTable(title, rows, share_sentence(runs) + note)

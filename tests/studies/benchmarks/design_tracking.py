@@ -1,14 +1,13 @@
 """Designed inputs measured: tracking, wrong parameters, quickest moves, time to design."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import expm
 from scipy.optimize import least_squares, linprog
 
+import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.design.tracking.inversion import correct, invert
 from psa_casadi.design.tracking.minimum_time import INTERVALS, QuickMove, quickest_move
@@ -20,15 +19,9 @@ from psa_casadi.design.tracking.targets import (
     uncompensated,
 )
 from psa_casadi.design.tracking.tracking import track
-from psa_casadi.effects import EFFECTS
-from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.start import linear_part
-from tests.studies.benchmarks.table import Progress, TitledTable
-
-FloatArray = npt.NDArray[np.float64]
+from tests.studies.benchmarks.table import FloatArray, Progress, TitledTable
 
 _RATIOS = (1.0, 10.0, 100.0)
 
@@ -122,74 +115,59 @@ ARCS = 6
 _SAMPLES, _TAIL, _EVALUATIONS, _SOLVED = 200, (0.02, 0.002), 200, 1e-6
 
 
-@dataclass(frozen=True)
-class BangBang:
-    """A move between the `limits` [V] from a rest in `initial` states, of which x has crept."""
+def own_bang_bang(model: psa.Model, found: QuickMove) -> float | None:
+    """Return the length [s] of the stack's own bang-bang move that a design leads to.
 
-    values: Mapping[str, float]
-    initial: Mapping[str, float]
-    begin: float
-    end: float
-    limits: tuple[float, float]
-    upward: bool
+    Between the limits, from the rest in which the design begins, of which x has crept; the search
+    starts from the arcs of the design's voltage. None if it does not settle.
+    """
+    first = dict(zip(model.state_names, found.response.states[0].tolist(), strict=True))
+    initial = {n: first[n] for n in ("u", "f_H", "f_out", "y", "v_y", "x", "v_x")}
+    limits = (found.limits.min_voltage, found.limits.max_voltage)
+    played, length = found.response.voltage[2 : 2 + INTERVALS], found.move_time
+    span, upward = limits[1] - limits[0], found.end > found.begin
+    shares = _arcs(played, limits)
 
-    def shortest(self, voltage: FloatArray, length: float) -> float | None:
-        """Return the length [s] of the move; None if the search does not settle.
-
-        It starts from the arcs of a `voltage` [V] on equal intervals of a designed move.
-        """
-        arcs = _arcs(voltage, self.limits, length)
-        scale = np.append(np.maximum(arcs / length, 0.01), 0.5)
-        start = np.append(arcs / length, voltage[-1] / self._span)
-        low = np.append(np.zeros(ARCS), self.limits[0] / self._span)
-        high = np.append(np.full(ARCS, np.inf), self.limits[1] / self._span)
-
-        def miss(q: FloatArray) -> FloatArray:
-            return self._miss(q[:-1] * length, float(q[-1]) * self._span)
-
-        found = least_squares(
-            miss, start, bounds=(low, high), x_scale=scale, diff_step=[1e-5],
-            xtol=1e-12, ftol=1e-12, max_nfev=_EVALUATIONS,
-        )  # fmt: skip
-        solved = float(np.max(np.abs(found.fun))) < 100.0 * _SOLVED
-        return float(np.sum(found.x[:-1]) * length) if solved else None
-
-    @property
-    def _span(self) -> float:
-        return self.limits[1] - self.limits[0]
-
-    def _miss(self, arcs: FloatArray, held: float) -> FloatArray:
-        """Return the distances from rest at the end (7,), in percent of the move."""
-        p, move = self.values, abs(self.end - self.begin)
-        ends = np.cumsum(np.maximum(arcs, 1e-12))
+    def miss(q: FloatArray) -> FloatArray:
+        """Return the distances from rest at the end (8,), in percent of the move."""
+        p, move, held = model.values, abs(found.end - found.begin), float(q[-1]) * span
+        ends = np.cumsum(np.maximum(q[:-1] * length, 1e-12))
         time = np.unique(np.concatenate([[0.0], ends, np.linspace(0.0, ends[-1], _SAMPLES)]))
 
         def voltage(t: float) -> float:
             arc = min(int(np.searchsorted(ends, t, side="right")), ARCS - 1)
-            return self.limits[int((arc % 2 == 0) == self.upward)]
+            return limits[int((arc % 2 == 0) == upward)]
 
-        found = reference.simulate(
-            p, voltage, time, initial=self.initial, breakpoints=ends[:-1].tolist(), rtol=1e-9
+        run = reference.simulate(
+            p, voltage, time, initial=initial, breakpoints=ends[:-1].tolist(), rtol=1e-9
         )
-        s = {n: float(v[-1]) for n, v in found.states.items()}
-        shown = float(crept(p, time, found.displacement)[-1])
-        force = p["k_L"] * p["G"] * held + s["f_H"]
-        y, x = force / p["k_P"], force * (1.0 / p["k_P"] + 1.0 / p["k_B"])
+        s = {n: float(v[-1]) for n, v in run.states.items()}
+        shown = float(crept(p, time, run.displacement)[-1])
+        force, c = p["k_L"] * p["G"] * held + s["f_H"], 1.0 / p["k_P"] + 1.0 / p["k_B"]
         w_p, w_b = np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])
-        positions = [s["y"] - y, s["x"] - x, shown - self.end, s["v_y"] / w_p, s["v_x"] / w_b]
-        electric = (s["u"] - p["G"] * held) / self._span
-        mechanic = (s["f_out"] - force) * (1.0 / p["k_P"] + 1.0 / p["k_B"]) / move
-        return 100.0 * np.array([electric, mechanic, *(d / move for d in positions)])
+        far = [(s["f_out"] - force) * c, s["y"] - force / p["k_P"], s["x"] - force * c,
+               shown - found.end, s["v_y"] / w_p, s["v_x"] / w_b]  # fmt: skip
+        return 100.0 * np.array([(s["u"] - p["G"] * held) / span, *(d / move for d in far)])
+
+    solved = least_squares(
+        miss, np.append(shares, played[-1] / span),
+        bounds=(np.append(np.zeros(ARCS), limits[0] / span),
+                np.append(np.full(ARCS, np.inf), limits[1] / span)),
+        x_scale=np.append(np.maximum(shares, 0.01), 0.5), diff_step=[1e-5],
+        xtol=1e-12, ftol=1e-12, max_nfev=_EVALUATIONS,
+    )  # fmt: skip
+    settled = float(np.max(np.abs(solved.fun))) < 100.0 * _SOLVED
+    return float(np.sum(solved.x[:-1]) * length) if settled else None
 
 
-def _arcs(voltage: FloatArray, limits: tuple[float, float], length: float) -> FloatArray:
-    """Return the lengths [s] of the first four arcs of a designed voltage, and two short ones."""
+def _arcs(voltage: FloatArray, limits: tuple[float, float]) -> FloatArray:
+    """Return the shares of the first four arcs of a designed voltage, and two short ones."""
     high = voltage > 0.5 * sum(limits)
     switches = np.flatnonzero(np.diff(high.astype(int))) + 1
     edges = np.concatenate([[0], switches, [high.size]]) / high.size
     seen = np.diff(edges)[: ARCS - len(_TAIL)]
     rest = np.full(ARCS - len(_TAIL) - len(seen), _TAIL[0])
-    return length * np.concatenate([seen, rest, _TAIL])
+    return np.concatenate([seen, rest, _TAIL])
 
 
 #: The stack carries a payload [kg], so that it rings at 1.6 kHz, and a loop 10 % of the stroke.
@@ -202,15 +180,15 @@ _SEED = 7
 LIMITS = AmplifierLimits(min_voltage=-20.0, max_voltage=120.0)
 
 
-def scanner(payload: float = PAYLOAD) -> Model:
+def scanner(payload: float = PAYLOAD) -> psa.Model:
     """Return the P-885.51 with a payload, creep, and a hysteresis loop 10 % of the stroke wide."""
     creep = {"creep_gain": 0.02, "creep_time": 0.01}
-    model = stack_model("P-885.51").with_effect(EFFECTS["slow_creep"], creep).plant()
+    model = psa.stack_model("P-885.51").with_effect(psa.EFFECTS["slow_creep"], creep).plant()
     loop = {name: LOOP * model.values[name] for name in ("A", "beta", "gamma")}
     return model.with_values({**loop, **({"m_B": payload} if payload else {})})
 
 
-def scan(model: Model, samples: int) -> Target:
+def scan(model: psa.Model, samples: int) -> Target:
     """Return a raster scan at a twentieth of the first resonance, 250 samples a line."""
     poles = np.linalg.eigvals(linear_part(model).a)
     ringing = np.abs(poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)])
@@ -253,22 +231,21 @@ def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
     )
 
 
-def _errors(model: Model, target: Target, voltage: FloatArray) -> TitledTable:
+def _errors(model: psa.Model, target: Target, voltage: FloatArray) -> TitledTable:
     plain, inverse = uncompensated(model, target).voltage, invert(model, target).response.voltage
-    named = {"uncompensated": plain, "inversion": inverse, "designed": voltage}
     rows = []
-    for name, played in named.items():
-        error = judged(model.values, target, played)
-        rows.append((name, number(error.rms_percent), number(error.largest_percent)))
+    for name, v in {"uncompensated": plain, "inversion": inverse, "designed": voltage}.items():
+        error = judged(model.values, target, v)
+        rows.append({"voltage": name, "error, rms [% of range]": number(error.rms_percent),
+                     "largest [%]": number(error.largest_percent)})  # fmt: skip
     note = (
         f"{len(target.time)} samples at 1/20 of the first resonance (1.6 kHz), hysteresis 10 % of"
         " the stroke, creep on; displacement of the independent reference. Target: 0.1 % rms."
     )
-    head = ("voltage", "error, rms [% of range]", "largest [%]")
-    return TitledTable("Raster scan on the independent reference", Table(head, tuple(rows)), note)
+    return TitledTable("Raster scan on the independent reference", rows, note)
 
 
-def wrong_values(model: Model, generator: np.random.Generator) -> dict[str, float]:
+def wrong_values(model: psa.Model, generator: np.random.Generator) -> dict[str, float]:
     """Return the values with every parameter off by 5 %, up or down at random."""
     changed = {
         name: value * (1.0 + WRONG * generator.choice([-1.0, 1.0]))
@@ -279,47 +256,42 @@ def wrong_values(model: Model, generator: np.random.Generator) -> dict[str, floa
 
 
 def after_trials(
-    model: Model, values: Mapping[str, float], target: Target, voltage: FloatArray, trials: int = 2
-) -> tuple[float, float, list[float]]:
-    """Return the errors [% rms] as designed, with the range calibrated, and after trials.
+    model: psa.Model, values: Mapping[str, float], target: Target, voltage: FloatArray
+) -> list[float]:
+    """Return the errors [% rms] as designed, with the range calibrated, and after two trials.
 
     The plant is the reference with `values`; the model knows its own values only.
     """
     shown = creeping_displacement(values, target.time, voltage)
-    raw = error_of(target, shown).rms_percent
     gain = target.span / float(np.ptp(shown))
-    calibrated = judged(values, target, gain * voltage).rms_percent
-    found = []
-    for _ in range(trials):
+    found = [error_of(target, shown), judged(values, target, gain * voltage)]
+    for _ in range(2):
         voltage = correct(model, target, voltage, shown)
         shown = creeping_displacement(values, target.time, voltage)
-        found.append(error_of(target, shown).rms_percent)
-    return raw, calibrated, found
+        found.append(error_of(target, shown))
+    return [e.rms_percent for e in found]
 
 
 def _wrong(
-    model: Model, target: Target, voltage: FloatArray, draws: int, progress: Progress
+    model: psa.Model, target: Target, voltage: FloatArray, draws: int, progress: Progress
 ) -> TitledTable:
     generator, short = np.random.default_rng(_SEED), len(target.time) // 4
     part = Target(target.time[:short], target.displacement[:short])
     found = []
     for draw in range(draws):
         progress(f"parameters off by 5 %: draw {draw + 1} of {draws}")
-        values = wrong_values(model, generator)
-        raw, calibrated, trials = after_trials(model, values, part, voltage[:short])
-        found.append([raw, calibrated, *trials])
-    worst, middle = np.max(found, axis=0), np.median(found, axis=0)
+        found.append(after_trials(model, wrong_values(model, generator), part, voltage[:short]))
     names = ("as designed", "scaled by one measured range", "after one trial", "after two trials")
-    rows = tuple(
-        (n, number(float(m)), number(float(w)))
-        for n, m, w in zip(names, middle, worst, strict=True)
-    )
+    rows = [
+        {"voltage": n, "error, median [% rms]": number(float(np.median(e))),
+         "worst [% rms]": number(max(e))}
+        for n, e in zip(names, zip(*found, strict=True), strict=True)
+    ]  # fmt: skip
     note = (
         f"{draws} draws of random signs, all parameters off by 5 %, the gain by up to 10 %: no"
         " voltage that is played blind is right then. A trial is one measured run of the scan."
     )
-    head = ("voltage", "error, median [% rms]", "worst [% rms]")
-    return TitledTable("Every parameter off by 5 %", Table(head, rows), note)
+    return TitledTable("Every parameter off by 5 %", rows, note)
 
 
 def _moves(progress: Progress, quick: bool) -> TitledTable:
@@ -330,12 +302,14 @@ def _moves(progress: Progress, quick: bool) -> TitledTable:
             progress(f"quickest move, {payload:g} kg")
             found = quickest_move(model, begin, end, LIMITS)
             bound = bang_bang_bound(model.values, begin, end, -20.0, 120.0)
+            row = {"payload [kg]": f"{payload:g}", "move [um]": f"{1e6 * begin:g} to {1e6 * end:g}",
+                   "time [us]": number(1e6 * found.move_time)}  # fmt: skip
             own = own_bang_bang(model, found)
-            times = [1e6 * found.move_time, 1e6 * bound, 100.0 * (found.move_time / bound - 1.0)]
-            over = [] if own is None else [1e6 * own, 100.0 * (found.move_time / own - 1.0)]
-            cells = [*map(number, times), *(map(number, over) if over else ["none found"] * 2)]
-            name = f"{1e6 * begin:g} to {1e6 * end:g}"
-            rows.append((f"{payload:g}", name, *cells, number(100.0 * found.residual, 2)))
+            for least, name, over in ((bound, "bang-bang bound [us]", "over it [%]"),
+                                      (own, "own bang-bang [us]", "over that [%]")):  # fmt: skip
+                row[name] = "none found" if least is None else number(1e6 * least)
+                row[over] = "" if least is None else number(100 * (found.move_time / least - 1))
+            rows.append(row | {"residual vibration [%]": number(100.0 * found.residual, 2)})
     note = (
         "-20 V to 120 V. The bound is that of the linear part, which knows neither hysteresis nor"
         " creep. The hysteresis takes part of the voltage of a move, and more of it downward, where"
@@ -343,21 +317,4 @@ def _moves(progress: Progress, quick: bool) -> TitledTable:
         " limits, is solved on the independent reference with hysteresis and creep. Targets: 10 %"
         " over the bound, 0.1 % of residual vibration."
     )
-    head = (
-        "payload [kg]", "move [um]", "time [us]", "bang-bang bound [us]", "over it [%]",
-        "own bang-bang [us]", "over that [%]", "residual vibration [%]",
-    )  # fmt: skip
-    return TitledTable("Quickest moves", Table(head, tuple(rows)), note)
-
-
-def own_bang_bang(model: Model, found: QuickMove) -> float | None:
-    """Return the length [s] of the stack's own bang-bang move that a design leads to."""
-    first = dict(zip(model.state_names, found.response.states[0].tolist(), strict=True))
-    chain = ("u", "f_H", "f_out", "y", "v_y", "x", "v_x")
-    low, high = found.limits.min_voltage, found.limits.max_voltage
-    own = BangBang(
-        model.values, {n: first[n] for n in chain}, found.begin, found.end, (low, high),
-        found.end > found.begin,
-    )  # fmt: skip
-    played = found.response.voltage[2 : 2 + INTERVALS]
-    return own.shortest(played, found.move_time)
+    return TitledTable("Quickest moves", rows, note)

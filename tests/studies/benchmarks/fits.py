@@ -1,8 +1,9 @@
 """What exact steps are worth to fits, beside the stepper in the same run.
 
 One simulation of the demonstration's record with twelve derivatives is what a fit is made of; both
-ways make it at falling tolerances and are held against the stepper at 1e-11. Times are the least
-processor time of one thread over several repeats, in which both ways take turns.
+ways make it at falling tolerances and are held against the stepper at 1e-11. Then the ways and
+errors of all effects in `simulate`, lanes, and whole fits and diagnoses. Times are the least
+processor time over several repeats, in which both ways take turns.
 """
 
 import time
@@ -10,80 +11,46 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
-from math import inf
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from psa_casadi.errors import PsaError
+import psa_casadi as psa
+from psa_casadi.identification.fitting.fit import FIT_RTOL
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.model.compose import Model
-from psa_casadi.records import Record, read_record
-from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.tables import Table
-from psa_casadi.simulation.exact.run import LANES, run_exact, run_sets
-from psa_casadi.simulation.many import simulate_many
-from psa_casadi.simulation.simulate import EXACT, STEPPER, record_inputs
+from psa_casadi.records import concatenate, decaying_triangle, steps, time_grid, triangle
+from psa_casadi.report.words.phrases import number, plain
+from psa_casadi.simulation import simulate as simulate_module
+from psa_casadi.simulation.exact.run import LANES, NotExact, run_exact, run_sets
+from psa_casadi.simulation.side_by_side import side_by_side
+from psa_casadi.simulation.simulate import EXACT, STEP_SHARE, STEPPER, Way, input_samples, trace
 from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.stepper import run as run_stepper
-from tests.studies.benchmarks.fits_ways import diagnosis_table, ways_tables
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled, table_of
-
-_STYLES = (("#0072b2", "o"), ("#d55e00", "s"))
-
-
-def picture(points: Sequence["Point"]) -> Figure:
-    """Return time per sample over largest error, with sensitivities (solid) and without."""
-    figure = Figure(figsize=(8.4, 5.2), layout="constrained")
-    axes = figure.subplots()
-    ways = list(dict.fromkeys(p.way for p in points))
-    kinds = {
-        "differentiated": ("-", f"{len(FREE)} sensitivities"),
-        "plain": ("--", "no sensitivities"),
-    }
-    for way, (colour, marker) in zip(ways, _STYLES, strict=False):
-        mine = [p for p in points if p.way == way]
-        for of, (style, what) in kinds.items():
-            axes.loglog(
-                [p.largest for p in mine], [getattr(p, of) for p in mine], style, color=colour,
-                marker=marker, markersize=5.5, linewidth=1.5, label=f"{way}, {what}",
-                markerfacecolor=colour if of == "differentiated" else "white",
-            )  # fmt: skip
-    error, took = "largest error of the displacement / its range", "processor time per sample [µs]"
-    styled(axes, error, took, "One simulation of the demonstration's record, as in a fit")
-    low, high = axes.get_ylim()
-    ticks = [m * 10.0**k for k in range(-3, 5) for m in (1, 2, 5)]
-    axes.set_yticks([y for y in ticks if low <= y <= high])
-    axes.yaxis.set_major_formatter("{x:g}")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_minor_formatter(NullFormatter())
-    figure.legend(fontsize=9.5, loc="outside lower center", ncols=2, frameon=False)
-    return figure
-
-
-FloatArray = npt.NDArray[np.float64]
+from tests.model.stack_models import at_ordinary_size
+from tests.studies.benchmarks import table
+from tests.studies.benchmarks.records import hidden_record, noisy, played_again
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, share
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P", "m_B")
 #: Tolerances of a step. Looser ones run exact steps at 1e-5 (`ways.LOOSEST`), so none is below.
-EXACT_TOLERANCES = tuple(10.0 ** (-k / 2) for k in range(10, 17))
-STEPPER_TOLERANCES = tuple(10.0 ** (-k / 2) for k in range(8, 19))
+TOLERANCES = {
+    EXACT: tuple(10.0 ** (-k / 2) for k in range(10, 17)),
+    STEPPER: tuple(10.0 ** (-k / 2) for k in range(8, 19)),
+}
 #: Error over the range at which the two ways are compared.
 WANTED = 1e-5
-_TRUTH = 1e-11
-_OUTPUT = "measured_displacement"
+_TRUTH, _OUTPUT = 1e-11, "measured_displacement"
 
 
-@dataclass(frozen=True)
-class Point:
-    """One way at one tolerance: errors over the range, least times per sample [us], steps."""
+class Point(NamedTuple):
+    """One way at one tolerance: error over the range, least times per sample [us], steps."""
 
     way: str
     tolerance: float
-    largest: float
-    rms: float
+    error: float
     differentiated: float
     plain: float
     steps: float
@@ -93,8 +60,8 @@ class Point:
 class Task:
     """A record with the model that a fit of it starts from."""
 
-    record: Record
-    model: Model
+    record: psa.Record
+    model: psa.Model
 
     @property
     def time(self) -> FloatArray:
@@ -104,9 +71,9 @@ class Task:
     @property
     def inputs(self) -> FloatArray:
         """Samples of the model's inputs (n, nu)."""
-        return record_inputs(self.model, self.record, self.record.n)
+        return simulate_module.record_inputs(self.model, self.record, self.record.n)
 
-    def start(self, model: Model) -> tuple[FloatArray, FloatArray]:
+    def start(self, model: psa.Model) -> tuple[FloatArray, FloatArray]:
         """Return the initial state (nx,) and its derivatives by the unknowns (nx, k)."""
         found = start_on(model, self.time, self.inputs)
         return found.x, found.by_parameter[:, [model.parameter_names.index(n) for n in FREE]]
@@ -114,96 +81,90 @@ class Task:
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Measure one run, lanes, the ways of all effects, and whole fits and diagnoses."""
-    task = demonstration()
-    repeats = 3 if quick else 15
+    task, repeats = demonstration(), 3 if quick else 15
     points = measured(task, repeats, progress)
     tables = (
         run_table(points, task.record.n),
         _lanes(task, cheapest(points, EXACT, "plain").tolerance, repeats, progress),
-        *ways_tables(progress, quick),
+        *ways_tables(_tried(progress, quick)),
         diagnosis_table(task.record, progress, quick),
     )
     return Outcome(tables, partial(picture, points))
 
 
+def picture(points: Sequence[Point]) -> Figure:
+    """Return time per sample over largest error, with sensitivities (solid) and without."""
+    figure = Figure(figsize=(8.4, 5.2), layout="constrained")
+    axes = figure.subplots()
+    looks = {EXACT: ("#0072b2", "o"), STEPPER: ("#d55e00", "s")}
+    kinds = {"differentiated": ("-", f"{len(FREE)} sensitivities"), "plain": ("--", "none")}
+    for (way, (colour, marker)), (of, (style, what)) in product(looks.items(), kinds.items()):
+        mine = [p for p in points if p.way == way]
+        axes.loglog(
+            [p.error for p in mine], [getattr(p, of) for p in mine], style, color=colour,
+            marker=marker, markersize=5.5, linewidth=1.5, label=f"{way}, {what}",
+            markerfacecolor=colour if of == "differentiated" else "white",
+        )  # fmt: skip
+    error, took = "largest error of the displacement / its range", "processor time per sample [µs]"
+    table.styled(axes, error, took, "One simulation of the demonstration's record, as in a fit")
+    low, high = axes.get_ylim()
+    axes.set_yticks(
+        [y for k in range(-3, 5) for m in (1, 2, 5) if low <= (y := m * 10.0**k) <= high]
+    )
+    axes.yaxis.set_major_formatter("{x:g}")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())
+    figure.legend(fontsize=9.5, loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
 def demonstration() -> Task:
     """Return the demonstration's record and the stack of its size."""
     with resources.as_file(resources.files("psa_casadi").joinpath("data", "demo.csv")) as path:
-        record = read_record(path)
+        record = psa.read_record(path)
     return Task(record, starting_model([record]))
 
 
 def measured(task: Task, repeats: int, progress: Progress) -> list[Point]:
     """Return both ways at all tolerances; errors are those against the stepper at 1e-11."""
-    model, t, u = task.model, task.time, task.inputs
-    x0, s0 = task.start(model)
-    progress("one run: reference")
-    truth = run_stepper(model, t, u, x0, rtol=_TRUTH).y[:, model.output_names.index(_OUTPUT)]
     progress("one run: both ways at all tolerances")
-    ways = [(EXACT, r) for r in EXACT_TOLERANCES] + [(STEPPER, r) for r in STEPPER_TOLERANCES]
-    works = [
-        partial(_work, task, way, tolerance, x0, given)
-        for way, tolerance in ways
-        for given in (s0, None)
-    ]
-    least = least_times(works, repeats)
+    x0, s0 = task.start(task.model)
+    truth = _run(task, STEPPER, _TRUTH, x0, None)[0]
+    ways = [(way, rtol) for way, rtols in TOLERANCES.items() for rtol in rtols]
+    works = [partial(_run, task, *way, x0, given) for way in ways for given in (s0, None)]
+    shown = [work() for work in works]  # compiles and loads what the first use needs
+    times = [1e6 * s / task.record.n for _, s in table.least_times(works, repeats)]
     points = []
-    for k, (way, tolerance) in enumerate(ways):
-        shown, steps = works[2 * k + 1]()
-        error = (shown - truth) / np.ptp(truth)
-        with_, without = (1e6 * s / len(t) for s in least[2 * k : 2 * k + 2])
-        largest, rms = float(np.max(np.abs(error))), float(np.sqrt(np.mean(error**2)))
-        points.append(Point(way, tolerance, largest, rms, with_, without, steps / len(t)))
+    for k, (way, rtol) in enumerate(ways):
+        x, taken = shown[2 * k + 1]
+        with_, without = times[2 * k : 2 * k + 2]
+        points.append(Point(way, rtol, _error(x, truth), with_, without, taken / task.record.n))
     return points
 
 
-def _work(
+def _run(
     task: Task, way: str, tolerance: float, x0: FloatArray, s0: FloatArray | None
 ) -> tuple[FloatArray, int]:
     """Return the displacement (n,) and the steps of one run, with derivatives where `s0` is."""
     model, t, u = task.model, task.time, task.inputs
-    unknowns = () if s0 is None else FREE
+    how: Any = {"unknowns": () if s0 is None else FREE, "s0": s0, "outputs": (_OUTPUT,)}
     if way == EXACT:
-        found = run_exact(
-            model, t, u, x0, tolerance=tolerance, unknowns=unknowns, s0=s0, outputs=(_OUTPUT,)
-        )
-        return found.shown[:, 0], found.steps
-    steps = run_stepper(
-        model, t, u, x0, rtol=tolerance, unknowns=unknowns, s0=s0, outputs=(_OUTPUT,)
-    )
-    return steps.y[:, model.output_names.index(_OUTPUT)], steps.steps
+        exact = run_exact(model, t, u, x0, tolerance=tolerance, **how)
+        return exact.shown[:, 0], exact.steps
+    found = psa.run(model, t, u, x0, rtol=tolerance, **how)
+    return found.y[:, model.output_names.index(_OUTPUT)], found.steps
 
 
-def least_times(works: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Return the least processor time of this thread [s] for each, taken in turns."""
-    for work in works:
-        work()  # compiles and loads what the first use needs
-    least = [inf] * len(works)
-    for _ in range(repeats):
-        for k, work in enumerate(works):
-            begin = time.thread_time()
-            work()
-            least[k] = min(least[k], time.thread_time() - begin)
-    return least
+def _error(x: FloatArray, truth: FloatArray) -> float:
+    return float(np.max(np.abs(x - truth)) / np.ptp(truth))
 
 
 def cheapest(points: Sequence[Point], way: str, of: str, error: float = WANTED) -> Point:
     """Return the run of a way that takes least ("differentiated" or "plain") below an error."""
-    fine = [p for p in points if p.way == way and p.largest < error]
+    fine = [p for p in points if p.way == way and p.error < error]
     if not fine:
-        raise PsaError(f"No tolerance brings the {way} below {error:g} of the range.")
+        raise psa.PsaError(f"No tolerance brings the {way} below {error:g} of the range.")
     return min(fine, key=lambda p: float(getattr(p, of)))
-
-
-def time_at(points: Sequence[Point], way: str, of: str, error: float = WANTED) -> float:
-    """Return the time [us] of a way at an error, between two tolerances linear in the logarithms.
-
-    nan where the error lies beyond the tolerances.
-    """
-    mine = sorted((p for p in points if p.way == way), key=lambda p: p.largest)
-    errors = np.log([p.largest for p in mine])
-    times = np.log([float(getattr(p, of)) for p in mine])
-    return float(np.exp(np.interp(np.log(error), errors, times, left=np.nan, right=np.nan)))
 
 
 def run_table(points: Sequence[Point], samples: int) -> TitledTable:
@@ -211,31 +172,22 @@ def run_table(points: Sequence[Point], samples: int) -> TitledTable:
     said = []
     for of, words in (("differentiated", f"with {len(FREE)} sensitivities"), ("plain", "without")):
         ours, theirs = (cheapest(points, way, of) for way in (EXACT, STEPPER))
-        ratio = getattr(theirs, of) / getattr(ours, of)
-        between = time_at(points, STEPPER, of) / time_at(points, EXACT, of)
-        at_wanted = f"read off between tolerances at {WANTED:.0e} itself: 1/{number(between, 2)}"
-        said.append(
-            f"{words} 1/{number(ratio, 2)} of the stepper's time (tolerances {ours.tolerance:.0e}"
-            f" and {theirs.tolerance:.0e}, errors {number(ours.largest, 2)} and"
-            f" {number(theirs.largest, 2)}{f'; {at_wanted}' if np.isfinite(between) else ''})"
-        )
-    return table_of(
+        ratio = number(getattr(theirs, of) / getattr(ours, of), 2)
+        said.append(f"{words} 1/{ratio} of the stepper's time (tolerances {ours.tolerance:.0e} and"
+                    f" {theirs.tolerance:.0e})")  # fmt: skip
+    rows = [
+        {"way": p.way, "tolerance of a step": f"{p.tolerance:.0e}",
+         "largest error / range": number(p.error, 2),
+         f"us per sample, {len(FREE)} sensitivities": number(p.differentiated),
+         "us per sample, none": number(p.plain), "steps per sample": number(p.steps)}
+        for p in points
+    ]  # fmt: skip
+    return TitledTable(
         f"One run of the demonstration's record ({samples} samples)",
-        points,
-        {
-            "way": lambda p: p.way,
-            "tolerance of a step": lambda p: f"{p.tolerance:.0e}",
-            "largest error / range": lambda p: number(p.largest, 2),
-            "rms error / range": lambda p: number(p.rms, 2),
-            f"us per sample, {len(FREE)} sensitivities": lambda p: number(p.differentiated),
-            "us per sample, none": lambda p: number(p.plain),
-            "steps per sample": lambda p: number(p.steps),
-        },
+        rows,
         f"At errors below {WANTED:.0e} of the range the exact way takes {'; '.join(said)}: of each"
-        " way the cheapest tolerance counts. Exact steps asked for at tolerances above 1e-5 run at"
-        f" 1e-5. Errors are against the stepper at {_TRUTH:.0e}; times are the least of the"
-        " repeats and carry over to other machines as ratios only. The stepper is of second"
-        " order at tolerances of 5e-6 and above, of fourth below: its steps are not all alike.",
+        f" way the cheapest tolerance counts. Errors are against the stepper at {_TRUTH:.0e}; times"
+        " are the least of the repeats and carry over to other machines as ratios only.",
     )
 
 
@@ -248,43 +200,256 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
         for _ in range(LANES)
     ]
     models = [task.model.with_values(s) for s in sets]
-    t, u = task.time, task.inputs
     starts = [task.start(m)[0] for m in models]
     p, nominal = (
         np.array([getattr(m, of)() for m in models]).T
         for of in ("parameter_vector", "state_nominals")
     )
-    how: Any = {"tolerance": tolerance}
-
-    def together() -> FloatArray:
-        x0 = np.array(starts).T
-        return run_sets(
-            task.model.structure, t, u, p=p, x0=x0, nominal=nominal, output=_OUTPUT, **how
-        )
-
-    def by_itself(k: int) -> FloatArray:
-        return run_exact(models[k], t, u, starts[k], outputs=(_OUTPUT,), **how).shown[:, 0]
-
-    singles = [partial(by_itself, k) for k in range(LANES)]
-    if not np.array_equal(together().T, np.array([one() for one in singles])):
-        raise PsaError("A set has other bits in a lane than by itself.")
-    many = simulate_many(task.model, sets, task.record, rtol=tolerance)
-    if not np.array_equal(many.T, together()):
-        raise PsaError("simulate_many has other bits than its lanes.")
-    side, *alone = least_times([together, *singles], repeats)
-    return lanes_table(side / LANES / len(t), sum(alone) / LANES / len(t), tolerance)
-
-
-def lanes_table(side: float, alone: float, tolerance: float) -> TitledTable:
-    """Return the seconds of a sample and set side by side in one core, and one set by itself."""
-    rows = tuple(
-        (name, number(1e9 * seconds), number(alone / seconds, 2))
-        for name, seconds in (("one set by itself", alone), (f"{LANES} sets in lanes", side))
+    given, how = (task.time, task.inputs), dict[str, Any](tolerance=tolerance)
+    together = partial(
+        run_sets,
+        task.model.structure,
+        *given,
+        p=p,
+        x0=np.array(starts).T,
+        nominal=nominal,
+        output=_OUTPUT,
+        **how,
     )
+    single = partial(run_exact, outputs=(_OUTPUT,), **how)
+    singles = [partial(single, m, *given, x) for m, x in zip(models, starts, strict=True)]
+    many = psa.simulate_many(task.model, sets, task.record, rtol=tolerance)
+    for others in (np.array([one().shown[:, 0] for one in singles]), many):
+        if not np.array_equal(together().T, others):
+            raise psa.PsaError("A set has other bits in a lane than by itself.")
+    side, *alone = (
+        s / LANES / task.record.n for _, s in table.least_times([together, *singles], repeats)
+    )
+    rows = [
+        {"how": name, "ns per sample and set": number(1e9 * seconds),
+         "sets per time, over one by itself": number(sum(alone) / seconds, 2)}
+        for name, seconds in (("one set by itself", sum(alone)), (f"{LANES} sets in lanes", side))
+    ]  # fmt: skip
     return TitledTable(
         "Many sets of parameters on one core",
-        Table(("how", "ns per sample and set", "sets per time, over one by itself"), rows),
+        rows,
         f"At a tolerance of {tolerance:.0e}, without sensitivities; mean over {LANES} sets. The"
         " displacement of every set has the same bits in a lane, by itself and from"
         " `simulate_many`, which this run checked.",
     )
+
+
+BASE_NAME = "base"
+#: Corners (share of the record, share of the rated voltage) of the records with kinks.
+KINKED: dict[str, tuple[tuple[float, float], ...]] = {
+    "triangles": tuple((k / 8.0 + 0.0003 * (0 < k < 8), 0.8 * (k % 2)) for k in range(9)),
+    "steps": (
+        (0.0, 0.0), (0.1, 0.0), (0.1, 0.7), (0.4, 0.7), (0.4, 0.2), (0.7, 0.2), (0.7, 0.9), (1, 0.9)
+    ),
+    "ramps and holds": ((0, 0), (0.1, 0), (0.3, 0.8), (0.5, 0.8), (0.6, 0.3), (0.8, 0.3), (1, 0)),
+}  # fmt: skip
+MIXED = "sine, ramp, hold, step"
+_SAMPLES, _RTOLS = 1500, (1e-4, 1e-5, 1e-6)
+
+
+class Trial(NamedTuple):
+    """A stack with one effect or none, on a record of 1500 samples at one sample time [s]."""
+
+    stack: str
+    effect: str
+    record: str
+    sample_time: float
+
+
+class Reached(NamedTuple):
+    """The way of a trial at one tolerance, and its error over the range.
+
+    `fit` is the way of a run as a fit makes it, whose steps have one tolerance at all of these.
+    """
+
+    trial: Trial
+    rtol: float
+    way: str
+    error: float
+    fit: str
+
+
+def _tried(progress: Progress, quick: bool) -> list[Reached]:
+    found: list[Reached] = []
+    hows = [(MIXED, 1e-3)] if quick else product((*KINKED, MIXED), (2e-5, 1e-3))
+    trials = list(product((BASE_NAME, *psa.EFFECTS), hows))
+    for stack in list(psa.STACKS)[: 1 if quick else None]:
+        progress(f"errors over tolerance: {stack}")
+        for reached in side_by_side(tried, [Trial(stack, n, *how) for n, how in trials]):
+            found += reached
+    return found
+
+
+def voltage(record: str, top: float, sample_time: float) -> tuple[FloatArray, FloatArray]:
+    """Return times and voltages of a record up to 0.8 or 0.9 of the rated voltage."""
+    s, t = np.linspace(0.0, 1.0, _SAMPLES), sample_time * np.arange(_SAMPLES, dtype=np.float64)
+    if record == MIXED:
+        v = 0.4 * (1.0 - np.cos(2.0 * np.pi * 10.0 * s))
+        v = np.where(s < 0.4, v, np.interp(s, (0.4, 0.6, 0.8), (0.0, 0.7, 0.7)))
+        return t, np.asarray(top * np.where(s < 0.8, v, 0.3))
+    corners = np.array(KINKED[record])
+    return t, np.asarray(top * np.interp(s, corners[:, 0], corners[:, 1]))
+
+
+def with_one_effect(stack: str, effect: str) -> psa.Model:
+    """Return a stack with an effect at its ordinary size."""
+    model = psa.stack_model(stack)
+    return model if effect == BASE_NAME else at_ordinary_size(model, psa.EFFECTS[effect])
+
+
+def tried(trial: Trial) -> list[Reached]:
+    """Return what a trial reaches at each tolerance; nothing where the truth cannot be had."""
+    model = with_one_effect(trial.stack, trial.effect)
+    t, v = voltage(trial.record, model.values["u_rated"], trial.sample_time)
+    given = {"voltage": v}
+    if "temperature" in model.input_names:
+        given["temperature"] = 293.15 + 2.0 * np.sin(3.0 * t / t[-1])
+    u = input_samples(model, len(t), given)
+    x0, warm = start_on(model, t, u).x, given.get("temperature")
+    try:
+        truth = psa.run(model, t, u, x0, rtol=_TRUTH).y[:, model.output_names.index(_OUTPUT)]
+    except psa.PsaError:
+        return []
+    fit = trace(model, t, u, x0, way=Way(FIT_RTOL, FIT_RTOL), outputs=(_OUTPUT,)).way
+    runs = [(rtol, psa.simulate(model, t, v, temperature=warm, rtol=rtol)) for rtol in _RTOLS]
+    return [Reached(trial, rtol, r.way, _error(r.displacement, truth), fit) for rtol, r in runs]
+
+
+def ways_tables(found: Sequence[Reached]) -> list[TitledTable]:
+    """Return the ways of the base and of each effect beside it, and errors over the tolerance."""
+    ways, errors = [], []
+    for name in dict.fromkeys(r.trial.effect for r in found):
+        own = [r for r in found if r.trial.effect == name]
+        row = {"effect": plain(name), "in a fit": ", ".join({r.fit: 0 for r in own})}
+        for rtol in dict.fromkeys(r.rtol for r in own):
+            exact = [r.way == EXACT for r in own if r.rtol == rtol]
+            row[f"exact at {rtol:.0e}"] = f"{sum(exact)} of {len(exact)}"
+        ways.append(row)
+    for rtol in sorted({r.rtol for r in found}, reverse=True):
+        own = [r for r in found if r.rtol == rtol]
+        worst = max(own, key=lambda r: r.error)
+        stack, effect, record, step = worst.trial
+        errors.append({
+            "tolerance": f"{rtol:.0e}", "by exact steps": share(r.way == EXACT for r in own),
+            "error / tolerance above 1": share(r.error > rtol for r in own),
+            "worst": number(worst.error / rtol, 2),
+            "where": f"{stack}, {plain(effect)}, {record}, {1e3 * step:g} ms",
+        })  # fmt: skip
+    effects = {r.trial.effect for r in found} - {BASE_NAME}
+    fits = effects - {r.trial.effect for r in found if r.fit != EXACT}
+    trials = [len(set(of)) for of in zip(*{r.trial for r in found}, strict=True)]
+    return [
+        TitledTable(
+            "Ways of the effects, one at a time",
+            ways,
+            f"Of {len(effects)} effects {len(fits)} take the exact way in a fit (tolerance of a"
+            f" step {FIT_RTOL:.0e}). In `simulate` the others fall back on the stepper at"
+            f" {STEP_SHARE:g} of the tolerance.",
+        ),
+        TitledTable(
+            "Error over tolerance of `simulate`, records with kinks and jumps",
+            errors,
+            f"{trials[0]} stacks, {trials[1]} models (the base, and each effect alone beside it),"
+            f" {trials[2]} kinds of record of {_SAMPLES} samples, {trials[3]} sampling times,"
+            f" against the stepper at {_TRUTH:.0e}.",
+        ),
+    ]
+
+
+#: Causes hidden in a device of the independent plants each, of which there are six records.
+HIDDEN = ("hysteresis_memory", "structural_mode", "slow_creep")
+_RECORDS, _FIRST_SEED, _NOISE, _SAMPLE_TIME = 6, 271828, 1e-3, 1e-4
+_LONG, _QUICK_LONG = 180_000, 12_000
+#: Samples of a step of the long record; samples of a record of the plants that are diagnosed.
+_HELD, _CUT = 600, 2400
+
+
+def stepper_alone() -> Any:
+    """Leave exact steps out within: every model counts as one that they do not fit."""
+    error = NotExact("left out for a benchmark")
+    return patch.object(simulate_module, "run_exact", side_effect=error)
+
+
+def diagnosis_table(demo: psa.Record, progress: Progress, quick: bool) -> TitledTable:
+    """Diagnose the demonstration and hidden causes, identify a long record.
+
+    What is diagnosed is so once before it counts: models get compiled.
+    """
+    long, several = long_record(_QUICK_LONG if quick else _LONG), f"{_RECORDS} x {_CUT}"
+    works: list[tuple[str, str, Callable[[], str], bool]] = [
+        ("diagnose, demonstration", str(demo.n), partial(_diagnosed, [demo]), True),
+        ("identify, loops and steps", str(long.n), partial(_identified, long), True),
+    ]
+    for cause in HIDDEN[: 1 if quick else None]:
+        name = f"diagnose, {_RECORDS} records, hidden {plain(cause)}"
+        works.append((name, several, partial(_diagnosed, six_records(cause)), False))
+    rows = []
+    for work, samples, do, peer in works:
+        progress(work)
+        do()
+        spent = _spent(work, samples, do)
+        rows.append(spent)
+        if peer:
+            progress(f"{work}, by the stepper alone")
+            with stepper_alone():
+                rows.append(_spent(f"{work}, by the stepper alone", samples, do))
+            ratio = float(spent["processor [s]"]) / float(rows[-1]["processor [s]"])
+            spent["over the stepper's"] = number(ratio, 2)
+    note = "Models are compiled and cached before. Wall times are those of a shared machine."
+    return TitledTable("Whole fits and diagnoses", rows, note)
+
+
+def _spent(work: str, samples: str, do: Callable[[], str]) -> dict[str, str]:
+    wall, processor = time.perf_counter(), time.process_time()
+    with psa.timed() as timings:
+        found = do()
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    runs, with_derivatives = (
+        str(sum(getattr(s, of) for s in timings.stages)) for of in ("runs", "differentiated")
+    )
+    return {
+        "work": work, "samples": samples, "wall [s]": number(wall),
+        "processor [s]": number(processor), "over the stepper's": "", "simulations": runs,
+        "with derivatives": with_derivatives, "found": found,
+    }  # fmt: skip
+
+
+def _diagnosed(records: Sequence[psa.Record]) -> str:
+    found = psa.diagnose(records)
+    return ", ".join(plain(c.effect) for c in found.causes) or str(found.verdict)
+
+
+def _identified(record: psa.Record) -> str:
+    rms = psa.identify([record]).fit.rms
+    return f"rms {number(100.0 * rms / record.range_m, 2)} % of range"
+
+
+def six_records(cause: str) -> list[psa.Record]:
+    """Return records of one device of the independent plants, each with a voltage of its own."""
+    truth, _ = hidden_record(cause, _FIRST_SEED, visible=(1.0, 3.0))
+    return [played_again(truth, _FIRST_SEED + k).slice(0, _CUT) for k in range(_RECORDS)]
+
+
+def long_record(samples: int) -> psa.Record:
+    """Return loops and steps with noise, of this package's own simulation."""
+    model = psa.stack_model("WYDS0808020")
+    top, part = model.values["u_rated"], samples // 3
+    t = time_grid(part * _SAMPLE_TIME, _SAMPLE_TIME)
+    rng = np.random.default_rng(1)
+    levels = top * rng.uniform(0.0, 1.0, max(6, part // _HELD))
+    parts = [
+        triangle(t, 0.0, top, 4.0 / (part * _SAMPLE_TIME)),
+        decaying_triangle(t, 0.0, top, 6, centre=0.0),
+        steps(t, levels),
+    ]
+    wave = concatenate(parts, _SAMPLE_TIME)
+    x = psa.simulate(model, wave.time, wave.voltage).displacement
+    clean = psa.Record(
+        name=f"{x.size} samples", time=wave.time, voltage=wave.voltage, displacement=x
+    )
+    return noisy(clean, _NOISE * clean.range_m, rng)

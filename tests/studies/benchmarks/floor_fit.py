@@ -7,18 +7,23 @@ many modes there are) is chosen by the evidence of the fitted samples.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
-FloatArray = npt.NDArray[np.float64]
+from tests.studies.benchmarks.table import FloatArray
+
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+#: Columns (samples, count) by kind; weights of a kind have one prior size between them.
+Columns = dict[str, FloatArray]
 
 #: Thresholds of the plays over half the voltage's range; relaxations in a decade of their time;
 #: voltages of the last samples that act directly.
@@ -27,16 +32,7 @@ PLAYS, IN_A_DECADE, TAPS = 14, 2, 4
 _POWERS = (1, 2, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Columns (samples, count) of one kind; weights of a kind have one prior size between them."""
-
-    kind: str
-    values: FloatArray
-
-
-@dataclass(frozen=True)
-class Mode:
+class Mode(NamedTuple):
     """A mode of a sampled system: frequency over the sampling rate, and damping ratio.
 
     One without damping is a line, as the mains leave it: no voltage drives it.
@@ -64,65 +60,47 @@ def play(v: FloatArray, threshold: float, before: Sequence[float]) -> FloatArray
     return shown
 
 
-def memory(v: FloatArray, before: Sequence[float]) -> list[Columns]:
-    """Return the voltage [of half its range] and its plays, with their squares and cubes."""
+def memory(v: FloatArray, before: Sequence[float]) -> Columns:
+    """Return the voltage [of half its range] and its plays, with their squares and cubes.
+
+    And the last voltages: what acts at once, and a delay of some samples.
+    """
     thresholds = np.arange(1, PLAYS + 1) / (PLAYS + 1.0)
     plays = np.column_stack([play(v, float(r), before) for r in thresholds])
-    curve = Columns("voltage", np.column_stack([v, v**2, v**3]))
-    return [curve, *(Columns(f"plays^{p}", plays**p) for p in _POWERS)]
+    shown = [np.r_[np.full(k, v[0]), v[: len(v) - k]] for k in range(1, TAPS + 1)]
+    curve = {"voltage": np.column_stack([v, v**2, v**3])}
+    powers = {f"plays^{p}": plays**p for p in (1, 2, 3)}
+    return {**curve, **powers, "taps": np.column_stack(shown)}
 
 
-def relaxations(v: FloatArray, driving: FloatArray, longest: float) -> list[Columns]:
+def relaxations(v: FloatArray, driving: FloatArray, longest: float) -> Columns:
     """Return what lags behind the voltage and behind a play, and what is left of its start.
 
     Times go from one sample to `longest` samples.
     """
     count = max(2, int(np.ceil(IN_A_DECADE * np.log10(longest))))
-    times = np.geomspace(1.0, longest, count)
-    k = np.arange(len(v))
+    times, k = np.geomspace(1.0, longest, count), np.arange(len(v))
     lags = [np.column_stack([s - _lagging(s, t) for t in times]) for s in (v, driving)]
     start = np.column_stack([np.exp(-k / t) for t in times])
-    return [
-        Columns("relaxations", lags[0]),
-        Columns("relaxations of a play", lags[1]),
-        Columns("start", start),
-    ]
+    return {"relaxations": lags[0], "relaxations of a play": lags[1], "start": start}
 
 
-def taps(v: FloatArray) -> Columns:
-    """Return the last voltages: what acts at once, and a delay of some samples."""
-    shown = [np.r_[np.full(k, v[0]), v[: len(v) - k]] for k in range(1, TAPS + 1)]
-    return Columns("taps", np.column_stack(shown))
-
-
-def modal(v: FloatArray, mode: Mode) -> Columns:
-    """Return the answer of a damped mode to the voltage, in both phases."""
+def modal(v: FloatArray, mode: Mode) -> FloatArray:
+    """Return the answer of a damped mode to the voltage, in both phases (n, 2)."""
     s = lfilter([1.0], [1.0, -mode.pole], v.astype(complex))
-    return Columns("modes", np.column_stack([s.real, s.imag]))
+    return np.column_stack([s.real, s.imag])
 
 
-def ringing(n: int, mode: Mode) -> Columns:
-    """Return the motion that a mode has by itself, in both phases."""
+def ringing(n: int, mode: Mode) -> FloatArray:
+    """Return the motion that a mode has by itself, in both phases (n, 2)."""
     s = mode.pole ** np.arange(n)
-    kind = "start of modes" if mode.damping else "start of lines"
-    return Columns(kind, np.column_stack([s.real, s.imag]))
+    return np.column_stack([s.real, s.imag])
 
 
-def fine_curve(displacement: FloatArray, low: float, high: float, knots: int) -> Columns:
+def fine_curve(displacement: FloatArray, low: float, high: float, knots: int) -> FloatArray:
     """Return hats over the displacement: what is fixed to a place, up and down alike."""
     at = np.clip((displacement - low) / (high - low), 0.0, 1.0) * (knots - 1)
-    hats = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(knots)))
-    return Columns("fine curve", hats)
-
-
-def apart(values: Sequence[FloatArray]) -> FloatArray:
-    """Return blocks one under the other, each in columns of its own."""
-    whole = np.zeros((sum(len(v) for v in values), sum(v.shape[1] for v in values)))
-    row = column = 0
-    for v in values:
-        whole[row : row + len(v), column : column + v.shape[1]] = v
-        row, column = row + len(v), column + v.shape[1]
-    return whole
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(knots))))
 
 
 def _lagging(v: FloatArray, time: float) -> FloatArray:
@@ -132,8 +110,6 @@ def _lagging(v: FloatArray, time: float) -> FloatArray:
     shown: FloatArray = lag
     return shown
 
-
-BoolArray = npt.NDArray[np.bool_]
 
 #: Frequencies over the sampling rate and dampings that a mode is looked for at, and their limits:
 #: slower and less damped ones imitate loops of the voltage's own frequency.
@@ -218,14 +194,12 @@ class Search:
 
     def _answer(self, mode: Mode) -> FloatArray:
         if mode.damping == 0.0:
-            return apart([ringing(len(v), mode).values for v in self._voltages])[self._used]
-        return np.vstack([modal(v, mode).values for v in self._voltages])[self._used]
+            return block_diag(*(ringing(len(v), mode) for v in self._voltages))[self._used]
+        return np.vstack([modal(v, mode) for v in self._voltages])[self._used]
 
-
-IntArray = npt.NDArray[np.int64]
 
 #: Rounds of the re-estimation of the prior sizes and the noise, and when they have settled.
-_ROUNDS_floor_ridge, _SETTLED = 60, 1e-3
+_RIDGE_ROUNDS, _SETTLED = 60, 1e-3
 #: Precision of a weight without a prior, and the largest of any, in units of the output's rms.
 _FREE, _LARGEST = 1e-8, 1e10
 
@@ -251,7 +225,7 @@ def ridge(features: FloatArray, kinds: IntArray, y: FloatArray) -> Ridge:
     gram, cross, power = x.T @ x, x.T @ target, float(target @ target)
     n = len(y)
     precision, beta = np.where(kinds == 0, _FREE, 1.0), 1e4
-    for _ in range(_ROUNDS_floor_ridge):
+    for _ in range(_RIDGE_ROUNDS):
         w, inverse, _ = _solved(gram, cross, precision, beta)
         left = max(power - 2.0 * float(w @ cross) + float(w @ gram @ w), 1e-14 * power)
         known = 1.0 - precision * np.diag(inverse)
@@ -303,8 +277,7 @@ class Part:
     used: BoolArray
 
 
-@dataclass(frozen=True, eq=False)
-class Floor:
+class Floor(NamedTuple):
     """The fit of records: predicted displacements, modes and lines, histories, curve's knots."""
 
     predicted: tuple[FloatArray, ...]
@@ -313,74 +286,67 @@ class Floor:
     knots: int
 
 
-@dataclass(frozen=True, eq=False)
-class _Fitted:
+class _Fitted(NamedTuple):
     """A fit: features (samples, count) of all parts, the displacement, the curve's columns."""
 
     found: Ridge
     features: FloatArray
     shown: FloatArray
-    curves: Sequence[Sequence[Columns]]
+    curves: Sequence[Columns]
 
 
-@dataclass(eq=False)
 class _Problem:
-    parts: Sequence[Part]
-    made: dict[tuple[int, History], list[Columns]] = field(default_factory=dict)
+    """The parts of a floor; columns that do not change between fits are kept."""
 
-    def __post_init__(self) -> None:
-        self.used = np.concatenate([p.used for p in self.parts])
-        self.y = np.concatenate([p.displacement for p in self.parts])
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self.voltages = [p.voltage for p in parts]
+        self.used = np.concatenate([p.used for p in parts])
+        self.y = np.concatenate([p.displacement for p in parts])
+        self.slow = cache(self._slow)
 
-    def columns(self, histories: Sequence[History], modes: Sequence[Mode]) -> list[list[Columns]]:
+    def columns(self, histories: Sequence[History], modes: Sequence[Mode]) -> list[Columns]:
         """Return the columns of every part, an offset first."""
         every = []
-        for k, (part, history) in enumerate(zip(self.parts, histories, strict=True)):
-            v = part.voltage
-            offset = Columns("offset of its start", np.ones((len(v), 1)))
-            driven = [modal(v, m) for m in modes if m.damping]
-            free = [ringing(len(v), m) for m in modes]
-            every.append([offset, *self._slow(k, history), *driven, *free])
+        for k, (v, history) in enumerate(zip(self.voltages, histories, strict=True)):
+            own = {"offset of its start": np.ones((len(v), 1)), **self.slow(k, history)}
+            parts = [("modes", modal(v, m)) for m in modes if m.damping]
+            parts += [(f"start of {'modes' if m.damping else 'lines'}", ringing(len(v), m))
+                      for m in modes]  # fmt: skip
+            for kind in dict.fromkeys(kind for kind, _ in parts):
+                own[kind] = np.hstack([x for name, x in parts if name == kind])
+            every.append(own)
         return every
 
-    def _slow(self, k: int, history: History) -> list[Columns]:
-        if (k, history) not in self.made:
-            v = self.parts[k].voltage
-            longest = 3.0 * max(len(p.voltage) for p in self.parts)
-            lags = relaxations(v, play(v, _FOLLOWED, history), longest)
-            self.made[k, history] = [*memory(v, history), taps(v), *lags]
-        return self.made[k, history]
+    def _slow(self, k: int, history: History) -> Columns:
+        v = self.voltages[k]
+        longest = 3.0 * max(map(len, self.voltages))
+        return memory(v, history) | relaxations(v, play(v, _FOLLOWED, history), longest)
 
-    def fitted(
-        self, columns: Sequence[Sequence[Columns]], curves: Sequence[Sequence[Columns]] = ()
-    ) -> _Fitted:
+    def fitted(self, columns: Sequence[Columns], curves: Sequence[Columns] = ()) -> _Fitted:
         """Fit the used samples with the columns, and with curves over the displacement."""
-        features, kinds = stacked(joined(columns, curves))
-        used = self.used
-        found = ridge(features[used], kinds, self.y[used])
+        features, kinds = stacked(columns, curves)
+        found = ridge(features[self.used], kinds, self.y[self.used])
         return _Fitted(found, features, features @ found.weights, curves)
 
-    def with_curve(self, columns: Sequence[Sequence[Columns]], knots: int) -> _Fitted:
+    def with_curve(self, columns: Sequence[Columns], knots: int) -> _Fitted:
         """Fit with a curve over what the other columns say that the displacement is."""
         fitted = self.fitted(columns)
         under = fitted.shown
         for _ in range(_ROUNDS if knots else 0):
             low, high = float(under.min()), float(under.max())
-            curves = [[fine_curve(y, low, high, knots)] for y in self.split(under)]
-            fitted = self.fitted(columns, curves)
-            hats = np.vstack([c.values for of in curves for c in of])
-            under = fitted.shown - hats @ fitted.found.weights[-knots:]
+            hats = [fine_curve(y, low, high, knots) for y in self.split(under)]
+            fitted = self.fitted(columns, [{"fine curve": h} for h in hats])
+            under = fitted.shown - np.vstack(hats) @ fitted.found.weights[-knots:]
         return fitted
 
-    def best_curve(self, columns: Sequence[Sequence[Columns]]) -> tuple[_Fitted, int]:
+    def best_curve(self, columns: Sequence[Columns]) -> tuple[_Fitted, int]:
         """Return the fit with the knots of most evidence, and their number."""
         tried = [(self.with_curve(columns, knots), knots) for knots in _KNOTS]
         return max(tried, key=lambda pair: pair[0].found.evidence)
 
     def split(self, shown: FloatArray) -> list[FloatArray]:
         """Return an array of all samples as one for each part."""
-        edges = np.cumsum([0, *(len(p.voltage) for p in self.parts)])
-        return [shown[a:b] for a, b in pairwise(edges)]
+        return np.split(shown, np.cumsum([len(v) for v in self.voltages])[:-1])
 
 
 def floor_of(parts: Sequence[Part], progress: Callable[[str], None] = lambda _: None) -> Floor:
@@ -395,31 +361,25 @@ def floor_of(parts: Sequence[Part], progress: Callable[[str], None] = lambda _: 
     return Floor(tuple(problem.split(fitted.shown)), modes, histories, knots)
 
 
-def stacked(every: Sequence[Sequence[Columns]]) -> tuple[FloatArray, IntArray]:
+def stacked(
+    columns: Sequence[Columns], curves: Sequence[Columns] = ()
+) -> tuple[FloatArray, IntArray]:
     """Return the features of all parts, and the kind of each; the first columns have kind 0.
 
     What is left of a start belongs to its own record alone.
     """
-    blocks: dict[str, list[FloatArray]] = {}
-    for same in zip(*every, strict=True):
-        values = [c.values for c in same]
-        own = "start" in same[0].kind
-        blocks.setdefault(same[0].kind, []).append(apart(values) if own else np.vstack(values))
-    counts = [sum(b.shape[1] for b in of) for of in blocks.values()]
-    kinds = np.repeat(np.arange(len(counts)), counts)
-    return np.hstack([b for of in blocks.values() for b in of]), kinds
-
-
-def joined(
-    columns: Sequence[Sequence[Columns]], more: Sequence[Sequence[Columns]]
-) -> list[list[Columns]]:
-    """Return the columns of every part with more of them, if there are any."""
-    return [[*c, *m] for c, m in zip(columns, more or [()] * len(columns), strict=True)]
+    every = [c | m for c, m in zip(columns, curves or [{}] * len(columns), strict=True)]
+    blocks = [
+        block_diag(*(c[kind] for c in every)) if "start" in kind
+        else np.vstack([c[kind] for c in every])
+        for kind in every[0]
+    ]  # fmt: skip
+    return np.hstack(blocks), np.repeat(np.arange(len(blocks)), [b.shape[1] for b in blocks])
 
 
 def _histories(problem: _Problem) -> tuple[History, ...]:
     """Return the history of most evidence for each record, one after the other."""
-    chosen: list[History] = [()] * len(problem.parts)
+    chosen: list[History] = [()] * len(problem.voltages)
     for k in range(len(chosen)):
         tried = [[*chosen[:k], h, *chosen[k + 1 :]] for h in HISTORIES]
         chosen = max(tried, key=lambda h: problem.fitted(problem.columns(h, ())).found.evidence)
@@ -434,14 +394,14 @@ def _modes(
 ) -> tuple[Mode, ...]:
     """Return modes and lines found one by one, all tuned again, while the evidence grows."""
     used, y, curves = problem.used, problem.y[problem.used], fitted.curves
-    search = Search([p.voltage for p in problem.parts], used)
+    search = Search(problem.voltages, used)
     modes: list[Mode] = []
     while len(modes) < _MODES:
         progress(f"mode {len(modes) + 1}")
         tried = [*modes, search.next(beside(fitted.features[used], y))]
         for k, mode in enumerate(tried[:-1]):
             without = problem.columns(histories, [*tried[:k], *tried[k + 1 :]])
-            tried[k] = search.tuned(mode, beside(stacked(joined(without, curves))[0][used], y))
+            tried[k] = search.tuned(mode, beside(stacked(without, curves)[0][used], y))
         wider = problem.fitted(problem.columns(histories, tried), curves)
         if wider.found.evidence < fitted.found.evidence + _WORTH:
             break

@@ -9,81 +9,58 @@ from pathlib import Path
 
 import numpy as np
 
+import psa_casadi as psa
 from psa_casadi import datasets
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out import Errors, errors_of
-from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records import read_records
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.floor_fit import Floor, Part, floor_of
+from tests.studies.benchmarks.floor_fit import Part, floor_of
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
-_HEAD = ("record", "base", "extended", "floor", "extended / floor", "verdict", "causes")
-_NOTE = (
-    "Held-out rms, percent of range, in the samples that `psa diagnose` holds out. The floor: plays"
-    " with squares and cubes, relaxations over decades, modes, a fine curve over the displacement,"
-    " linear in their weights, their prior sizes and their number by evidence."
-)
 
-
-def run(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose the public records; `quick` takes the shortest one alone."""
+def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
+    """Diagnose the public records, or those of a folder; `quick` takes the shortest alone."""
     sine, loops = datasets.micromanipulator()
     cases = [("minor loops", [loops])]
-    if not quick:
+    if folder is not None:
+        paths = sorted(folder.glob("*.csv"))
+        if not paths:
+            raise psa.InputError(f"{folder}: holds no CSV file; name the folder with your records.")
+        cases = [(r.name, [r]) for r in psa.read_records(paths)]
+    elif not quick:
         axis = datasets.load("steering_mirror")[0]
         cases += [("sine", [sine]), ("both", [sine, loops]), (axis.name, [axis])]
-    return _outcome(cases, progress)
-
-
-def run_on(progress: Progress, folder: Path) -> Outcome:
-    """Diagnose every record of a folder by itself."""
-    paths = sorted(p for p in folder.glob("*.csv"))
-    if not paths:
-        raise InputError(f"{folder}: holds no CSV file; name the folder with your records.")
-    return _outcome([(r.name, [r]) for r in read_records(paths)], progress)
-
-
-def floor_on(experiments: Sequence[Experiment], progress: Progress) -> tuple[Floor, Errors]:
-    """Return the floor of experiments and its errors, in training and held-out samples."""
-    voltages = [e.record.voltage for e in experiments]
-    high, low = max(float(v.max()) for v in voltages), min(float(v.min()) for v in voltages)
-    middle, half = 0.5 * (high + low), 0.5 * (high - low)
-    size = max(e.record.range_m for e in experiments)
-    parts = [
-        Part((v - middle) / half, measured(e.record) / size, e.used)
-        for v, e in zip(voltages, experiments, strict=True)
-    ]
-    floor = floor_of(parts, progress)
-    return floor, errors_of(experiments, [size * y for y in floor.predicted])
-
-
-def _outcome(cases: Sequence[tuple[str, Sequence[Record]]], progress: Progress) -> Outcome:
     rows, ratios = [], []
     for name, records in cases:
 
         def tell(step: str, name: str = name) -> None:
             progress(f"{name}: {step}")
 
-        found = diagnose(records, progress=tell)
-        errors = floor_on(found.experiments, tell)[1]
-        base, extended, floor = (
-            e.holdout_nrmse_percent for e in (found.base_errors, found.extended_errors, errors)
-        )
+        d = psa.diagnose(records, progress=tell)
+        errors = (d.base_errors, d.extended_errors, floor_on(d.experiments, tell))
+        base, extended, floor = (e.holdout_nrmse_percent for e in errors)
         ratios.append(extended / floor)
-        causes = ", ".join(c.effect for c in found.causes)
-        rows.append(
-            (name, *(f"{x:.3f}" for x in (base, extended, floor)), f"{ratios[-1]:.2f}",
-             found.verdict, causes)
-        )  # fmt: skip
-    worst = f" Extended over floor: median {np.median(ratios):.2f}, worst {max(ratios):.2f}."
-    return Outcome(
-        (
-            TitledTable(
-                "Measured records and their floors", Table(_HEAD, tuple(rows)), _NOTE + worst
-            ),
-        )
+        rows.append({
+            "record": name, "base": f"{base:.3f}", "extended": f"{extended:.3f}",
+            "floor": f"{floor:.3f}", "extended / floor": f"{ratios[-1]:.2f}", "verdict": d.verdict,
+            "causes": ", ".join(c.effect for c in d.causes),
+        })  # fmt: skip
+    note = (
+        "Held-out rms, percent of range, in the samples that `psa diagnose` holds out. The floor:"
+        " plays with squares and cubes, relaxations over decades, modes, a fine curve over the"
+        " displacement, linear in their weights, their prior sizes and their number by evidence."
+        f" Extended over floor: median {np.median(ratios):.2f}, worst {max(ratios):.2f}."
     )
+    return Outcome((TitledTable("Measured records and their floors", rows, note),))
+
+
+def floor_on(experiments: Sequence[Experiment], progress: Progress) -> Errors:
+    """Return the errors of the floor of experiments, in training and held-out samples."""
+    voltages = np.concatenate([e.record.voltage for e in experiments])
+    middle, half = 0.5 * (voltages.max() + voltages.min()), 0.5 * float(np.ptp(voltages))
+    size = max(e.record.range_m for e in experiments)
+    parts = [
+        Part((e.record.voltage - middle) / half, measured(e.record) / size, e.used)
+        for e in experiments
+    ]
+    return errors_of(experiments, [size * y for y in floor_of(parts, progress).predicted])

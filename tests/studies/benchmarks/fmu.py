@@ -10,59 +10,47 @@ take.
 
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from ctypes import c_size_t
-from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
-from math import inf, log
+from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import fmpy
 import numpy as np
-import numpy.typing as npt
 from fmpy.sundials import CVodeSolver
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from scipy.integrate import solve_ivp
 
+import psa_casadi as psa
+from psa_casadi import reference
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fixed_step.export import export_c, fixed_step
+from psa_casadi.export.fixed_step.export import fixed_step
 from psa_casadi.export.fixed_step.probe import VOLTAGES
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.sources import compiled_files, exported_texts
 from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate
-from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import multisine, time_grid
-from psa_casadi.reference import simulate
 from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
-from psa_casadi.simulation.stepper import run as run_stepper
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled, table_of
-
-FloatArray = npt.NDArray[np.float64]
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, least_times
 
 #: The share of the importer's tolerance that the FMU's solver gives each step (instance.c).
-STEP_SHARE = 0.003
-TIGHTEST_STEP = 1e-11
-OURS = "co-simulation FMU"
-_OUTPUT = "displacement"
+STEP_SHARE, TIGHTEST_STEP = 0.003, 1e-11
+OURS, _OUTPUT = "co-simulation FMU", "displacement"
+#: Errors at which methods are compared; runs longer than this are not repeated [s].
+_LEVELS, _SLOW = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7), 0.3
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A model and its voltage [V] at regular times (n,) [s].
 
     The voltage is linear between the times or, with `hold`, constant from each to the next.
     """
 
     name: str
-    model: Model
+    model: psa.Model
     times: FloatArray
     voltage: FloatArray
     hold: bool
@@ -81,43 +69,27 @@ class Case:
     def truth(self, rtol: float) -> FloatArray:
         """Return the displacement (n,) of the reference, which shares no code with the model."""
         marks = self.times[self.jumps] if self.hold else self.times
-        breakpoints = list(marks)
-        return simulate(
-            self.model.values, self.at, self.times, breakpoints=breakpoints, rtol=rtol
-        ).displacement
+        how: Any = {"breakpoints": list(marks), "rtol": rtol}
+        return reference.simulate(self.model.values, self.at, self.times, **how).displacement
 
 
-@dataclass(frozen=True)
-class Solved:
-    """The displacement (n,) of one run; `evaluations` of the right-hand side, if counted on it."""
-
-    displacement: FloatArray
-    evaluations: int | None = None
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to integrate: `solve` is timed; `count`, where needed, counts in a run of its own."""
-
-    name: str
-    solve: Callable[[Case, Fmu, float], Solved]
-    count: Callable[[Case, Fmu, float], int] | None = None
+#: Displacement (n,) of a run, and evaluations of the right-hand side, None if a run of its own
+#: counts them.
+Solved = tuple[FloatArray, int | None]
 
 
 def _stepped(case: Case, fmu: Fmu, tolerance: float) -> Solved:
     """Step the FMU from sample to sample; with slopes where the voltage is linear."""
     inputs = Signals(("voltage",), case.times, case.voltage[:, None])
-    found = co_simulate(
-        fmu, case.times, inputs, [_OUTPUT], tolerance=tolerance, rates=not case.hold
-    )
-    return Solved(found[:, 0])
+    how: Any = {"tolerance": tolerance, "rates": not case.hold}
+    return co_simulate(fmu, case.times, inputs, [_OUTPUT], **how)[:, 0], None
 
 
-def _stepped_count(case: Case, _fmu: Fmu, tolerance: float) -> int:
+def _stepped_count(case: Case, tolerance: float) -> int:
     """Count with the simulator: the same C code with the same tolerance of a step."""
     u = np.zeros((len(case.times), len(case.model.input_names)))
     u[:, case.model.input_names.index("voltage")] = case.voltage
-    return run_stepper(
+    return psa.run(
         case.model, case.times, u, np.zeros(len(case.model.state_names)),
         rtol=max(STEP_SHARE * tolerance, TIGHTEST_STEP), hold="zero" if case.hold else "linear",
     ).evaluations  # fmt: skip
@@ -145,16 +117,16 @@ def _cvode(case: Case, fmu: Fmu, tolerance: float) -> Solved:
             instance.set({"voltage": case.at(min(time, last[0]))})
 
         def vector(function: str) -> Callable[[Any, int], None]:
-            return lambda values, count: instance.require(function, values, c_size_t(count))
+            def call(values: Any, count: int) -> None:
+                calls[0] += function == "GetDerivatives"
+                instance.require(function, values, c_size_t(count))
 
-        def derivatives(values: Any, count: int) -> None:
-            calls[0] += 1
-            instance.require("GetDerivatives", values, c_size_t(count))
+            return call
 
         solver = CVodeSolver(
             nx=len(fmu.states()), nz=int(fmu.description.numberOfEventIndicators),
             get_x=vector("GetContinuousStates"), set_x=vector("SetContinuousStates"),
-            get_dx=derivatives, get_z=vector("GetEventIndicators"), input=_Unused(),
+            get_dx=vector("GetDerivatives"), get_z=vector("GetEventIndicators"), input=_Unused(),
             get_nominals=vector("GetNominalsOfContinuousStates"), set_time=set_time,
             startTime=float(t[0]), maxStep=float(t[-1] - t[0]) / 50.0, relativeTolerance=tolerance,
         )  # fmt: skip
@@ -172,7 +144,7 @@ def _cvode(case: Case, fmu: Fmu, tolerance: float) -> Solved:
                         solver.reset(now)
                 rows.append(instance.get([_OUTPUT]))
             solver.reset(float(t[end]))
-    return Solved(np.array(rows)[:, 0], calls[0])
+    return np.array(rows)[:, 0], calls[0]
 
 
 def _scipy(solver: Any, case: Case, fmu: Fmu, tolerance: float) -> Solved:
@@ -189,10 +161,8 @@ def _scipy(solver: Any, case: Case, fmu: Fmu, tolerance: float) -> Solved:
                 calls[0] += 1
                 return instance.derivatives(time, x, {"voltage": case.at(min(time, last))})
 
-            found = solve_ivp(
-                rates, (t[begin], t[end]), x, solver, t[begin + 1 : end + 1], rtol=tolerance,
-                atol=atol,
-            )  # fmt: skip
+            how: Any = {"rtol": tolerance, "atol": atol}
+            found = solve_ivp(rates, (t[begin], t[end]), x, solver, t[begin + 1 : end + 1], **how)
             if not found.success:
                 raise FmuError(f"scipy stopped after {t[begin]:g} s: {found.message}")
             counted = calls[0]
@@ -200,123 +170,20 @@ def _scipy(solver: Any, case: Case, fmu: Fmu, tolerance: float) -> Solved:
                 rates(float(time), state)
                 rows.append(instance.get([_OUTPUT]))
             calls[0], x = counted, found.y[:, -1]
-    return Solved(np.array(rows)[:, 0], calls[0])
+    return np.array(rows)[:, 0], calls[0]
 
 
-METHODS = (
-    Method(OURS, _stepped, _stepped_count),
-    Method("CVode, model exchange", _cvode),
-    Method("scipy Radau, model exchange", partial(_scipy, "Radau")),
-    Method("scipy LSODA, model exchange", partial(_scipy, "LSODA")),
-)
+METHODS: dict[str, Callable[[Case, Fmu, float], Solved]] = {
+    OURS: _stepped,
+    "CVode, model exchange": _cvode,
+    "scipy Radau, model exchange": partial(_scipy, "Radau"),
+    "scipy LSODA, model exchange": partial(_scipy, "LSODA"),
+}
 
 
-#: The step of issue and table [s], and what is asked of it.
-STEP, MOST_NS, MOST_RATIO = 1e-5, 400.0, 1.5
-_SOURCE = Path(__file__).parents[2] / "export" / "c_host" / "step_cost.c"
-
-
-def voltage(model: Model) -> FloatArray:
-    """Return 1000 voltages [V]: 200 of each reference voltage."""
-    share = np.linspace(0.0, 1.0, 1001)[1:]
-    parts = [
-        shape(share)[200 * k : 200 * (k + 1)] for k, (_, shape) in enumerate(VOLTAGES.values())
-    ]
-    return np.asarray(model.values["u_rated"] * np.concatenate(parts))
-
-
-def measured(model: Model, repetitions: int, *, fixed: bool) -> FloatArray:
-    """Return the time [ns] of every step, (1000, 2): of the generated code and of an FMU.
-
-    The FMU is the ordinary one, or the one with a `fixed` step.
-    """
-    table = {v.name: k for k, v in enumerate(variable_table(model), start=1)}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        export_c(model, folder, step=STEP, name="stack", substeps=1)
-        step = fixed_step(model, name="stack", step=STEP, substeps=1) if fixed else None
-        token, texts, _ = exported_texts(model, model.name, fixed=step)
-        for file, text in texts.items():
-            (folder / file).write_text(text, encoding="utf-8")
-        sources = compiled_files(texts)
-        headers = Path(fmpy.__file__).parent / "c-code"
-        command = [*compiler_command(), *OPTIMISE, "-I.", f"-I{headers}"]
-        files = [str(_SOURCE), "stack.c", *sources, "-lm", "-o", "step_cost"]
-        run_compiler([*command, *files], folder)
-        given = [str(repetitions), str(table["voltage"]), str(table["displacement"])]
-        done = subprocess.run(
-            [str(folder / "step_cost"), token, *given],
-            input="\n".join(map(repr, voltage(model).tolist())),
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-    return np.array([[float(v) for v in line.split()] for line in done.stdout.splitlines()])
-
-
-def cost_table(progress: Progress, *, quick: bool) -> TitledTable:
-    """Return mean, worst and their ratio for a stack."""
-    progress("cost of a step")
-    model, repetitions = stack_model("P-885.51").plant(), 50 if quick else 400
-    ordinary, fixed = (measured(model, repetitions, fixed=f).T for f in (False, True))
-    ways = {
-        "psa export c": ordinary[0],
-        "psa export fmu --solver fixed": fixed[1],
-        "psa export fmu": ordinary[1],
-    }
-    return table_of(
-        f"cost of a step of {1e6 * STEP:g} us, P-885.51: ramps, holds, tones and jumps",
-        ways,
-        {
-            "way": str,
-            "mean [ns]": lambda way: f"{ways[way].mean():.0f}",
-            "worst [ns]": lambda way: f"{ways[way].max():.0f}",
-            "worst / mean": lambda way: f"{ways[way].max() / ways[way].mean():.2f}",
-        },
-        f"Asked of the generated code: at most {MOST_NS:g} ns, worst over mean below"
-        f" {MOST_RATIO:g}. Each step counts with the least time of its repetitions.",
-    )
-
-
-_STYLES = (("#0072b2", "o"), ("#d55e00", "s"), ("#009e73", "^"), ("#9a6fb0", "v"))
-
-
-def picture(runs: Sequence["Run"]) -> Figure:
-    """Return a row for every case: error over CPU time, over right-hand sides, over tolerance."""
-    cases = list(dict.fromkeys(r.case for r in runs))
-    figure = Figure(figsize=(14.0, 4.6 * len(cases)), layout="constrained")
-    grid = figure.subplots(len(cases), 3, squeeze=False)
-    across = {
-        "seconds": "CPU time [s]",
-        "evaluations": "evaluations of the right-hand side",
-        "tolerance": "tolerance asked for",
-    }
-    for row, case in zip(grid, cases, strict=True):
-        of_case = [r for r in runs if r.case == case]
-        for axes, (of, label) in zip(row, across.items(), strict=True):
-            for method, (colour, marker) in zip(_methods(of_case), _STYLES, strict=False):
-                mine = [r for r in of_case if r.method == method]
-                axes.loglog(
-                    [getattr(r, of) for r in mine], [r.error for r in mine], color=colour,
-                    marker=marker, markersize=5, linewidth=1.4, label=method,
-                )  # fmt: skip
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            styled(axes, label, "largest error / range", case if of == "seconds" else "")
-        ends = [min(r.tolerance for r in of_case), max(r.tolerance for r in of_case)]
-        row[2].plot(ends, ends, color="0.6", linewidth=1.0, zorder=0, label="error = tolerance")
-        row[2].legend(fontsize=8.5)
-    return figure
-
-
-_TRUTH, _CHECK = 1e-12, 1e-11
-_LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
-_SAMPLE_TIME = 5e-5
-_SLOW = 0.3
-
-
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One run: error as a share of the range, CPU time [s], right-hand sides; inf if it failed."""
 
-    case: str
     method: str
     tolerance: float
     error: float
@@ -327,128 +194,155 @@ class Run:
 def run(progress: Progress, quick: bool) -> Outcome:
     """Run every method at every tolerance on a sampled record and on a stiff, ringing stack."""
     tolerances = (1e-3, 1e-5, 1e-7) if quick else tuple(10.0**-k for k in range(3, 10))
-    tables, runs = [], []
+    tables, ratios = [], []
     for case in cases(quick):
         progress(f"reference: {case.name}")
-        truth = case.truth(_TRUTH)
-        doubt = np.max(np.abs(case.truth(_CHECK) - truth)) / np.ptp(truth)
+        truth, check = case.truth(1e-12), case.truth(1e-11)
+        doubt = float(np.max(np.abs(check - truth)) / np.ptp(truth))
+        runs = []
         with tempfile.TemporaryDirectory() as folder:
-            path = export_fmu(case.model, Path(folder) / "model.fmu")
+            path = psa.export_fmu(case.model, Path(folder) / "model.fmu")
             with Fmu(path) as fmu:
-                found = [
-                    _measured(m, case, fmu, tolerance, truth, progress, 1 if quick else 3)
-                    for m in METHODS
-                    for tolerance in tolerances
-                ]
-        tables.append(_table(case, found, float(doubt)))
-        runs += found
-    cost = cost_table(progress, quick=quick)
-    return Outcome((*tables, _summary(runs), cost), partial(picture, runs))
-
-
-def cases(quick: bool) -> tuple[Case, Case]:
-    """Return a multisine with rounded samples, and steps on a ringing stack with a tiny R_s."""
-    t = time_grid(0.015 if quick else 0.025, _SAMPLE_TIME)
-    ramp = np.minimum(5.0 * t / t[-1], 1.0)
-    sampled = np.round(ramp * multisine(t, 0.0, 100.0, (100.0, 1000.0), seed=1), 2)
-    steps = time_grid(0.005 if quick else 0.01, _SAMPLE_TIME)
-    levels = np.array([100.0, 180.0, 40.0, 150.0, 0.0])
-    stiff = stack_model("PTBS200").with_values({"R_s": 0.01})
-    return (
-        Case(
-            f"sampled record ({len(t)} samples at 20 kHz, linear in between)",
-            stack_model("P-885.51"), t, sampled, hold=False,
-        ),
-        Case(
-            "stiff and ringing (five steps of the voltage, R_s C_p of 16 ns)",
-            stiff, steps, np.repeat(levels, len(steps) // len(levels)), hold=True,
-        ),
-    )  # fmt: skip
-
-
-def _measured(
-    method: Method, case: Case, fmu: Fmu, tolerance: float, truth: FloatArray,
-    progress: Progress, repeats: int,
-) -> Run:  # fmt: skip
-    """Return one run; its CPU time is the least of the repeats, of which a slow run has one."""
-    progress(f"{case.name}: {method.name}, {tolerance:.0e}")
-    seconds = inf
-    try:
-        for _ in range(repeats):
-            begin = time.process_time()
-            found = method.solve(case, fmu, tolerance)
-            seconds = min(seconds, time.process_time() - begin)
-            if seconds > _SLOW:
-                break
-    except FmuError:
-        return Run(case.name, method.name, tolerance, inf, inf, inf)
-    error = float(np.max(np.abs(found.displacement - truth)) / np.ptp(truth))
-    evaluations = found.evaluations
-    if evaluations is None and method.count:
-        evaluations = method.count(case, fmu, tolerance)
-    return Run(case.name, method.name, tolerance, error, seconds, evaluations or inf)
-
-
-def _table(case: Case, runs: Sequence[Run], doubt: float) -> TitledTable:
-    return table_of(
-        f"Reached error and work: {case.name}",
-        runs,
-        {
-            "method": lambda r: r.method,
-            "tolerance asked for": lambda r: f"{r.tolerance:.0e}",
-            "largest error / range": lambda r: number(r.error, 2),
-            "error / tolerance": lambda r: number(r.error / r.tolerance, 2),
-            "CPU time [ms]": lambda r: number(1e3 * r.seconds),
-            "right-hand sides": lambda r: number(r.evaluations),
-        },
-        f"The reference at 1e-11 and at 1e-12 differ by {number(doubt, 2)} of the range.",
-    )
-
-
-def work_at(runs: Sequence[Run], error: float) -> tuple[float, float]:
-    """Return CPU time [s] and right-hand sides at which a method reaches an error.
-
-    Both are read off between the two runs on either side, linear in the logarithms; inf if no run
-    is as accurate, and the loosest run's where all are.
-    """
-    ordered = sorted((r for r in runs if r.error < inf), key=lambda r: -r.tolerance)
-    if not ordered or ordered[-1].error > error:
-        return inf, inf
-    last = max(i for i, r in enumerate(ordered) if i == 0 or r.error > error)
-    if ordered[last].error <= error:
-        return ordered[last].seconds, ordered[last].evaluations
-    a, b = ordered[last], ordered[last + 1]
-    share = log(a.error / error) / log(a.error / b.error)
-    seconds, evaluations = (
-        low * (high / low) ** share
-        for low, high in ((a.seconds, b.seconds), (a.evaluations, b.evaluations))
-    )
-    return seconds, evaluations
-
-
-def _summary(runs: Sequence[Run]) -> TitledTable:
-    """Return the work of the others over that of the FMU, at equal error."""
-    rows = []
-    names = [m.name for m in METHODS if m.name != OURS]
-    for case, method, error in product(dict.fromkeys(r.case for r in runs), names, _LEVELS):
-        ours, theirs = (
-            work_at([r for r in runs if (r.case, r.method) == (case, name)], error)
-            for name in (OURS, method)
-        )
-        if inf not in (*ours, *theirs):
-            ratios = (number(b / a, 2) for a, b in zip(ours, theirs, strict=True))
-            rows.append((case.partition(" (")[0], method, f"{error:.0e}", *ratios))
-    head = ("case", "method", "error", "CPU time over the FMU's", "right-hand sides over the FMU's")
+                for name, tolerance in product(METHODS, tolerances):
+                    progress(f"{case.name}: {name}, {tolerance:.0e}")
+                    runs.append(_measured(name, case, fmu, tolerance, truth, 1 if quick else 3))
+        tables.append(_table(case, runs, doubt))
+        ratios += _ratios(case, runs)
     note = (
         "CPU time of one process of one run; only the ratios carry over to other machines. All are"
         " driven from Python: co-simulation pays for it once a communication step, the others at"
         " every right-hand side, so the right-hand sides are the fairer measure of the methods"
         " themselves. They include those spent on Jacobians by differences; the FMU's solver has"
-        " the exact Jacobian and evaluates it once a step, which is not counted. CVode and scipy"
-        " restart at jumps and run through the samples of the record."
+        " the exact Jacobian and evaluates it once a step, which is not counted."
     )
-    return TitledTable("Work of the others at equal error", Table(head, tuple(rows)), note)
+    at_equal = TitledTable("Work of the others at equal error", ratios, note)
+    progress("cost of a step")
+    return Outcome((*tables, at_equal, cost_table(50 if quick else 400)))
 
 
-def _methods(runs: Sequence["Run"]) -> list[str]:
-    return list(dict.fromkeys(r.method for r in runs))
+def cases(quick: bool) -> tuple[Case, Case]:
+    """Return a multisine with rounded samples, and steps on a ringing stack with a tiny R_s."""
+    ends = (0.015, 0.005) if quick else (0.025, 0.01)
+    t, steps = (time_grid(end, 5e-5) for end in ends)
+    ramp = np.minimum(5.0 * t / t[-1], 1.0)
+    sampled = np.round(ramp * multisine(t, 0.0, 100.0, (100.0, 1000.0), seed=1), 2)
+    levels = np.repeat([100.0, 180.0, 40.0, 150.0, 0.0], len(steps) // 5)
+    name = f"sampled record ({len(t)} samples at 20 kHz, linear in between)"
+    stiff = psa.stack_model("PTBS200").with_values({"R_s": 0.01})
+    return (
+        Case(name, psa.stack_model("P-885.51"), t, sampled, False),
+        Case("stiff and ringing (five steps of the voltage, R_s C_p of 16 ns)",
+             stiff, steps, levels, True),
+    )  # fmt: skip
+
+
+def _measured(
+    name: str, case: Case, fmu: Fmu, tolerance: float, truth: FloatArray, repeats: int
+) -> Run:
+    """Return one run; its CPU time is the least of the repeats, of which a slow run has one."""
+    found: list[Solved] = []
+    work = partial(METHODS[name], case, fmu, tolerance)
+    try:
+        ((_, seconds),) = least_times([lambda: found.append(work())], repeats, _SLOW)
+    except FmuError:
+        return Run(name, tolerance, inf, inf, inf)
+    shown, evaluations = found[-1]
+    error = float(np.max(np.abs(shown - truth)) / np.ptp(truth))
+    evaluations = _stepped_count(case, tolerance) if evaluations is None else evaluations
+    return Run(name, tolerance, error, seconds, evaluations or inf)
+
+
+def _table(case: Case, runs: Sequence[Run], doubt: float) -> TitledTable:
+    rows = [
+        {"method": r.method, "tolerance asked for": f"{r.tolerance:.0e}",
+         "largest error / range": number(r.error, 2),
+         "error / tolerance": number(r.error / r.tolerance, 2),
+         "CPU time [ms]": number(1e3 * r.seconds), "right-hand sides": number(r.evaluations)}
+        for r in runs
+    ]  # fmt: skip
+    note = f"The reference at 1e-11 and at 1e-12 differ by {number(doubt, 2)} of the range."
+    return TitledTable(f"Reached error and work: {case.name}", rows, note)
+
+
+def work_at(runs: Sequence[Run], error: float) -> FloatArray:
+    """Return CPU time [s] and right-hand sides (2,) at which a method reaches an error.
+
+    Both are read off between the runs on either side, linear in the logarithms; inf if no run is
+    as accurate, and the loosest run's where all are.
+    """
+    ordered = sorted((r for r in runs if r.error < inf), key=lambda r: -r.tolerance)
+    if not ordered or ordered[-1].error > error:
+        return np.full(2, inf)
+    last = max(i for i, r in enumerate(ordered) if i == 0 or r.error > error)
+    near = np.log([r[2:] for r in ordered[last : last + 2]])[::-1]  # errors that grow
+    return np.array([np.exp(np.interp(np.log(error), near[:, 0], w)) for w in near[:, 1:].T])
+
+
+def _ratios(case: Case, runs: Sequence[Run]) -> list[dict[str, str]]:
+    """Return the work of the others over that of the FMU, at equal error."""
+    rows = []
+    for method, error in product(list(METHODS)[1:], _LEVELS):
+        ours, theirs = (
+            work_at([r for r in runs if r.method == name], error) for name in (OURS, method)
+        )
+        if np.all(np.isfinite([ours, theirs])):
+            seconds, evaluations = (number(float(q), 2) for q in theirs / ours)
+            rows.append({
+                "case": case.name.partition(" (")[0], "method": method, "error": f"{error:.0e}",
+                "CPU time over the FMU's": seconds, "right-hand sides over the FMU's": evaluations,
+            })  # fmt: skip
+    return rows
+
+
+#: The step of the table [s], and what is asked of it.
+STEP, MOST_NS, MOST_RATIO = 1e-5, 400.0, 1.5
+_SOURCE = Path(__file__).parents[2] / "export" / "c_host" / "step_cost.c"
+
+
+def measured(model: psa.Model, repetitions: int, *, fixed: bool) -> FloatArray:
+    """Return the time [ns] of every step, (2, 1000): of the generated code and of an FMU.
+
+    The FMU is the ordinary one, or the one with a `fixed` step. The voltages are 200 of each
+    reference voltage.
+    """
+    table = {v.name: k for k, v in enumerate(variable_table(model), start=1)}
+    share = np.linspace(0.0, 1.0, 1001)[1:]
+    parts = [s(share)[200 * k : 200 * (k + 1)] for k, (_, s) in enumerate(VOLTAGES.values())]
+    voltage = np.asarray(model.values["u_rated"] * np.concatenate(parts)).tolist()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        psa.export_c(model, folder, step=STEP, name="stack", substeps=1)
+        step = fixed_step(model, name="stack", step=STEP, substeps=1) if fixed else None
+        token, texts, _ = exported_texts(model, model.name, fixed=step)
+        for file, text in texts.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        command = [*compiler_command(), *OPTIMISE, "-I.", f"-I{Path(fmpy.__file__).parent}/c-code"]
+        files = [str(_SOURCE), "stack.c", *compiled_files(texts), "-lm", "-o", "step_cost"]
+        run_compiler([*command, *files], folder)
+        given = [token, str(repetitions), str(table["voltage"]), str(table["displacement"])]
+        done = subprocess.run(
+            [str(folder / "step_cost"), *given], input="\n".join(map(repr, voltage)),
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+    return np.array([[float(v) for v in line.split()] for line in done.stdout.splitlines()]).T
+
+
+def cost_table(repetitions: int) -> TitledTable:
+    """Return mean, worst and their ratio for a stack."""
+    model = psa.stack_model("P-885.51").plant()
+    ordinary, fixed = (measured(model, repetitions, fixed=f) for f in (False, True))
+    ways = {
+        "psa export c": ordinary[0], "psa export fmu --solver fixed": fixed[1],
+        "psa export fmu": ordinary[1],
+    }  # fmt: skip
+    rows = [
+        {"way": way, "mean [ns]": f"{t.mean():.0f}", "worst [ns]": f"{t.max():.0f}",
+         "worst / mean": f"{t.max() / t.mean():.2f}"}
+        for way, t in ways.items()
+    ]  # fmt: skip
+    return TitledTable(
+        f"Cost of a step of {1e6 * STEP:g} us, P-885.51: ramps, holds, tones and jumps",
+        rows,
+        f"Asked of the generated code: at most {MOST_NS:g} ns, worst over mean below"
+        f" {MOST_RATIO:g}. Each step counts with the least time of its repetitions.",
+    )

@@ -7,14 +7,12 @@ from typing import Annotated
 
 import typer
 
+from psa_casadi import InputError
 from psa_casadi.cli.failures import guarded
 from psa_casadi.cli.screen import Quiet, show, working
-from psa_casadi.errors import InputError
-from psa_casadi.report.words.tables import Table
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import TitledTable
 from tests.studies.fuzz import commands, fmus, readers, surroundings
-from tests.studies.fuzz.campaign import KINDS, Amount, Tally, Target, replay
-from tests.studies.fuzz.campaign import run as attack
+from tests.studies.fuzz.campaign import KINDS, Tally, Target, replay, run
 
 TARGETS: dict[str, Target] = {
     target.name: target
@@ -37,60 +35,56 @@ def chosen_targets(names: Sequence[str]) -> list[Target]:
     return [t for t in TARGETS.values() if not names or t.name in names or t.room in names]
 
 
-def tables(tally: Tally) -> tuple[TitledTable, ...]:
+def tables(tally: Tally) -> list[TitledTable]:
     """Return what was counted by target, and the distinct failures, if there are any."""
     rows = []
     for name in (*(n for n in TARGETS if tally.inputs[n]), "all"):
         own = [n for n in TARGETS if name in (n, "all")]
         inputs, accepted = (sum(c[n] for n in own) for c in (tally.inputs, tally.accepted))
-        seconds = sum(tally.seconds[n] for n in own)
-        failures = [sum(tally.kinds[n, kind] for n in own) for kind in KINDS]
-        counts = [f"{n:,}" for n in (inputs, accepted, *failures)]
-        rows.append((name, *counts, f"{inputs / max(seconds, 1e-9):,.3g}"))
+        seconds = sum(tally.seconds.get(n, 0.0) for n in own)
+        failures = {kind: f"{sum(tally.kinds[n, kind] for n in own):,}" for kind in KINDS}
+        rows.append({
+            "target": name, "inputs": f"{inputs:,}", "accepted": f"{accepted:,}", **failures,
+            "inputs per s of a core": f"{inputs / max(seconds, 1e-9):,.3g}",
+        })  # fmt: skip
     counted = TitledTable(
         f"Inputs and failures, seed {tally.seed}",
-        Table(("target", "inputs", "accepted", *KINDS, "inputs per s of a core"), tuple(rows)),
+        rows,
         "accepted: read or done without an error; all others were refused with a sentence.",
     )
-    if not tally.failures:
-        return (counted,)
-    found = tuple(
-        (d.first.target, d.first.kind, f"{d.times:,}", " ".join(d.first.sentence.split())[:150],
-         f"{d.first.index}", str(d.file or "-"))
+    found = [
+        {"target": d.first.target, "kind": d.first.kind, "times": f"{d.times:,}",
+         "the first of them": " ".join(d.first.sentence.split())[:150], "input": d.first.index,
+         "file": d.file or "-"}
         for d in tally.distinct.values()
-    )  # fmt: skip
+    ]  # fmt: skip
     failed = TitledTable(
         "Distinct failures",
-        Table(("target", "kind", "times", "the first of them", "input", "file"), found),
+        found,
         "Again, from the file: python -m tests.studies fuzz --replay FILE;"
         f" from the seed: fuzz --only TARGET --seed {tally.seed} --from INPUT --inputs 1.",
     )
-    return counted, failed
+    return [counted, failed] if found else [counted]
 
 
-_SECONDS, _QUICK_SECONDS = 60.0, 10.0
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
-def run(progress: Progress, quick: bool) -> Outcome:
-    """Attack everything for a minute, or for ten seconds."""
-    amount = Amount(seconds=_QUICK_SECONDS if quick else _SECONDS)
-    return Outcome(tables(attack(chosen_targets(()), 1, amount, progress=progress)))
-
-
+@app.command(epilog="Example: python -m tests.studies fuzz --seconds 3600 --only readers,files")
+@guarded
 def fuzz(
     *,
     seconds: Annotated[
         float, typer.Option(help="How long all targets are attacked together [s].")
-    ] = _SECONDS,
+    ] = 60.0,
     inputs: Annotated[
-        int | None, typer.Option(help="Inputs of each target, in place of a time.")
+        int | None, typer.Option(min=1, help="Inputs of each target, in place of a time.")
     ] = None,
     first: Annotated[int, typer.Option("--from", help="Number of the first input.")] = 0,
     seed: Annotated[int, typer.Option(help="Seed of the inputs.")] = 1,
     only: Annotated[
-        str | None,
-        typer.Option(help="Targets or rooms, such as readers,kills; by default all."),
-    ] = None,
+        str, typer.Option(help="Targets or rooms, such as readers,kills; by default all.")
+    ] = "",
     jobs: Annotated[
         int | None, typer.Option(help="Processes side by side; by default one for each core.")
     ] = None,
@@ -108,30 +102,19 @@ def fuzz(
         for distinct in tally.distinct.values():
             show(distinct.first.detail, quiet)
     else:
-        tally = _campaign(seconds, inputs, first, seed, only, jobs, keep, quiet)
+        targets = chosen_targets([n.strip() for n in only.split(",") if n.strip()])
+        each = None if inputs is None else {t.name: inputs for t in targets}
+        for which in (
+            signal.SIGINT,
+            signal.SIGTERM,
+        ):  # both end with a table, in the background too
+            signal.signal(which, signal.default_int_handler)
+        with working("attacking", quiet) as progress:
+            tally = run(
+                targets, seed, seconds=seconds if each is None else float("inf"), inputs=each,
+                first=first, jobs=jobs, keep=keep, progress=progress,
+            )  # fmt: skip
     for titled in tables(tally):
         show(f"\n{titled}", quiet)
     if tally.failures:
         raise typer.Exit(1)
-
-
-def _campaign(
-    seconds: float, inputs: int | None, first: int, seed: int, only: str | None, jobs: int | None,
-    keep: Path, quiet: bool,
-) -> Tally:  # fmt: skip
-    names = [n.strip() for n in (only or "").split(",") if n.strip()]
-    targets = chosen_targets(names)
-    if inputs is not None and inputs < 1:
-        raise InputError(f"--inputs is {inputs}; give how many, at least 1.")
-    each = None if inputs is None else dict.fromkeys([t.name for t in targets], inputs)
-    amount = Amount(seconds if each is None else float("inf"), each, first)
-    for which in (signal.SIGINT, signal.SIGTERM):  # both end with a table, also in the background
-        signal.signal(which, signal.default_int_handler)
-    with working("attacking", quiet) as progress:
-        return attack(targets, seed, amount, jobs=jobs, keep=keep, progress=progress)
-
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-app.command(epilog="Example: python -m tests.studies fuzz --seconds 3600 --only readers,files")(
-    guarded(fuzz)
-)

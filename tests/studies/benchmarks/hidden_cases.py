@@ -13,14 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.result import Diagnosis, Verdict
+import psa_casadi as psa
+from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.task import Method
-from psa_casadi.effects import EFFECTS
-from psa_casadi.records.record import Record
-from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.records import hidden_record, played_again
-from tests.studies.benchmarks.table import TitledTable
+from tests.studies.benchmarks.table import Progress, on_all_cores
 from tests.studies.plants.excitations import DesignKind, ExcitationKind, PoorKind
 from tests.studies.plants.make import Truth
 from tests.studies.plants.noise import NoiseKind
@@ -130,14 +127,13 @@ def how_made(case: Case) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def records_of(case: Case) -> tuple[Truth, list[Record]]:
+def records_of(case: Case) -> tuple[Truth, list[psa.Record]]:
     """Make the records of a case as files, and read them."""
     truth, record = hidden_record(case.effect, case.seed, **how_made(case))
-    more = range(1, case.records)
-    records = [record, *(played_again(truth, case.seed + 10_000 * k) for k in more)]
-    if case.records > 1:
-        records = [r.slice(0, min(_CUT, r.n)) for r in records]
-    return truth, records
+    if case.records == 1:
+        return truth, [record]
+    more = (played_again(truth, case.seed + 10_000 * k) for k in range(1, case.records))
+    return truth, [r.slice(0, min(_CUT, r.n)) for r in (record, *more)]
 
 
 def run_case(case: Case, method: Method | None = None, only: bool = False) -> Found:
@@ -147,20 +143,10 @@ def run_case(case: Case, method: Method | None = None, only: bool = False) -> Fo
     """
     truth, records = records_of(case)
     left_out = case.right if case.kind == "left out" else None
-    table = [e for n, e in EFFECTS.items() if (n == case.right if only else n != left_out)]
+    table = [e for n, e in psa.EFFECTS.items() if (n == case.right if only else n != left_out)]
     begin = time.process_time()
-    d = diagnose(records, effects=table, method=method)
-    return _found(case, d, truth, time.process_time() - begin)
-
-
-def names_of(d: Diagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the named causes, and these with what they cannot be told from."""
-    named = tuple(c.effect for c in d.causes)
-    alike = (n for c in d.causes for n in c.cannot_be_told_from)
-    return named, tuple(dict.fromkeys((*named, *alike)))
-
-
-def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
+    d = psa.diagnose(records, effects=table, method=method)
+    seconds = time.process_time() - begin
     named, within = names_of(d)
     return Found(
         case=case,
@@ -179,7 +165,21 @@ def _found(case: Case, d: Diagnosis, truth: Truth, seconds: float) -> Found:
     )
 
 
-def _patched(d: Diagnosis) -> float:
+def diagnosed(
+    cases: Sequence[Case], progress: Progress, method: Method | None = None, only: bool = False
+) -> list[Found]:
+    """Diagnose cases side by side; with `only`, by a table of the right effect alone."""
+    return on_all_cores(run_case, [(case, method, only) for case in cases], progress)
+
+
+def names_of(d: psa.Diagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the named causes, and these with what they cannot be told from."""
+    named = tuple(c.effect for c in d.causes)
+    alike = (n for c in d.causes for n in c.cannot_be_told_from)
+    return named, tuple(dict.fromkeys((*named, *alike)))
+
+
+def _patched(d: psa.Diagnosis) -> float:
     """Return what is offered without a name: the effects that are kept, and the correction."""
     b = d.budget
     if b is None:
@@ -188,7 +188,7 @@ def _patched(d: Diagnosis) -> float:
     return kept + (b.unnamed.share if b.unnamed is not None else 0.0)
 
 
-def _level(d: Diagnosis, truth: Truth) -> float:
+def _level(d: psa.Diagnosis, truth: Truth) -> float:
     """Return the rms of the noise that was added, of a first record in its held-out samples [m]."""
     if len(d.experiments) > 1:
         return truth.sigma
@@ -234,29 +234,3 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
     for _ in range(3 * seeds):
         cases.append(Case("six", str(rng.choice(known)), next(seed), records=6))
     return cases
-
-
-def limits_table(missed: Sequence[Found], known: Sequence[Found]) -> TitledTable:
-    """Return each case that was missed beside what is said where its effect is known."""
-    told = {f.case: f for f in known}
-    rows = tuple(limits_row(f, told[f.case]) for f in missed)
-    return TitledTable(
-        "What the missed records hold",
-        Table(("hidden", "seed", "rho", "said", "known beforehand", "rival"), rows),
-        "Known beforehand: what is said where the right effect is the only one in the table, and"
-        " its evidence [nats]; a cause has a price of 8. Rival: evidence of the strongest other"
-        " effect less that of the right one, in the first step with the whole table.",
-    )
-
-
-def limits_row(f: Found, told: Found) -> tuple[str, ...]:
-    """Return the row of a case that was `f`, and `told` with the right effect alone."""
-    right = str(f.case.right)
-    others = [e for name, e in f.evidence.items() if name != right]
-    known = f"{told.verdict}, {told.evidence.get(right, float('nan')):.1f}"
-    ahead = f"{max(others) - f.evidence[right]:+.1f}" if others and right in f.evidence else "-"
-    return (right, str(f.case.seed), f"{f.rho:.2f}", _said(f), known, ahead)
-
-
-def _said(f: Found) -> str:
-    return f"{f.verdict}: {', '.join(f.within)}" if f.within else f.verdict

@@ -1,24 +1,22 @@
 """The benchmark `method`: the two pictures of docs/method.md, from one record with two causes."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psa_casadi.diagnosis.diagnose import diagnose
+import psa_casadi as psa
 from psa_casadi.diagnosis.pack import STACK, Task
-from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.split import divided
 from psa_casadi.report.words.phrases import length_scale, plain
-from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.records import hidden_record
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
@@ -36,21 +34,21 @@ def run(progress: Progress, quick: bool) -> Outcome:
         record = record.slice(0, 3000)
     experiments = divided([record], [])
     base = fit_base(starting_model([record], None), experiments, progress=progress)
-    table = tuple(e for e in EFFECTS.values() if not e.inputs or record.temperature is not None)
-    table = tuple(e for e in table if set(e.needs) <= {c.name for c in base.model.components})
-    found = best_first(base, Task(experiments, table, STACK, progress=progress))
-    d = diagnose([record], progress=progress)
-    rows = [(_named(h), f"{found.scale.score(h):.0f}", "yes" if h.names in found.worthy else "no")
-            for h in _best(found)]  # fmt: skip
-    head = ("hypothesis", "score", "may be the answer")
-    return Outcome(
-        (TitledTable(f"The search on a record with {' and '.join(map(plain, HIDDEN))}",
-                     Table(head, tuple(rows))),),
-        lambda: picture(found, d),
-    )  # fmt: skip
+    there = {c.name for c in base.model.components}
+    table = [e for e in psa.EFFECTS.values() if not e.inputs or record.temperature is not None]
+    table = [e for e in table if set(e.needs) <= there]
+    found = best_first(base, Task(experiments, tuple(table), STACK, progress=progress))
+    d = psa.diagnose([record], progress=progress)
+    rows = [
+        {"hypothesis": _named(h), "score": f"{found.scale.score(h):.0f}",
+         "may be the answer": "yes" if h.names in found.worthy else "no"}
+        for h in _best(found)
+    ]  # fmt: skip
+    title = f"The search on a record with {' and '.join(map(plain, HIDDEN))}"
+    return Outcome((TitledTable(title, rows),), partial(picture, found, d))
 
 
-def picture(found: Known, d: Diagnosis) -> Figure:
+def picture(found: Known, d: psa.Diagnosis) -> Figure:
     """Return scores of the hypotheses, and the shares of the budget."""
     figure = Figure(figsize=(12.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
@@ -61,28 +59,28 @@ def picture(found: Known, d: Diagnosis) -> Figure:
 
 def _scores(axes: Axes, found: Known) -> None:
     rows = _best(found)[::-1]
-    colours = [_BLUE if h is found.answer else _ORANGE if h.names in found.worthy else _GREY
-               for h in rows]  # fmt: skip
-    names = [_named(h) for h in rows]
-    axes.barh(names, [max(found.scale.score(h), 0.0) for h in rows], color=colours)
+    colours = [
+        _BLUE if h is found.answer else _ORANGE if h.names in found.worthy else _GREY for h in rows
+    ]
+    scores = [max(found.scale.score(h), 0.0) for h in rows]
+    axes.barh([_named(h) for h in rows], scores, color=colours)
     axes.set_xlabel("score [ln units]")
-    axes.set_title("Blue: the answer; orange: may be it;\n"
-                   "grey: fails a rule",
-                   loc="left", fontsize=10)  # fmt: skip
+    title = "Blue: the answer; orange: may be it;\ngrey: fails a rule"
+    axes.set_title(title, loc="left", fontsize=10)
     axes.tick_params(labelsize=8)
 
 
-def _shares(axes: Axes, d: Diagnosis) -> None:
+def _shares(axes: Axes, d: psa.Diagnosis) -> None:
     b = d.budget
     if b is None:
         return
-    shares = [*b.causes, *([b.unnamed] if b.unnamed is not None else [])]
-    names = [plain(s.what).replace(" ", "\n") for s in b.causes]
-    names += [f"unnamed:\n{d.patch.kind}"] if d.patch is not None and b.unnamed is not None else []
-    values = [100.0 * s.share for s in shares]
-    errors = np.array([[100.0 * (s.share - max(s.interval[0], 0.0)) for s in shares],
-                       [100.0 * (min(s.interval[1], 1.0) - s.share) for s in shares]])  # fmt: skip
-    axes.bar(names, values, color=_BLUE, yerr=np.abs(errors), capsize=4)
+    shares = {plain(s.what).replace(" ", "\n"): s for s in b.causes}
+    if b.unnamed is not None and d.patch is not None:
+        shares[f"unnamed:\n{d.patch.kind}"] = b.unnamed
+    values = np.array([s.share for s in shares.values()])
+    ends = np.clip([s.interval for s in shares.values()], 0.0, 1.0)
+    reach = 100.0 * np.abs(ends.T - values)
+    axes.bar(list(shares), 100.0 * values, color=_BLUE, yerr=reach, capsize=4)
     left = 100.0 * (b.remains_rms_m / max(b.excess_rms_m, 1e-300)) ** 2
     axes.bar(["remains"], [left], color=_GREY)
     scale = length_scale(b.excess_rms_m)

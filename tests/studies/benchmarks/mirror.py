@@ -12,17 +12,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+import psa_casadi as psa
 from psa_casadi import datasets
 from psa_casadi.datasets.devices import LEVELS, SIGNS, linear_response, own_part
-from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.errors import InputError
-from psa_casadi.model.compose import Model
-from psa_casadi.model.model_file import load_model
-from psa_casadi.report.words.tables import Table
-from psa_casadi.simulation.simulate import simulate
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
-
-FloatArray = npt.NDArray[np.float64]
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
 
 #: Sampling rate; samples that the score leaves out; samples played before; error of a simulation.
 RATE, SKIPPED, LEAD, RTOL = 6400.0, 100, 1000, 1e-4
@@ -41,21 +34,23 @@ _NOTE = (
 )
 
 
-def run(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose axis 1 at 100 mV and score its model; `quick` scores the linear response alone."""
+def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
+    """Diagnose axis 1 at 100 mV and score its model; `quick` scores the linear response alone.
+
+    Or score the models of a folder: axis_1_*.json, axis_2_*.json, axis_3_*.json.
+    """
+    if folder is not None:
+        files = sorted(folder.glob("axis_[123]_*.json"))
+        if not files:
+            raise psa.InputError(
+                f"{folder}: holds no model axis_1_*.json; `psa diagnose -o` writes one."
+            )
+        return _outcome([(f.name, int(f.name[5]) - 1, psa.load_model(f)) for f in files], progress)
     if quick:
         return _outcome([], progress)
     record = datasets.load("steering_mirror")[0]
-    model = diagnose([record], progress=progress).model
+    model = psa.diagnose([record], progress=progress).model
     return _outcome([("diagnosed at 100 mV", 0, model)], progress)
-
-
-def run_on(progress: Progress, folder: Path) -> Outcome:
-    """Score the models of a folder: axis_1_*.json, axis_2_*.json, axis_3_*.json."""
-    files = sorted(folder.glob("axis_[123]_*.json"))
-    if not files:
-        raise InputError(f"{folder}: holds no model axis_1_*.json; `psa diagnose -o` writes one.")
-    return _outcome([(f.name, int(f.name[5]) - 1, load_model(f)) for f in files], progress)
 
 
 def scores(
@@ -63,7 +58,7 @@ def scores(
     y: FloatArray,
     response: npt.NDArray[np.complex128],
     axis: int,
-    model: Model | None,
+    model: psa.Model | None,
 ) -> tuple[float, float]:
     """Return the score of an axis [1] and the rms error [m].
 
@@ -85,25 +80,23 @@ def scores(
     return float(np.mean(shares)), float(np.mean(errors))
 
 
-def settled(model: Model, periods: FloatArray) -> FloatArray:
+def settled(model: psa.Model, periods: FloatArray) -> FloatArray:
     """Return the displacement (samples, periods) without its mean [m].
 
     The end of the last period is played before, as the authors do, so that transients have died.
     """
     n, count = periods.shape
     v = np.concatenate([periods[-LEAD:, -1], periods.T.reshape(-1)])
-    x = simulate(model, np.arange(len(v)) / RATE, v, rtol=RTOL).displacement[LEAD:]
+    x = psa.simulate(model, np.arange(len(v)) / RATE, v, rtol=RTOL).displacement[LEAD:]
     shown: FloatArray = (x - np.mean(x)).reshape(count, n).T
     return shown
 
 
-def _outcome(models: Sequence[tuple[str, int, Model]], progress: Progress) -> Outcome:
+def _outcome(models: Sequence[tuple[str, int, psa.Model]], progress: Progress) -> Outcome:
     files = datasets.originals("steering_mirror_test")
-    cases: list[tuple[str, int, Model | None]] = [*models]
-    cases += [
-        ("the linear response of the training signals, line by line", a, None) for a in range(3)
-    ]
-    found: dict[int, list[str]] = {k: [] for k in range(len(cases))}
+    linear = "the linear response of the training signals, line by line"
+    cases = [*models, *((linear, axis, None) for axis in range(3))]
+    rows = [{"model": name, "output": f"{axis + 1}"} for name, axis, _ in cases]
     for level in LEVELS:
         u, y, test_u, test_y = (
             np.load(files[f"{s}_{level}mV_{part}.npy"], allow_pickle=False)
@@ -111,11 +104,11 @@ def _outcome(models: Sequence[tuple[str, int, Model]], progress: Progress) -> Ou
             for s in "uy"
         )
         response = linear_response(u, y)
-        for k, (name, axis, model) in enumerate(cases):
+        for row, (name, axis, model) in zip(rows, cases, strict=True):
             progress(f"{name}, output {axis + 1}, {level} mV")
             share, rms = scores(test_u, test_y, response, axis, model)
-            found[k].append(f"{100 * share:.2f} ({1e6 * rms:.3f})")
-    rows = [(name, f"{axis + 1}", *found[k]) for k, (name, axis, _) in enumerate(cases)]
-    rows += [(name, outputs, *(f"{x:.2f}" for x in of)) for name, outputs, of in _PUBLISHED]
-    head = ("model", "output", *(f"{level} mV" for level in LEVELS))
-    return Outcome((TitledTable("Steering mirror, test signals", Table(head, tuple(rows)), _NOTE),))
+            row[f"{level} mV"] = f"{100 * share:.2f} ({1e6 * rms:.3f})"
+    for name, outputs, of in _PUBLISHED:
+        cells = (name, outputs, *(f"{x:.2f}" for x in of))
+        rows.append(dict(zip(rows[0], cells, strict=True)))
+    return Outcome((TitledTable("Steering mirror, test signals", rows, _NOTE),))

@@ -8,23 +8,21 @@ corners that a linear stack has too do not count. (A free delay would absorb hys
 a loop is nearly one.)
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import product
 from math import copysign, pi, sqrt, tan
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from scipy.integrate import odeint
 
-from psa_casadi.model.nanopositioner import nanopositioner
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled, table_of
+import psa_casadi as psa
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, styled
 
-FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float]
 
 #: States: filter, compensator (u, f_H), amplifier, stack (7), stage (2); their usual sizes.
@@ -44,11 +42,9 @@ class Case:
     position: FloatArray
     deviation: FloatArray
     nonlinearity: float
-    tracking: float
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """At the instants: stage and tip of the stack [m], command and voltage at the stack [V]."""
 
     time: FloatArray
@@ -146,8 +142,7 @@ def simulate_positioner(
         held = partial(rates, command=command)
         atol: Any = 1e-2 * rtol * _SIZES  # one for each state, which the stubs do not know
         state = odeint(held, state, [0.0, period], rtol=rtol, atol=atol)[1]
-    position, tip, commands, voltage = np.array(rows).T
-    return Run(time, position, tip, commands, voltage)
+    return Run(time, *np.array(rows).T)
 
 
 #: Colour and name of a case by (closed loop, compensated).
@@ -206,105 +201,76 @@ _NOTE = (
     f"Stack {STACK} on the flexure stage (0.2 kg, 5 N/um), {1e6 * PEAK:g} um at {FREQUENCY:g} Hz,"
     f" controller every {1e6 * PERIOD:g} us; second period from rest, simulated by an independent"
     " plain loop (scipy). Nonlinearity: largest distance from the best line of position against the"
-    " position of the same loop with a linear stack, over the range. Tracking error: largest"
-    " |position - reference| over the reference's range, nothing fitted; in open loop the command"
-    " is the reference over the linear plant's gain, in closed loop it is the feed-forward too."
+    " position of the same loop with a linear stack, over the range. In open loop the command is"
+    " the reference over the linear plant's gain, in closed loop it is the feed-forward too."
 )
-_WRONG = (
-    "The stack simulated has other hysteresis parameters than the compensator and the controller"
-    " were made from."
-)
-
-
-def triangle(t: float) -> float:
-    """Return the raster: up to the peak and down, both at one speed [m]."""
-    return PEAK * (1.0 - abs(2.0 * (t * FREQUENCY % 1.0) - 1.0))
-
-
-def sine(t: float) -> float:
-    """Return a sine from 0 to the peak [m]."""
-    return 0.5 * PEAK * (1.0 - float(np.cos(2.0 * np.pi * FREQUENCY * t)))
-
-
-WAVES: dict[str, Callable[[float], float]] = {"triangle": triangle, "sine": sine}
+_WRONG = "The stack simulated has other hysteresis parameters than compensator and controller know."
+#: The raster, up to the peak and down at one speed, and a sine from 0 to the peak [m].
+WAVES: dict[str, Callable[[float], float]] = {
+    "triangle": lambda t: PEAK * (1.0 - abs(2.0 * (t * FREQUENCY % 1.0) - 1.0)),
+    "sine": lambda t: 0.5 * PEAK * (1.0 - float(np.cos(2.0 * np.pi * FREQUENCY * t))),
+}
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Simulate all cases; `quick` takes the triangle, and of the errors one."""
-    cases = list(_cases(progress, quick))
+    cases = []
+    waves, errors = (list(of)[: n if quick else None] for of, n in ((WAVES, 1), (ERRORS, 2)))
+    for wave, closed, compensated in product(waves, (False, True), (False, True)):
+        for error in errors if compensated else ("exact",):
+            loop = "closed" if closed else "open"
+            progress(f"{wave}, {loop} loop, {'' if compensated else 'un'}compensated, {error}")
+            cases.append(simulate_case(wave, closed, compensated, error))
     return Outcome(tables(cases), partial(picture, cases))
 
 
-def _cases(progress: Progress, quick: bool) -> Iterator[Case]:
-    for wave, closed, compensated in product(
-        ("triangle",) if quick else WAVES, (False, True), (False, True)
-    ):
-        for error in ERRORS if compensated else ("exact",):
-            if quick and error not in ("exact", "all +10 %"):
-                continue
-            loop = "closed" if closed else "open"
-            progress(f"{wave}, {loop} loop, {'' if compensated else 'un'}compensated, {error}")
-            yield simulate_case(wave, closed=closed, compensated=compensated, error=error)
-
-
-def simulate_case(wave: str, *, closed: bool, compensated: bool, error: str = "exact") -> Case:
+def simulate_case(wave: str, closed: bool, compensated: bool, error: str = "exact") -> Case:
     """Simulate one case and measure its last period."""
-    values = _values(closed=closed, compensated=compensated)
+    values = _values(closed, compensated)
     for name, factor in ERRORS[error].items():
         values["stack"][name] *= factor
-    end = _PERIODS / FREQUENCY
-    found = simulate_positioner(values, WAVES[wave], end, PERIOD)
+    found = simulate_positioner(values, WAVES[wave], _PERIODS / FREQUENCY, PERIOD)
     last = found.time >= found.time[-1] - 1.0 / FREQUENCY
     time, position = found.time[last], found.position[last]
     reference = np.array([WAVES[wave](float(t)) for t in time])
-    deviation = line_deviation(linear_run(wave, closed).position[last], position)
+    line = np.polynomial.Polynomial.fit(
+        linear := linear_run(wave, closed).position[last], position, 1
+    )
+    deviation = position - line(linear)
     nonlinearity = float(np.abs(deviation).max() / np.ptp(position))
-    tracking = float(np.abs(position - reference).max() / np.ptp(reference))
-    shown = (time, reference, position, deviation, nonlinearity, tracking)
+    shown = (time, reference, position, deviation, nonlinearity)
     return Case(closed, compensated, wave, error, *shown)
 
 
-def _values(*, closed: bool, compensated: bool) -> dict[str, dict[str, float]]:
+def _values(closed: bool, compensated: bool) -> dict[str, dict[str, float]]:
     """Return the values of the parts; in open loop the feed-forward is the whole command."""
-    system = nanopositioner(STACK, compensated=compensated, sample_time=PERIOD)
+    system = psa.nanopositioner(STACK, compensated=compensated, sample_time=PERIOD)
     values = {name: dict(model.values) for name, model in system.parts.items()}
     if not closed:
-        controller = values["controller"]
-        controller["proportional_gain"] = controller["integral_gain"] = 0.0
+        values["controller"] |= dict.fromkeys(("proportional_gain", "integral_gain"), 0.0)
     return values
 
 
 @cache
 def linear_run(wave: str, closed: bool) -> Run:
     """Simulate the loop with a stack that has no hysteresis, and so nothing to compensate."""
-    values = _values(closed=closed, compensated=False)
+    values = _values(closed, False)
     values["stack"] |= dict.fromkeys(("A", "beta", "gamma", "delta"), 0.0)
     return simulate_positioner(values, WAVES[wave], _PERIODS / FREQUENCY, PERIOD)
 
 
-def line_deviation(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return y minus its least-squares line in x."""
-    basis = np.column_stack([x, np.ones_like(x)])
-    left: FloatArray = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
-    return left
-
-
-def tables(cases: list[Case]) -> tuple[TitledTable, ...]:
+def tables(cases: Sequence[Case]) -> tuple[TitledTable, ...]:
     """Return the nonlinearity of exact compensators, and of wrong ones."""
-    Columns = dict[str, Callable[[Case], str]]
-    loops: Columns = {
-        "reference": lambda c: c.wave,
-        "loop": lambda c: "closed" if c.closed else "open",
-    }
-    figures: Columns = {
-        "nonlinearity [% of range]": lambda c: f"{100 * c.nonlinearity:.3f}",
-        "tracking error [%]": lambda c: f"{100 * c.tracking:.3f}",
-    }
-    with_it: Columns = {"compensator": lambda c: "with" if c.compensated else "without"}
-    wrong: Columns = {"stack's parameters": lambda c: c.error}
-    exact = [c for c in cases if c.error == "exact"]
-    off = [c for c in cases if c.compensated]
+    rows = [
+        {"reference": c.wave, "loop": "closed" if c.closed else "open",
+         "compensator": "with" if c.compensated else "without",
+         "stack's parameters": c.error,
+         "nonlinearity [% of range]": f"{100 * c.nonlinearity:.3f}"}
+        for c in cases
+    ]  # fmt: skip
+    exact = [r for r in rows if r["stack's parameters"] == "exact"]
+    off = [r for r in rows if r["compensator"] == "with"]
     return (
-        table_of("Nonlinearity of the positioner", exact, loops | with_it | figures, _NOTE),
-        table_of("With hysteresis parameters that are off", off, loops | wrong | figures, _WRONG),
+        TitledTable("Nonlinearity of the positioner", exact, _NOTE),
+        TitledTable("With hysteresis parameters that are off", off, _WRONG),
     )

@@ -9,19 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import logsumexp
 from scipy.stats import binom, chi2, kstest, multivariate_normal, norm
 
 import psa_casadi as psa
-from psa_casadi.effects import EFFECTS
 from psa_casadi.posterior.chains import chains_of, prior_draws
 from psa_casadi.posterior.task import Block, Density, Task, task_of
-from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
-
-FloatArray = npt.NDArray[np.float64]
+from tests.studies.benchmarks.records import noisy
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
 
 #: Effects that are tried, and gains in ordinary changes that the record has.
 CASES = (
@@ -38,62 +34,51 @@ LONG, LONG_TUNE, CHAINS = 1000, 500, 2
 _ROUNDS, _CLOSE = 200, 1e-8
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """ln Z of one model by bridge sampling, Laplace's method and Schwarz's criterion."""
-
-    bridge: float
-    error: float
-    laplace: float
-    schwarz: float
-
-
 def evidence_table(progress: Progress, quick: bool) -> TitledTable:
     """Return ln Bayes factors of an effect over the base, by three ways, of every case."""
     rows = []
     for name, size in CASES[: 2 if quick else None]:
         progress(f"evidence: {name}, {size:g} of an ordinary size")
         record, *models = _case(name, size)
-        one, other = (evidence(task_for(record, m, FREE)) for m in models)
-        bridge = f"{other.bridge - one.bridge:.2f} ± {np.hypot(one.error, other.error):.2f}"
-        rest = (f"{getattr(other, w) - getattr(one, w):.2f}" for w in ("laplace", "schwarz"))
-        rows.append((name, f"{size:g}", bridge, *rest))
-    head = ("effect", "gain put in", "bridge sampling", "Laplace", "Schwarz")
-    return TitledTable(
-        "ln Bayes factor of an effect over the base",
-        Table(head, tuple(rows)),
-        "Gains in ordinary changes. Schwarz: -n/2 ln S - k/2 ln n, which knows no prior.",
-    )
+        (one, error), (other, further) = (evidence(task_for(record, m, FREE)) for m in models)
+        over = {way: f"{other[way] - one[way]:.2f}" for way in one}
+        over["bridge sampling"] += f" ± {np.hypot(error, further):.2f}"
+        rows.append({"effect": name, "gain put in": f"{size:g}", **over})
+    note = "Gains in ordinary changes. Schwarz: -n/2 ln S - k/2 ln n, which knows no prior."
+    return TitledTable("ln Bayes factor of an effect over the base", rows, note)
 
 
-def evidence(task: Task) -> Evidence:
-    """Return ln Z of a task up to the constant that models of the same record share.
+def evidence(task: Task) -> tuple[dict[str, float], float]:
+    """Return ln Z of a task by three ways, and the standard error of bridge sampling.
 
-    Every sample counts, as two models of one record need it.
+    Up to the constant that models of the same record share. Every sample counts, as two models of
+    one record need it.
     """
     blocks = tuple(Block(b.rows, float(b.rows.stop - b.rows.start)) for b in task.density.blocks)
     density = replace(task.density, blocks=blocks)
     with one_thread():
         found = chains_of(density, chains=CHAINS, draws=LONG, tune=LONG_TUNE, seed=1)
-    flat = found.u.reshape(-1, density.size)
     # of a density in u: the Jacobian of z, and what normal priors are short of
     kept = np.isfinite(task.unknowns.prior)
     known = task.unknowns.prior[kept]
     low, high = (edge[kept] / known for edge in task.unknowns.bounds())
-    constant = float(np.linalg.slogdet(density.factor)[1])
+    counts = sum(b.count for b in blocks)
+    level = counts * float(
+        np.log(task.density.blocks[0].level)
+    )  # residuals are weighted by a fit's own
+    constant = float(np.linalg.slogdet(density.factor)[1]) - level
     constant -= float(np.sum(np.log(known * np.sqrt(2.0 * np.pi))))
     constant -= float(np.sum(np.log(norm.cdf(high) - norm.cdf(low))))  # cut at the bounds
-    counts = sum(b.count for b in blocks)
-    level = counts * float(np.log(task.levels[0]))  # residuals are weighted by a fit's own
-    constant -= level
-    bridge, error = bridge_sampled(density, flat)
+    bridge, error = bridge_sampled(density, found.u.reshape(-1, density.size))
     peak, _ = density(np.zeros(density.size))
-    laplace = peak + 0.5 * density.size * np.log(2.0 * np.pi)
     rows = density.evaluate(task.theta)
     assert rows is not None
     fitted = sum(0.5 * b.count * np.log(float(np.sum(rows[0][b.rows] ** 2))) for b in blocks)
-    schwarz = -fitted - level - 0.5 * len(task.unknowns.names) * np.log(counts)
-    return Evidence(bridge + constant, error, laplace + constant, schwarz)
+    return {
+        "bridge sampling": bridge + constant,
+        "Laplace": peak + 0.5 * density.size * np.log(2.0 * np.pi) + constant,
+        "Schwarz": -fitted - level - 0.5 * len(task.unknowns.names) * np.log(counts),
+    }, error
 
 
 def bridge_sampled(density: Density, draws: FloatArray, seed: int = 0) -> tuple[float, float]:
@@ -124,13 +109,13 @@ def bridge_sampled(density: Density, draws: FloatArray, seed: int = 0) -> tuple[
 
 def _case(name: str, size: float) -> tuple[psa.Record, psa.Model, psa.Model]:
     """Return a record of the stack with an effect, and the models without and with it."""
-    base, effect = centred_model(), EFFECTS[name]
+    base, effect = centred_model(), psa.EFFECTS[name]
     gain = str(effect.gain)
     wider = base.with_effect(effect)
     ordinary = wider.parameter(gain).typical({**wider.values, gain: 0.0})
     true = wider.with_values({gain: size * ordinary})
-    clean = recorded(true, 0.0, np.random.default_rng(7))
-    record = recorded(true, NOISE * clean.range_m, np.random.default_rng(7))
+    clean = recorded(true)
+    record = noisy(clean, NOISE * clean.range_m, np.random.default_rng(7))
     return record, base, true if size else wider
 
 
@@ -144,7 +129,7 @@ BINS = 10
 LEVELS = (0.5, 0.8, 0.94)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Replica:
     """One draw of the prior: rank of the truth for every unknown, in which intervals it lies."""
 
@@ -154,23 +139,10 @@ class Replica:
     inflation: float
 
 
-def run(progress: Progress, quick: bool) -> Outcome:
-    """Print the tables of calibration and evidence."""
-    count = QUICK_REPLICAS if quick else REPLICAS
-    calibration = _calibration(progress, count)
-    return Outcome((*calibration, evidence_table(progress, quick)))
-
-
-def run_sized(progress: Progress, count: int) -> Outcome:
-    """Print the calibration of so many replicas alone."""
-    return Outcome(_calibration(progress, count))
-
-
-def voltage() -> tuple[FloatArray, FloatArray]:
-    """Return time [s] and voltage [V] of two loops from rest, the second higher."""
-    time: FloatArray = np.linspace(0.0, 0.399, 400)
-    applied: FloatArray = 60.0 * (1.0 - np.cos(10.0 * np.pi * time))
-    return time, applied * np.where(time > 0.2, 1.0, 0.5)
+def run(progress: Progress, quick: bool, size: int | None = None) -> Outcome:
+    """Measure calibration and evidence; with a size the calibration of so many replicas alone."""
+    calibration = _calibration(progress, size or (QUICK_REPLICAS if quick else REPLICAS))
+    return Outcome([calibration] if size else [calibration, evidence_table(progress, quick)])
 
 
 def centred_model() -> psa.Model:
@@ -178,14 +150,12 @@ def centred_model() -> psa.Model:
     return psa.stack_model(STACK).with_values(CENTRES)
 
 
-def recorded(
-    model: psa.Model, noise: float, rng: np.random.Generator, **memory: float
-) -> psa.Record:
-    """Return a record of a model that starts with a hysteresis force [N], with noise [m]."""
-    time, applied = voltage()
+def recorded(model: psa.Model, **memory: float) -> psa.Record:
+    """Return a record of two loops, the second higher, from a hysteresis force [N], no noise."""
+    time = np.linspace(0.0, 0.399, 400)
+    applied = 60.0 * (1.0 - np.cos(10.0 * np.pi * time)) * np.where(time > 0.2, 1.0, 0.5)
     x = psa.simulate(model, time, applied, memory=memory or None, rtol=1e-8).displacement
-    y = x + noise * rng.standard_normal(len(x))
-    return psa.Record(name="record", time=time, voltage=applied, displacement=y)
+    return psa.Record(name="record", time=time, voltage=applied, displacement=x)
 
 
 def task_for(record: psa.Record, model: psa.Model, widths: Mapping[str, float]) -> Task:
@@ -199,70 +169,57 @@ def task_for(record: psa.Record, model: psa.Model, widths: Mapping[str, float]) 
     return task_of(model, [record], free=tuple(wide), prior=centre, widths=wide)
 
 
-def _calibration(progress: Progress, count: int) -> tuple[TitledTable, TitledTable]:
+def _calibration(progress: Progress, count: int) -> TitledTable:
     rng, model = np.random.default_rng(20261125), centred_model()
-    noise = NOISE * recorded(model, 0.0, rng, f_H=0.0).range_m
-    before = task_for(recorded(model, noise, rng, f_H=0.0), model, WIDTHS)
-    truths = prior_draws(before, count, rng)
+    clean = recorded(model, f_H=0.0)
+    noise = NOISE * clean.range_m
+    rng.standard_normal(clean.n)  # of a first record, which is not used
+    before = task_for(noisy(clean, noise, rng), model, WIDTHS)
     found: list[Replica] = []
-    for k, truth in enumerate(truths):
+    for k, truth in enumerate(prior_draws(before, count, rng)):
         progress(f"calibration: {k + 1} of {count}")
         found.append(_replica(before, truth, noise, k))
-    names = (*WIDTHS, "f_H at the start")
-    return _ranks(found, names), _coverage(found, names)
+    return _ranks(found)
 
 
 def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replica:
-    u, rng = before.unknowns, np.random.default_rng(seed)
-    model = before.model.with_values(u.values(truth))
-    record = recorded(model, noise, rng, f_H=u.start(truth, 0)["f_H"])
-    task = task_for(record, centred_model(), WIDTHS)
+    u, model = before.unknowns, before.model.with_values(before.unknowns.values(truth))
+    clean = recorded(model, f_H=u.start(truth, 0)["f_H"])
+    task = task_for(noisy(clean, noise, np.random.default_rng(seed)), centred_model(), WIDTHS)
     with one_thread():
         chains = chains_of(task.density, chains=1, draws=DRAWS, tune=TUNE, seed=seed, cores=1)
     draws = np.array([task.density.theta(x) for x in chains.u[0]])
-    kept = [k for k in range(u.size) if np.isfinite(u.prior[k])]
-    ranks = [int((draws[::THIN, k] < truth[k]).sum()) for k in kept]
-    shares = [float((draws[:, k] < truth[k]).mean()) for k in kept]
-    inside = [tuple(abs(s - 0.5) <= 0.5 * level for level in LEVELS) for s in shares]
-    return Replica(tuple(ranks), tuple(inside), chains.divergences, task.inflation[0])
+    below = (draws < truth)[:, np.isfinite(u.prior)]
+    apart = np.abs(below.mean(axis=0) - 0.5)
+    inside = tuple(tuple(bool(a <= 0.5 * level) for level in LEVELS) for a in apart)
+    ranks = tuple(below[::THIN].sum(axis=0).tolist())
+    return Replica(ranks, inside, chains.divergences, task.density.blocks[0].alike)
 
 
-def _ranks(found: Sequence[Replica], names: Sequence[str]) -> TitledTable:
-    """Return chi-square and Kolmogorov's test of the ranks, each by parameter."""
-    possible = DRAWS // THIN + 1
-    rows = []
-    for k, name in enumerate(names):
-        ranks = np.array([r.ranks[k] for r in found])
-        counts = np.bincount(ranks * BINS // possible, minlength=BINS)
-        expected = len(found) / BINS
+def _ranks(found: Sequence[Replica]) -> TitledTable:
+    """Return chi-square and Kolmogorov's test of the ranks, and the intervals, by parameter."""
+    possible, expected, rows = DRAWS // THIN + 1, len(found) / BINS, []
+    ranks = np.array([r.ranks for r in found])
+    inside = 100.0 * np.array([r.inside for r in found]).mean(axis=0)  # (unknowns, levels)
+    heads = [f"in the {100 * level:.0f} % interval" for level in LEVELS]
+    for k, name in enumerate((*WIDTHS, "f_H at the start")):
+        counts = np.bincount(ranks[:, k] * BINS // possible, minlength=BINS)
         power = float(np.sum((counts - expected) ** 2) / expected)
-        p = float(chi2.sf(power, BINS - 1))
-        distance = kstest((ranks + 0.5) / possible, "uniform")
-        shown = " ".join(str(c) for c in counts)
-        rows.append((name, shown, f"{power:.1f}", f"{p:.2f}", f"{distance.pvalue:.2f}"))
+        rows.append({
+            "unknown": name, f"in {BINS} bins": " ".join(map(str, counts)),
+            "chi-square": f"{power:.1f}", "p": f"{chi2.sf(power, BINS - 1):.2f}",
+            "p (Kolmogorov)": f"{kstest((ranks[:, k] + 0.5) / possible, 'uniform').pvalue:.2f}",
+            **{h: f"{share:.0f} %" for h, share in zip(heads, inside[k], strict=True)},
+        })  # fmt: skip
+    every = {h: f"{share:.1f} %" for h, share in zip(heads, inside.mean(axis=0), strict=True)}
+    rows.append(dict.fromkeys(rows[0], "") | {"unknown": "all", **every})
     worth = float(np.median([r.inflation for r in found]))
+    bands = [np.array(binom.interval(0.95, len(found), q)) / len(found) for q in LEVELS]
+    ends = ", ".join(f"{100 * a:.0f} to {100 * b:.0f} %" for a, b in bands)
     return TitledTable(
-        f"Ranks of the truth among {possible - 1} draws, {len(found)} replicas",
-        Table(("unknown", f"in {BINS} bins", "chi-square", "p", "p (Kolmogorov)"), tuple(rows)),
+        f"Ranks of the truth among {possible - 1} draws, {len(found)} replicas; its intervals",
+        rows,
         f"{sum(r.divergences for r in found)} of {len(found) * DRAWS} transitions diverged;"
-        f" {worth:.2f} samples count as one (median).",
-    )
-
-
-def _coverage(found: Sequence[Replica], names: Sequence[str]) -> TitledTable:
-    rows = []
-    for k, name in enumerate(names):
-        shares = [np.mean([r.inside[k][j] for r in found]) for j in range(len(LEVELS))]
-        rows.append((name, *(f"{100.0 * s:.0f} %" for s in shares)))
-    every = [[r.inside[k][j] for r in found for k in range(len(names))] for j in range(len(LEVELS))]
-    rows.append(("all", *(f"{100.0 * np.mean(e):.1f} %" for e in every)))
-    bands = [binom.interval(0.95, len(found), level) for level in LEVELS]
-    ends = ", ".join(
-        f"{100 * a / len(found):.0f} to {100 * b / len(found):.0f} %" for a, b in bands
-    )
-    head = ("unknown", *(f"in the {100 * level:.0f} % interval" for level in LEVELS))
-    return TitledTable(
-        "Truth in central intervals",
-        Table(head, tuple(rows)),
-        f"Of one unknown, 95 % of such tables lie within {ends}.",
+        f" {worth:.2f} samples count as one (median). Of one unknown, 95 % of such tables have"
+        f" {ends} of the truths in the intervals.",
     )

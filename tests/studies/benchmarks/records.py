@@ -1,11 +1,12 @@
-"""Synthetic records from the independent reference: step, loops, multisine, with white noise.
+"""Records that benchmarks and tests share: of the independent reference, and of the plants.
 
-All begin at rest at 0 V and use the voltage from 0 to u_rated. Times follow the stack: a step lasts
-twelve times the slowest time constant of drive, creep lag and mechanics.
+Those of the reference begin at rest at 0 V and use the voltage from 0 to u_rated: a step, loops, a
+multisine. Times follow the stack: a step lasts twelve times the slowest time constant of drive,
+creep lag and mechanics.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
@@ -13,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.records import Record, multisine, read_record, sine, time_grid
+from psa_casadi.records import multisine, sine, time_grid
+from tests.studies.benchmarks.table import FloatArray
 from tests.studies.plants.again import play_again
 from tests.studies.plants.make import Truth, make_record
 
-FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float]
 
 STEP_SAMPLES, LOOP_SAMPLES, MULTISINE_SAMPLES = 2500, 1000, 2000
@@ -38,34 +39,30 @@ def slowest(values: Values) -> float:
     return float(max(decays))
 
 
-def response(values: Values, time: FloatArray, voltage: FloatArray) -> FloatArray:
-    """Return the reference's displacement (n,) [m], voltage linear between samples, from rest."""
-    bends = np.flatnonzero(np.abs(np.diff(voltage, 2)) > 1e-12 * np.ptp(voltage)) + 1
-    drive = reference.from_samples(time, voltage)
-    found = reference.simulate(values, drive, time, breakpoints=time[bends].tolist(), rtol=_RTOL)
-    return found.displacement
+def played(
+    values: Values, name: str, time: FloatArray, voltage: FloatArray,
+    smooth: Callable[[float], float] | None = None, rtol: float = _RTOL,
+) -> psa.Record:  # fmt: skip
+    """Return the reference's record from rest under a voltage (n,) [V] that is linear in between.
 
-
-def loop_response(
-    values: Values, amplitude: float, frequency: float, time: FloatArray
-) -> FloatArray:
-    """Return the reference's displacement (n,) [m] under the smooth sine of `loop_voltage`.
-
-    Straight lines between its samples lie within (pi / LOOP_SAMPLES)^2 / 4 of it, 3e-6 of the
-    range, and a smooth voltage costs the reference a hundredth of the time.
+    Or under the `smooth` one of which these are the samples, which costs the reference a hundredth
+    of the time. Straight lines between the samples of a loop lie within (pi / LOOP_SAMPLES)^2 / 4
+    of it, 3e-6 of the range.
     """
-    half, omega = 0.5 * amplitude * values["u_rated"], 2.0 * np.pi * frequency
-    found = reference.simulate(
-        values, lambda t: half * (1.0 - float(np.cos(omega * t))), time, rtol=_RTOL
-    )
-    return found.displacement
+    bends = np.flatnonzero(np.abs(np.diff(voltage, 2)) > 1e-12 * np.ptp(voltage)) + 1
+    drive = smooth or reference.from_samples(time, voltage)
+    kinks = [] if smooth else time[bends].tolist()
+    found = reference.simulate(values, drive, time, breakpoints=kinks, rtol=rtol)
+    return psa.Record(name=name, time=time, voltage=voltage, displacement=found.displacement)
 
 
-def step_voltage(values: Values, duration: float | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return time and voltage of a step from 0 to u_rated at the second sample."""
-    length = duration or 12.0 * slowest(values)
-    time = time_grid(length, length / STEP_SAMPLES)
-    voltage = np.full(time.shape, values["u_rated"])
+def step_voltage(
+    values: Values, share: float = 1.0, samples: int = STEP_SAMPLES
+) -> tuple[FloatArray, FloatArray]:
+    """Return time and voltage of a step from 0 to a share of u_rated at the second sample."""
+    length = 12.0 * slowest(values)
+    time = time_grid(length, length / samples)
+    voltage = np.full(time.shape, share * values["u_rated"])
     voltage[0] = 0.0
     return time, voltage
 
@@ -87,7 +84,7 @@ def multisine_voltage(values: Values, seed: int) -> tuple[FloatArray, FloatArray
     return time, swing * np.minimum(10.0 * time / time[-1], 1.0)
 
 
-def clean_set(values: Values) -> list[Record]:
+def clean_set(values: Values) -> list[psa.Record]:
     """Return a step, loops at three amplitudes and two frequencies, and a multisine, without noise.
 
     Results are kept, because the reference is slow and noise is all that seeds change.
@@ -95,55 +92,58 @@ def clean_set(values: Values) -> list[Record]:
     return [*_fast_set(tuple(sorted(values.items()))), *clean_loops(values)]
 
 
-def clean_loops(values: Values) -> list[Record]:
+def clean_loops(values: Values) -> list[psa.Record]:
     """Return the loops of `clean_set` alone, which take a small part of its time."""
     return list(_loop_set(tuple(sorted(values.items()))))
 
 
 @lru_cache(maxsize=16)
-def _fast_set(items: tuple[tuple[str, float], ...]) -> tuple[Record, ...]:
+def _fast_set(items: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
     values = dict(items)
     fast = {"step": step_voltage(values), "multisine": multisine_voltage(values, seed=1)}
-    return tuple(
-        Record(name=n, time=t, voltage=v, displacement=response(values, t, v))
-        for n, (t, v) in fast.items()
-    )
+    return tuple(played(values, name, *given) for name, given in fast.items())
 
 
 @lru_cache(maxsize=16)
-def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[Record, ...]:
+def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
     values, found = dict(items), []
-    for amplitude, frequency in product(LOOP_AMPLITUDES, LOOP_FREQUENCIES):
-        name = f"loop {100 * amplitude:.0f} % {frequency:g} Hz"
-        t, v = loop_voltage(values, amplitude, frequency)
-        x = loop_response(values, amplitude, frequency, t)
-        found.append(Record(name=name, time=t, voltage=v, displacement=x))
+    for share, f in product(LOOP_AMPLITUDES, LOOP_FREQUENCIES):
+        half, omega = 0.5 * share * values["u_rated"], 2.0 * np.pi * f
+
+        def smooth(t: float, half: float = half, omega: float = omega) -> float:
+            return half * (1.0 - float(np.cos(omega * t)))
+
+        name = f"loop {100 * share:.0f} % {f:g} Hz"
+        found.append(played(values, name, *loop_voltage(values, share, f), smooth))
     return tuple(found)
 
 
-def with_noise(records: Sequence[Record], share: float, seed: int | Sequence[int]) -> list[Record]:
+def with_noise(
+    records: Sequence[psa.Record], share: float, seed: int | Sequence[int]
+) -> list[psa.Record]:
     """Return the records with white noise of `share` times the largest range of the set added."""
-    level = share * max(r.range_m for r in records)
-    draw = np.random.default_rng(seed)
-    return [
-        replace(r, displacement=r.displacement + level * draw.standard_normal(r.n))
-        for r in records
-        if r.displacement is not None
-    ]
+    level, draw = share * max(r.range_m for r in records), np.random.default_rng(seed)
+    return [noisy(r, level, draw) for r in records]
 
 
-def hidden_record(effect: str | None, seed: int, **how: Any) -> tuple[Truth, Record]:
+def noisy(record: psa.Record, level: float, draw: np.random.Generator) -> psa.Record:
+    """Return a record with white noise of rms `level` [m] added to its displacement."""
+    more = level * draw.standard_normal(record.n)
+    return replace(record, displacement=np.asarray(record.displacement) + more)
+
+
+def hidden_record(effect: str | None, seed: int, **how: Any) -> tuple[Truth, psa.Record]:
     """Return a record of an independent plant that hides an effect, and the truth behind it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "record_0.csv"
-        return make_record(effect, seed, path, **how), read_record(path)
+        return make_record(effect, seed, path, **how), psa.read_record(path)
 
 
 def played_again(
     truth: Truth, seed: int, given: tuple[FloatArray, FloatArray] | None = None
-) -> Record:
+) -> psa.Record:
     """Return a further record of a device, under a drawn voltage or a given one."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"record_{seed}.csv"
         play_again(truth, seed, path, given)
-        return read_record(path)
+        return psa.read_record(path)

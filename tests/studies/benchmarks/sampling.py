@@ -13,18 +13,15 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 import psa_casadi as psa
 from psa_casadi.posterior.chains import chains_of, sampler_and_arviz
 from psa_casadi.posterior.task import Task
 from psa_casadi.report.words.phrases import number
-from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.side_by_side import one_thread
 from tests.studies.benchmarks.posterior import task_for
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
-
-FloatArray = npt.NDArray[np.float64]
+from tests.studies.benchmarks.records import noisy
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
 
 STACK, NOISE, SAMPLES = "P-885.51", 3e-3, 200
 #: Parameters that are sampled, with the widths of their priors.
@@ -48,20 +45,20 @@ class Drawn:
     @property
     def effective(self) -> float:
         """The smallest bulk effective sample size of all unknowns."""
-        _, arviz = sampler_and_arviz()
-        return min(float(arviz.ess(t[None, :], method="bulk")) for t in self.theta.T)
+        return min(_size(t, "bulk") for t in self.theta.T)
 
 
-def run(progress: Progress, quick: bool) -> Outcome:
-    """Return both ways on one record, and whether their posteriors agree."""
+def _size(draws: FloatArray, method: str) -> float:
+    """Return the effective sample size of one chain (n,)."""
+    return float(sampler_and_arviz()[1].ess(draws[None, :], method=method))
+
+
+def run(progress: Progress, quick: bool, size: int | None = None) -> Outcome:
+    """Return both ways on one record for so many draws of PyMC, and whether they agree."""
     if find_spec("pymc") is None:
         missing = "PyMC is not installed: `pip install --group sampling`."
-        return Outcome((TitledTable("Beside PyMC", Table(("way",), ()), missing),))
-    return run_sized(progress, QUICK if quick else THEIRS)
-
-
-def run_sized(progress: Progress, count: int) -> Outcome:
-    """Return the tables for so many draws of PyMC."""
+        return Outcome((TitledTable("Beside PyMC", (), missing),))
+    count = size or (QUICK if quick else THEIRS)
     task = task_for(record(), stack(), WIDTHS)
     progress("psa.sample's way")
     ours = drawn_by_psa(task, OURS, TUNE)
@@ -77,12 +74,12 @@ def stack() -> psa.Model:
 
 def record() -> psa.Record:
     """Return a simulated record of two slow triangles of the voltage, with noise."""
-    times: FloatArray = np.arange(SAMPLES, dtype=np.float64) * (2 * len(PEAKS) * LEG / SAMPLES)
+    times = np.arange(SAMPLES, dtype=np.float64) * (2 * len(PEAKS) * LEG / SAMPLES)
     corners = np.concatenate([[0.0], *([p, 0.0] for p in PEAKS)])
     applied = np.interp(times, LEG * np.arange(len(corners)), corners)
-    clean = psa.simulate(stack(), times, applied, rtol=1e-8).displacement
-    noise = NOISE * np.ptp(clean) * np.random.default_rng(SEED).standard_normal(SAMPLES)
-    return psa.Record(name="triangles", time=times, voltage=applied, displacement=clean + noise)
+    x = psa.simulate(stack(), times, applied, rtol=1e-8).displacement
+    clean = psa.Record(name="triangles", time=times, voltage=applied, displacement=x)
+    return noisy(clean, NOISE * clean.range_m, np.random.default_rng(SEED))
 
 
 def drawn_by_psa(task: Task, draws: int, tune: int) -> Drawn:
@@ -182,21 +179,18 @@ def hysteresis_rate(force: Any, t: Any, p: Any, values: Any, pt: Any) -> Any:
 
 def speed(found: list[Drawn]) -> TitledTable:
     """Return gradients, effective samples and processor time of each way, and their ratio."""
-    each = [f.effective / f.seconds for f in found]
-    rows = tuple(
-        (
-            f.way, str(len(f.theta)), f"{f.gradients:.0f}", number(1e3 * f.seconds / f.gradients),
-            f"{f.effective:.0f}", number(f.seconds), number(rate),
-        )
-        for f, rate in zip(found, each, strict=True)
-    )  # fmt: skip
-    head = (
-        "way", "draws", "gradients", "a gradient [ms]", "smallest bulk ESS", "processor [s]",
-        "ESS per second",
-    )  # fmt: skip
+    sizes = [f.effective for f in found]
+    each = [size / f.seconds for size, f in zip(sizes, found, strict=True)]
+    rows = [
+        {"way": f.way, "draws": len(f.theta), "gradients": f"{f.gradients:.0f}",
+         "a gradient [ms]": number(1e3 * f.seconds / f.gradients),
+         "smallest bulk ESS": f"{size:.0f}", "processor [s]": number(f.seconds),
+         "ESS per second": number(rate)}
+        for f, size, rate in zip(found, sizes, each, strict=True)
+    ]  # fmt: skip
     return TitledTable(
         f"One posterior of {found[0].theta.shape[1]} unknowns and {SAMPLES} samples, two ways",
-        Table(head, rows),
+        rows,
         f"psa.sample has {each[0] / each[1]:.0f} times the effective samples per second. Processor"
         " times hold tuning and drawing, and no compiling; one chain each.",
     )
@@ -204,17 +198,14 @@ def speed(found: list[Drawn]) -> TitledTable:
 
 def _agreement(task: Task, ours: Drawn, theirs: Drawn) -> TitledTable:
     """Return the differences of both posteriors' means over their Monte Carlo errors."""
-    _, arviz = sampler_and_arviz()
     names = (*task.unknowns.names, "f_H at the start", "offset")
     rows = []
-    for k, name in enumerate(names):
-        a, b = ours.theta[:, k], theirs.theta[:, k]
-        one, other = (
-            float(np.std(x)) / float(arviz.ess(x[None, :], method="mean")) ** 0.5 for x in (a, b)
-        )
-        error = float(np.hypot(one, other))
-        gap = (np.mean(b) - np.mean(a)) / error
-        moved = f"{(np.mean(b) - np.mean(a)) / np.std(a):.2f}"
-        rows.append((name, moved, f"{gap:.1f}", f"{np.std(b) / np.std(a):.2f}"))
-    head = ("unknown", "difference of means [sd]", "over its Monte Carlo error", "ratio of sd")
-    return TitledTable("Do both posteriors agree?", Table(head, tuple(rows)), "")
+    for name, a, b in zip(names, ours.theta.T, theirs.theta.T, strict=True):
+        error = np.hypot(*(np.std(x) / _size(x, "mean") ** 0.5 for x in (a, b)))
+        gap = np.mean(b) - np.mean(a)
+        rows.append({
+            "unknown": name, "difference of means [sd]": f"{gap / np.std(a):.2f}",
+            "over its Monte Carlo error": f"{gap / error:.1f}",
+            "ratio of sd": f"{np.std(b) / np.std(a):.2f}",
+        })  # fmt: skip
+    return TitledTable("Do both posteriors agree?", rows)

@@ -7,29 +7,23 @@ Every named stack, driven by a sine, a triangle, a multisine and steps, without 
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from psa_casadi.diagnosis.diagnose import diagnose
+import psa_casadi as psa
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.errors import PsaError
-from psa_casadi.model.stacks import STACKS, stack_model
-from psa_casadi.records.excitation import multisine, sine, steps, triangle
-from psa_casadi.records.record import Record
+from psa_casadi.records import multisine, sine, steps, triangle
 from psa_casadi.report.words.phrases import number
-from psa_casadi.simulation.simulate import simulate
+from tests.studies.benchmarks.records import noisy
 from tests.studies.benchmarks.table import (
+    FloatArray,
     Outcome,
     Progress,
     TitledTable,
     on_all_cores,
     share,
-    table_of,
 )
-
-FloatArray = npt.NDArray[np.float64]
 
 _SAMPLES, _RATE = 2000, 1000.0
 LINEAR = "0.1 um/V"
@@ -41,18 +35,10 @@ VOLTAGES: dict[str, Callable[[FloatArray, float], FloatArray]] = {
 }
 #: Noise: None, the file's resolution [m], or the rms over the range.
 ROUNDED = 1e-9
-NOISES: dict[str, float] = {
-    "none": 0.0,
-    "1 nm": ROUNDED,
-    "1e-5": 1e-5,
-    "3e-5": 3e-5,
-    "1e-4": 1e-4,
-    "1e-3": 1e-3,
-}
+NOISES = {"none": 0.0, "1 nm": ROUNDED, "1e-5": 1e-5, "3e-5": 3e-5, "1e-4": 1e-4, "1e-3": 1e-3}
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """One record: a named stack or the straight line, a voltage and a noise."""
 
     stack: str
@@ -60,8 +46,7 @@ class Case:
     noise: str
 
 
-@dataclass(frozen=True)
-class Said:
+class Said(NamedTuple):
     """What a diagnosis said of a case; `error` is the largest over the range, "" or a failure."""
 
     case: Case
@@ -79,7 +64,7 @@ class Said:
 def run(progress: Progress, quick: bool) -> Outcome:
     """Diagnose all cases on all cores."""
     cases = all_cases()[:: 5 if quick else 1]
-    return Outcome([summary(on_all_cores(judged, [(case,) for case in cases], str, progress))])
+    return Outcome([summary(on_all_cores(judged, [(case,) for case in cases], progress))])
 
 
 def all_cases() -> list[Case]:
@@ -87,38 +72,38 @@ def all_cases() -> list[Case]:
     names = list(VOLTAGES)
     cases = [
         Case(stack, names[(s + n + 2 * k) % len(names)], noise)
-        for s, stack in enumerate(STACKS)
+        for s, stack in enumerate(psa.STACKS)
         for n, noise in enumerate(NOISES)
         for k in range(2)
     ]
     return [*cases, *(Case(LINEAR, voltage, "none") for voltage in names)]
 
 
-def record_of(case: Case) -> Record:
+def record_of(case: Case) -> psa.Record:
     """Return the record of a case."""
     t = np.asarray(np.arange(_SAMPLES) / _RATE, dtype=np.float64)
     if case.stack == LINEAR:
         v = VOLTAGES[case.voltage](t, 100.0)
-        return Record(name="line", time=t, voltage=v, displacement=1e-7 * v)
-    model = stack_model(case.stack)
+        return psa.Record(name="line", time=t, voltage=v, displacement=1e-7 * v)
+    model = psa.stack_model(case.stack)
     v = VOLTAGES[case.voltage](t, 0.8 * model.values["u_rated"])
-    x = simulate(model, t, v).displacement
-    level = NOISES[case.noise]
+    x = psa.simulate(model, t, v).displacement
     if case.noise == "1 nm":
         x = ROUNDED * np.round(x / ROUNDED)
-    elif level > 0.0:
-        name = f"{case.stack}/{case.voltage}/{case.noise}"  # the same seed in every process
-        rng = np.random.default_rng(zlib.crc32(name.encode()))
-        x = x + level * np.ptp(x) * rng.standard_normal(x.size)
-    return Record(name=case.stack, time=t, voltage=v, displacement=x)
+    clean = psa.Record(name=case.stack, time=t, voltage=v, displacement=x)
+    if case.noise in ("none", "1 nm"):
+        return clean
+    name = f"{case.stack}/{case.voltage}/{case.noise}"  # the same seed in every process
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    return noisy(clean, NOISES[case.noise] * clean.range_m, rng)
 
 
 def judged(case: Case) -> Said:
     """Return what a diagnosis says."""
     record = record_of(case)
     try:
-        d = diagnose([record])
-    except PsaError as error:
+        d = psa.diagnose([record])
+    except psa.PsaError as error:
         return Said(case, None, (), float("nan"), str(error))
     error_share = d.base_errors.holdout_rms_m / record.range_m
     return Said(case, d.verdict, tuple(c.effect for c in d.causes), error_share)
@@ -126,28 +111,22 @@ def judged(case: Case) -> Said:
 
 def summary(found: Sequence[Said]) -> TitledTable:
     """Return the verdicts by noise."""
-    groups = {
-        f"noise {n}": [f for f in found if f.case.noise == n and f.case.stack != LINEAR]
-        for n in NOISES
-    }
-    groups |= {LINEAR: [f for f in found if f.case.stack == LINEAR], "all": [*found]}
-
-    def counted(holds: Callable[[Said], bool]) -> Callable[[str], str]:
-        return lambda n: share(sum(map(holds, groups[n])), len(groups[n]))
-
-    def error(name: str) -> str:
-        errors = [f.error for f in groups[name] if np.isfinite(f.error)]
-        return number(float(np.median(errors)), 2) if errors else "-"
-
-    columns: dict[str, Callable[[str], str]] = {
-        "records": str, "adequate": counted(lambda f: f.verdict == "adequate"),
-        "a cause named": counted(lambda f: bool(f.named)),
-        "failed": counted(lambda f: bool(f.failure)), "held-out error / range, median": error,
-    }  # fmt: skip
-    return table_of(
+    rows = []
+    for name in (*NOISES, LINEAR, "all"):
+        own = [
+            f for f in found if name in ("all", LINEAR if f.case.stack == LINEAR else f.case.noise)
+        ]
+        errors = [f.error for f in own if np.isfinite(f.error)]
+        rows.append({
+            "records": f"noise {name}" if name in NOISES else name,
+            "adequate": share(f.verdict == "adequate" for f in own),
+            "a cause named": share(bool(f.named) for f in own),
+            "failed": share(bool(f.failure) for f in own),
+            "held-out error / range, median": number(np.median(errors), 2) if errors else "-",
+        })  # fmt: skip
+    return TitledTable(
         "Simulated records of named stacks, nothing hidden",
-        groups,
-        columns,
+        rows,
         f"{_SAMPLES} samples at {_RATE:g} Hz. Noise is the rms over the range, or the resolution of"
         " the file.",
     )

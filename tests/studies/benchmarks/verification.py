@@ -6,40 +6,28 @@ judged only on records that the fit has not seen.
 """
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from math import sqrt
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.signal import lsim
 
+import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.identify import identify
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, read_record, time_grid
+from psa_casadi.records import time_grid
 from psa_casadi.records.split import Experiment, split, whole
-from psa_casadi.report.words.tables import Table
-from psa_casadi.simulation.simulate import simulate
-from tests.studies.benchmarks.records import response, slowest
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled
-
-FloatArray = npt.NDArray[np.float64]
-Values = Mapping[str, float]
-Signal = Callable[[float], float]
+from tests.studies.benchmarks.records import Values, noisy, played, slowest, step_voltage
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, styled
 
 #: White noise of the synthetic records, as a share of the range of each.
 NOISE = 1e-3
@@ -54,7 +42,7 @@ _RTOL = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Measured and predicted displacement (n,) [m] of samples that no fit has seen.
+    """A record and what was predicted of it (n,) [m], in samples that no fit has seen.
 
     `kind` is LOOPS, STEPS or OTHER; `range_m` [m] is what errors are compared with: the range of
     the displacement, for a step its final value. A step is told normalised, as in the paper.
@@ -62,17 +50,14 @@ class Comparison:
 
     kind: str
     stack: str
-    record: str
-    time: FloatArray
-    voltage: FloatArray
-    measured: FloatArray
+    record: psa.Record
     predicted: FloatArray
     range_m: float
 
     @property
     def error(self) -> FloatArray:
         """Measured minus predicted [m]; nan where a fit has used the sample."""
-        return self.measured - self.predicted
+        return measured(self.record) - self.predicted
 
     @property
     def largest(self) -> float:
@@ -87,73 +72,57 @@ class Comparison:
 
 def synthetic(name: str, progress: Progress) -> list[Comparison]:
     """Identify a named stack from a step and two loops of the reference; predict other records."""
-    p = {key: figure.value for key, figure in STACKS[name].values.items()}
-    noise = np.random.default_rng(2015)
-
-    def noisy(record: Record) -> Record:
-        level = NOISE * record.range_m
-        return replace(
-            record, displacement=measured(record) + level * noise.standard_normal(record.n)
-        )
-
+    p, draw = psa.stack_model(name).values, np.random.default_rng(2015)
     progress(f"{name}: records of the reference")
     fitted = [_step(p, 1.0), *(_loop(p, *loop) for loop in FITTED_LOOPS)]
     kept = [(LOOPS, _loop(p, *loop)) for loop in KEPT_LOOPS]
     kept += [(STEPS, _step(p, KEPT_STEP)), (OTHER, _non_periodic(p))]
-    found = identify([noisy(r) for r in fitted], progress=lambda t: progress(f"{name}: {t}"))
-    return [_compare(kind, name, found.model, noisy(r)) for kind, r in kept]
+    given = [noisy(r, NOISE * r.range_m, draw) for r in fitted]
+    model = psa.identify(given, progress=lambda t: progress(f"{name}: {t}")).model
+    found = []
+    for kind, clean in kept:
+        record = noisy(clean, NOISE * clean.range_m, draw)
+        moved = psa.simulate(model, record.time, record.voltage, from_rest_at_zero=True)
+        end = float(np.mean(measured(record)[-record.n // 20 :]))
+        size = end if kind == STEPS else record.range_m
+        found.append(Comparison(kind, name, record, moved.displacement, size))
+    return found
 
 
 def instrument(progress: Progress) -> list[Comparison]:
     """Identify the micromanipulator from blocks of one record; predict the rest and another record.
 
-    The records are looked for in $PSA_CASADI_DATA; without them the list is empty.
+    Of the other one the first tenth tells offset and memory. The records are looked for in
+    $PSA_CASADI_DATA; without them the list is empty.
     """
     folder = Path(os.environ.get("PSA_CASADI_DATA", "")) / INSTRUMENT
     try:
-        sine, minor = (read_record(folder / f"{n}.csv") for n in ("sine_1hz", "minor_loops"))
-    except InputError:
+        sine, minor = (psa.read_record(folder / f"{n}.csv") for n in ("sine_1hz", "minor_loops"))
+    except psa.InputError:
         return []
     cut = split(sine)
     part = replace(sine, displacement=np.where(cut.used, measured(sine), np.nan))
-    found = identify([part], progress=lambda text: progress(f"{INSTRUMENT}: {text}"))
-    rest = np.where(cut.held_out, measured(sine), np.nan)
-    (predicted,) = found.fit.predicted(found.experiments)
-    kept = (sine.time, sine.voltage, rest, predicted, sine.range_m)
-    return [
-        Comparison(LOOPS, INSTRUMENT, "sine 1 Hz, blocks kept", *kept),
-        _led_in(found.model, minor, found.fit.rms),
-    ]
+    found = psa.identify([part], progress=lambda text: progress(f"{INSTRUMENT}: {text}"))
+    lead = np.arange(minor.n) < minor.n // 10
+    led = Experiment(minor, minor.mask & lead, minor.mask & ~lead)
+    again = fit(found.model, [led], [], sigma=[found.fit.rms])
+    cases = (
+        (LOOPS, "sine 1 Hz, blocks kept", cut, found.fit.predicted(found.experiments)),
+        (OTHER, "minor loops, after a tenth", led, again.predicted([led])),
+    )
+    compared = []
+    for kind, name, e, (predicted,) in cases:
+        rest = np.where(e.held_out, measured(e.record), np.nan)
+        record = replace(e.record, name=name, displacement=rest)
+        compared.append(Comparison(kind, INSTRUMENT, record, predicted, e.record.range_m))
+    return compared
 
 
-def _led_in(model: Model, record: Record, sigma: float) -> Comparison:
-    """Predict a record of a device that has a past: its first tenth tells offset and memory."""
-    lead = np.arange(record.n) < record.n // 10
-    experiment = Experiment(record, record.mask & lead, record.mask & ~lead)
-    (predicted,) = fit(model, [experiment], [], sigma=[sigma]).predicted([experiment])
-    rest = np.where(experiment.held_out, measured(record), np.nan)
-    kept = (record.time, record.voltage, rest, predicted, record.range_m)
-    return Comparison(OTHER, INSTRUMENT, "minor loops, after a tenth", *kept)
+def _step(p: Values, share: float) -> psa.Record:
+    return played(p, f"step to {100 * share:.0f} %", *step_voltage(p, share, _STEP_SAMPLES))
 
 
-def _compare(kind: str, stack: str, model: Model, record: Record) -> Comparison:
-    predicted = simulate(model, record.time, record.voltage, from_rest_at_zero=True).displacement
-    x = measured(record)
-    size = float(np.mean(x[-record.n // 20 :])) if kind == STEPS else record.range_m
-    return Comparison(kind, stack, record.name, record.time, record.voltage, x, predicted, size)
-
-
-def _step(p: Values, share: float) -> Record:
-    """Return a step from 0 to a share of u_rated at the second sample."""
-    length = 12.0 * slowest(p)
-    time = time_grid(length, length / _STEP_SAMPLES)
-    voltage = np.full(time.shape, share * p["u_rated"])
-    voltage[0] = 0.0
-    x, name = response(p, time, voltage), f"step to {100 * share:.0f} %"
-    return Record(name=name, time=time, voltage=voltage, displacement=x)
-
-
-def _loop(p: Values, share: float, frequency: float) -> Record:
+def _loop(p: Values, share: float, frequency: float) -> psa.Record:
     """Return a sine from 0 to a share of u_rated."""
     time = time_grid(_PERIODS / frequency, 1.0 / (_LOOP_SAMPLES * frequency))
     half, turn = 0.5 * share * p["u_rated"], 2.0 * np.pi * frequency
@@ -161,7 +130,7 @@ def _loop(p: Values, share: float, frequency: float) -> Record:
     return _smooth(p, name, time, lambda t: half * (1.0 - np.cos(turn * t)))
 
 
-def _non_periodic(p: Values) -> Record:
+def _non_periodic(p: Values) -> psa.Record:
     """Return three sines of incommensurate frequencies, decaying about half the rated voltage."""
     tones = ((0.5, 1.0), (0.3, np.sqrt(7.0)), (0.2, 2.0 * np.pi))
 
@@ -174,11 +143,10 @@ def _non_periodic(p: Values) -> Record:
     return _smooth(p, "decaying, 1, 2.65 and 6.28 Hz", time, voltage)
 
 
-def _smooth(p: Values, name: str, time: FloatArray, voltage: Signal) -> Record:
-    """Return the reference's response from rest to a voltage without kinks."""
-    samples = np.array([voltage(float(t)) for t in time])
-    x = reference.simulate(p, voltage, time, rtol=_RTOL).displacement
-    return Record(name=name, time=time, voltage=samples, displacement=x)
+def _smooth(
+    p: Values, name: str, time: FloatArray, voltage: Callable[[float], float]
+) -> psa.Record:
+    return played(p, name, time, np.array([voltage(float(t)) for t in time]), voltage, _RTOL)
 
 
 NAMES = {"cascade": "one-way cascade", "reciprocal": "reciprocal", "single_mass": "single mass"}
@@ -186,18 +154,13 @@ SAMPLES, _FINE_RTOL = 1200, 1e-9
 #: Weight of the samples in the fits, as a share of the step: far below any difference of interest.
 _SIGMA = 1e-4
 _TWO_MASSES = ("k_L", "tau", "m_P", "c_P", "m_B", "c_B", "k_B")
-_FREE = {
-    "cascade": _TWO_MASSES,
-    "reciprocal": _TWO_MASSES,
-    "single_mass": ("k_L", "tau", "m", "c"),
-}
+_FREE = dict.fromkeys(NAMES, _TWO_MASSES) | {"single_mass": ("k_L", "tau", "m", "c")}
 #: Starts: the wafers' share of the mass, k_P over k_B, and the damping ratios.
 _SPLITS = ((0.3, 5.0, 0.03), (0.3, 2.0, 0.05), (0.5, 2.0, 0.05), (0.7, 0.5, 0.05))
 _LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
 
 
-@dataclass(frozen=True)
-class Match:
+class Match(NamedTuple):
     """One model fitted to the step of one plant.
 
     `step` (n,) are the errors of the fit over the step's size; `load` (n,) those of the predicted
@@ -247,17 +210,15 @@ def two_masses(p: Values, time: FloatArray, voltage: FloatArray, load: FloatArra
     """
     rc, m_P, m_B = p["R_s"] * p["C_p"], p["m_P"], p["m_B"]
     pull = np.array([0.0, 0.0, -p["k_B"], -p["c_B"], p["k_B"], p["c_B"]])
-    a = np.zeros((6, 6))
+    a, b = np.zeros((6, 6)), np.zeros((6, 2))
     a[0, 0] = -1.0 / rc
     a[1, :2] = p["k_L"] / p["tau"], -1.0 / p["tau"]
     a[2, 3] = a[4, 5] = 1.0
     a[3] = (pull + np.array([0.0, 1.0, -p["k_P"], -p["c_P"], 0.0, 0.0])) / m_P
     a[5] = -pull / m_B
-    b = np.zeros((6, 2))
     b[0, 0], b[5, 1] = p["G"] / rc, 1.0 / m_B
-    shown = np.eye(6)[4:5]
-    _, x, _ = lsim((a, b, shown, np.zeros((1, 2))), np.column_stack([voltage, load]), time)
-    return np.asarray(x, dtype=np.float64)
+    system = (a, b, np.eye(6)[4:5], np.zeros((1, 2)))
+    return np.asarray(lsim(system, np.column_stack([voltage, load]), time)[1], dtype=np.float64)
 
 
 def matches(
@@ -265,21 +226,17 @@ def matches(
 ) -> list[Match]:
     """Fit every model to the step of every plant and predict the plant's response to a load."""
     p = with_single_mass(values)
-    length = 12.0 * slowest(p)
-    time = time_grid(length, length / SAMPLES)
-    none, step = np.zeros_like(time), np.ones_like(time)
-    step[0] = 0.0
-    top, push = p["u_rated"] * step, 0.1 * p["k_L"] * p["u_rated"] * step
+    time, top = step_voltage(p, samples=SAMPLES)
+    none, push = np.zeros_like(time), 0.1 * p["k_L"] * top
     found = []
     for plant in plants:
         x = plant_response(plant, p, time, top, none)
+        step = psa.Record(name="step", time=time, voltage=top, displacement=x)
         loaded = plant_response(plant, p, time, none, push)
         for model, name in NAMES.items():
             progress(f"{name} fitted to the step of the {NAMES[plant]}")
-            best = _best_fit(
-                model, p, Record(name="step", time=time, voltage=top, displacement=x), starts
-            )
-            run = simulate(best.model, time, none, load_force=push, from_rest_at_zero=True)
+            best = _best_fit(model, p, step, starts)
+            run = psa.simulate(best.model, time, none, load_force=push, from_rest_at_zero=True)
             y, q = run.displacement, best.model.values
             mass = (q["m"] if "m" in q else q["m_P"] + q["m_B"]) * y[-1] / (loaded[-1] * p["m"])
             load = y / y[-1] - loaded / loaded[-1]
@@ -287,22 +244,17 @@ def matches(
     return found
 
 
-def _best_fit(kind: str, p: Values, record: Record, starts: int) -> Fit:
+def _best_fit(kind: str, p: Values, record: psa.Record, starts: int) -> Fit:
     """Fit from several starts that know the whole mass and stiffness; return the best."""
     fits = []
     given: Any = {"sigma": [_SIGMA * record.range_m], "evaluations": 200, "tolerance": 1e-7}
     for model in islice(_starts(kind, p, record), starts):
-        with suppress(PsaError):
+        with suppress(psa.PsaError):
             fits.append(fit(model, [whole(record)], _FREE[kind], **given))
-    if not fits:
-        raise PsaError(
-            f"The model '{NAMES[kind]}' could not be fitted to the step from any start; the values"
-            " of the stack are the likely cause: check them."
-        )
     return min(fits, key=lambda f: f.cost)
 
 
-def _starts(kind: str, p: Values, record: Record) -> Iterator[Model]:
+def _starts(kind: str, p: Values, record: psa.Record) -> Iterator[psa.Model]:
     slope = record.range_m / p["u_rated"]
     common = {n: p[n] for n in ("G", "R_s", "C_p", "u_rated", "h_ref", "hold_rate", *_LINEAR)}
     common["tau"] = 0.1 * slowest(p)
@@ -310,73 +262,54 @@ def _starts(kind: str, p: Values, record: Record) -> Iterator[Model]:
         for _, _, ratio in _SPLITS[:2]:
             damping = 2.0 * ratio * sqrt(p["m"] * p["k"])
             mass = {"m": p["m"], "k": p["k"], "c": damping, "k_L": slope * p["k"]}
-            yield compose(SIMPLIFIED, {**common, **mass})
+            yield psa.compose(psa.SIMPLIFIED, {**common, **mass})
         return
     for share, stiff, ratio in _SPLITS:
-        k_P, k_B = p["k"] * (1.0 + stiff), p["k"] * (1.0 + 1.0 / stiff)
-        m_P, m_B = share * p["m"], (1.0 - share) * p["m"]
-        c_P, c_B = (2.0 * ratio * sqrt(m * k) for m, k in ((m_P, k_P), (m_B, k_B)))
-        seen = k_P if kind == "reciprocal" else p["k"]
-        parts = {"m_P": m_P, "m_B": m_B, "c_P": c_P, "c_B": c_B, "k_P": k_P, "k_B": k_B}
-        cascade = compose(BASE, {**common, **parts, "k_L": slope * seen})
-        effect = EFFECTS["reciprocal_coupling"]
-        newton = {"reciprocal_gain": 1.0}
+        parts = {"k_P": p["k"] * (1.0 + stiff), "k_B": p["k"] * (1.0 + 1.0 / stiff)}
+        parts |= {"m_P": share * p["m"], "m_B": (1.0 - share) * p["m"]}
+        parts |= {f"c_{q}": 2.0 * ratio * sqrt(parts[f"m_{q}"] * parts[f"k_{q}"]) for q in "PB"}
+        seen = parts["k_P"] if kind == "reciprocal" else p["k"]
+        cascade = psa.compose(psa.BASE, {**common, **parts, "k_L": slope * seen})
+        effect, newton = psa.EFFECTS["reciprocal_coupling"], {"reciprocal_gain": 1.0}
         yield cascade.with_effect(effect, newton) if kind == "reciprocal" else cascade
 
 
-def tables(found: Sequence[Match], stack: str) -> tuple[TitledTable, TitledTable]:
+def tables(found: Sequence[Match], stack: str) -> list[TitledTable]:
     """Return the errors of the fitted steps, and of what they predict under a load."""
     title = f"Three mechanics, {stack} without hysteresis: "
     how = "Rows: the plant that made the data; columns: the model. Rms and largest error, in %"
-    return (
+    steps, loads = (
+        {plant: {"data from": NAMES[plant]} for plant in dict.fromkeys(m.plant for m in found)}
+        for _ in range(2)
+    )
+    for m in found:
+        steps[m.plant][NAMES[m.model]] = _errors(m.step)
+        loads[m.plant][NAMES[m.model]] = f"{_errors(m.load)}, mass x {m.mass:.2f}"
+    return [
         TitledTable(
             title + "voltage step, fitted",
-            _table(found, lambda m: _errors(m.step)),
+            list(steps.values()),
             f"{how} of the step. The data have no noise: below 0.1 % no ordinary measurement tells."
             " Cascade and reciprocal pair both give four poles and a zero, so that a step hardly"
             " tells them apart; a single mass has two poles and shows.",
         ),
         TitledTable(
             title + "load step on the output, predicted by these fits",
-            _table(found, lambda m: f"{_errors(m.load)}, mass x {m.mass:.2f}"),
+            list(loads.values()),
             f"{how} of the final displacement, and the whole mass found over the true one. A"
             " voltage step determines no force, so each fit is scaled to the plant's stiffness"
             " against a load. Such a step tells the mass loosely with the right mechanics, and"
             " wrongly with another: scales or a second measurement must say which one it is.",
         ),
-    )
+    ]
 
 
 def _errors(shares: FloatArray) -> str:
     return f"{100 * np.sqrt(np.mean(shares**2)):.2g} / {100 * np.max(np.abs(shares)):.2g}"
 
 
-def _table(found: Sequence[Match], text: Callable[[Match], str]) -> Table:
-    cells = {(m.plant, m.model): text(m) for m in found}
-    rows = tuple(
-        (NAMES[plant], *(cells[plant, model] for model in NAMES))
-        for plant in dict.fromkeys(m.plant for m in found)
-    )
-    return Table(("data from", *NAMES.values()), rows)
-
-
-def picture(shown: Sequence[Comparison]) -> Figure:
-    """Return a column for every stack; in each, three pairs of curves above their error."""
-    stacks = list(dict.fromkeys(c.stack for c in shown))
-    figure = Figure(figsize=(4.6 * len(stacks) + 0.6, 15.0), layout="constrained")
-    parts = figure.add_gridspec(6, len(stacks), height_ratios=(2.1, 1.0) * 3)
-    for column, stack in enumerate(stacks):
-        for row, kind in enumerate(_PANELS):
-            of_kind = [c for c in shown if (c.stack, c.kind) == (stack, kind)]
-            if of_kind:
-                upper = figure.add_subplot(parts[2 * row, column])
-                _draw(upper, figure.add_subplot(parts[2 * row + 1, column]), of_kind)
-    return figure
-
-
 #: Whose mechanics the three models are compared on: the stack that rings.
 RINGING = "PTBS200"
-
 _SYNTHETIC = (
     f"The stacks are synthetic: the independent reference, from rest, with white noise of"
     f" {100 * NOISE:g} % of each record's range, which is in the errors. Identified from a step to"
@@ -387,9 +320,6 @@ _MEASURED = (
     " in blocks, judged on the rest and on the minor loops, whose first tenth gives offset and"
     " memory."
 )
-_ABSENT = (
-    f" The measured {INSTRUMENT} is left out: set PSA_CASADI_DATA to the directory of its records."
-)
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -397,67 +327,69 @@ def run(progress: Progress, quick: bool) -> Outcome:
     stacks = ("P-885.51",) if quick else ("PTBS200", "WYDS0808020", "P-885.51")
     shown = [c for name in stacks for c in synthetic(name, progress)]
     shown += [] if quick else instrument(progress)
-    values = {name: figure.value for name, figure in STACKS[RINGING].values.items()}
     plants = ("reciprocal",) if quick else tuple(NAMES)
+    values = psa.stack_model(RINGING).values
     found = matches(values, progress, plants, 2 if quick else len(_SPLITS))
-    return Outcome((*verification_tables(shown), *tables(found, RINGING)), partial(picture, shown))
+    return Outcome([*verification_tables(shown), *tables(found, RINGING)], partial(picture, shown))
 
 
-def verification_tables(shown: Sequence[Comparison]) -> tuple[TitledTable, ...]:
+#: Of each kind: title, the paper's row, and the picture's title and axes with that of the error.
+_KINDS = {
+    LOOPS: ("Hysteresis loops (paper, figures 6 and 8)", ("loops", "0.41 um", "2.65"),
+            "loops (paper, figures 6 and 8)", "voltage [V]", "displacement [um]", "error [um]"),
+    STEPS: ("Normalised steps (paper, figures 7 and 9)", ("steps", "0.0142", "1.42"),
+            "normalised step (figures 7 and 9)", "time [ms]", "displacement over its final value",
+            "error"),
+    OTHER: ("Non-periodic voltage (paper, figure 10)", ("no figure given", "", ""),
+            "non-periodic voltage (figure 10)", "time [s]", "displacement [um]", "error [um]"),
+}  # fmt: skip
+
+
+def verification_tables(shown: Sequence[Comparison]) -> list[TitledTable]:
     """Return one table each for the paper's loops, steps and non-periodic voltage."""
-    names = {c.stack for c in shown}
-    note = _SYNTHETIC
-    if INSTRUMENT in names:
-        note += _MEASURED
-    elif len(names) == 3:
-        note += _ABSENT
-    head = ("stack", "record, not fitted", "largest error", "of range [%]", "rms [%]")
-    paper = "paper, its measured stacks"
-    ends = {
-        LOOPS: ("Hysteresis loops (paper, figures 6 and 8)", ("loops", "0.41 um", "2.65", "")),
-        STEPS: ("Normalised steps (paper, figures 7 and 9)", ("steps", "0.0142", "1.42", "")),
-        OTHER: ("Non-periodic voltage (paper, figure 10)", ("no figure given", "", "", "")),
-    }
-    tables = []
-    for kind, (title, last) in ends.items():
-        rows = []
+    note = _SYNTHETIC + _MEASURED * any(c.stack == INSTRUMENT for c in shown)
+    found = []
+    for kind, (title, paper, *_) in _KINDS.items():
+        cells = []
         for c in (c for c in shown if c.kind == kind):
             share = c.largest / c.range_m
             largest = f"{share:.4f}" if kind == STEPS else f"{1e6 * c.largest:.3f} um"
             rms = f"{100 * c.rms / c.range_m:.3f}"
-            rows.append((c.stack, c.record, largest, f"{100 * share:.2f}", rms))
-        table = Table(head, (*rows, (paper, *last)))
-        tables.append(TitledTable(title, table, note if kind == LOOPS else ""))
-    return tuple(tables)
+            cells.append((c.stack, c.record.name, largest, f"{100 * share:.2f}", rms))
+        cells.append(("paper, its measured stacks", *paper, ""))
+        head = ("stack", "record, not fitted", "largest error", "of range [%]", "rms [%]")
+        rows = [dict(zip(head, row, strict=True)) for row in cells]
+        found.append(TitledTable(title, rows, note if kind == LOOPS else ""))
+    return found
 
 
-_PREDICTED, _ERRORS = "#0072b2", ("#d55e00", "#009e73")
+def picture(shown: Sequence[Comparison]) -> Figure:
+    """Return a column for every stack; in each, three pairs of curves above their error."""
+    stacks = list(dict.fromkeys(c.stack for c in shown))
+    figure = Figure(figsize=(4.6 * len(stacks) + 0.6, 15.0), layout="constrained")
+    parts = figure.add_gridspec(6, len(stacks), height_ratios=(2.1, 1.0) * 3)
+    for column, stack in enumerate(stacks):
+        for row, kind in enumerate(_KINDS):
+            of_kind = [c for c in shown if (c.stack, c.kind) == (stack, kind)]
+            if of_kind:
+                upper = figure.add_subplot(parts[2 * row, column])
+                _draw(upper, figure.add_subplot(parts[2 * row + 1, column]), of_kind)
+    return figure
 
 
-#: Of each kind: title, what a curve is drawn over, its factor, units of displacement and error.
-_PANELS = {
-    LOOPS: ("loops (paper, figures 6 and 8)", "voltage [V]", "displacement [um]", "error [um]"),
-    STEPS: (
-        "normalised step (figures 7 and 9)", "time [ms]", "displacement over its final value",
-        "error",
-    ),
-    OTHER: ("non-periodic voltage (figure 10)", "time [s]", "displacement [um]", "error [um]"),
-}  # fmt: skip
-
-
-def _draw(upper: Axes, lower: Axes, of_kind: list[Comparison]) -> None:
+def _draw(upper: Axes, lower: Axes, of_kind: Sequence[Comparison]) -> None:
     """Draw measured and predicted where something was measured, and the errors below."""
     stack, kind = of_kind[0].stack, of_kind[0].kind
-    title, x_label, y_label, error = _PANELS[kind]
+    _, _, title, x_label, y_label, error = _KINDS[kind]
     origin: str | None = "measured" if stack == INSTRUMENT else "synthetic, with noise"
-    for k, c in enumerate(of_kind):
-        size = 1.0 / c.range_m if kind == STEPS else 1e6
-        x = {LOOPS: c.voltage, STEPS: 1e3 * c.time, OTHER: c.time}[kind]
-        there = np.where(np.isfinite(c.measured), c.predicted, np.nan)
-        upper.plot(x, size * c.measured, color="#9a9a9a", linewidth=3.2, label=origin)
+    for c, colour in zip(of_kind, ("#d55e00", "#009e73"), strict=False):
+        size, r = 1.0 / c.range_m if kind == STEPS else 1e6, c.record
+        x = {LOOPS: r.voltage, STEPS: 1e3 * r.time, OTHER: r.time}[kind]
+        there = np.where(np.isfinite(measured(r)), c.predicted, np.nan)
+        upper.plot(x, size * measured(r), color="#9a9a9a", linewidth=3.2, label=origin)
         label = "model" if origin else None
-        upper.plot(x, size * there, color=_PREDICTED, linewidth=1.0, label=label)
-        lower.plot(x, size * c.error, color=_ERRORS[k % 2], linewidth=0.7, label=c.record)
+        upper.plot(x, size * there, color="#0072b2", linewidth=1.0, label=label)
+        lower.plot(x, size * c.error, color=colour, linewidth=0.7, label=r.name)
         origin = None
     styled(upper, "", y_label, f"{stack}: {title}", size=11.0)
     styled(lower, x_label, error, size=11.0)

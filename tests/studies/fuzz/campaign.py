@@ -13,15 +13,16 @@ import sys
 import tempfile
 import time
 import traceback
-from collections import Counter, defaultdict, deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
+from typing import NamedTuple
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi import InputError, PsaError
 
 #: Ways to fail. The first two are seen from outside: a signal, and no end within the limit.
 CRASH, HANG = "crash", "hang"
@@ -33,8 +34,7 @@ _SLICE = 2.0
 _FORK = multiprocessing.get_context("fork")
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """Something that must not be: its kind and a sentence."""
 
     kind: str
@@ -97,36 +97,17 @@ class Tally:
     seed: int
     inputs: Counter[str] = field(default_factory=Counter)
     accepted: Counter[str] = field(default_factory=Counter)
-    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    seconds: dict[str, float] = field(default_factory=dict)
     kinds: Counter[tuple[str, str]] = field(default_factory=Counter)
     distinct: dict[tuple[str, str, str], Distinct] = field(default_factory=dict)
 
     @property
     def failures(self) -> int:
         """Failures of every kind."""
-        return sum(self.kinds.values())
-
-    def note(self, failure: Failure) -> Distinct | None:
-        """Count a failure; return it where it is the first of its cause."""
-        self.kinds[failure.target, failure.kind] += 1
-        key = (failure.target, failure.kind, failure.alike)
-        new = key not in self.distinct
-        known = self.distinct.setdefault(key, Distinct(failure))
-        known.times += 1
-        return known if new else None
+        return self.kinds.total()
 
 
-@dataclass(frozen=True)
-class Amount:
-    """How much is done: inputs of each target from `first` on, or seconds for all of them."""
-
-    seconds: float = inf
-    inputs: Mapping[str, int] | None = None
-    first: int = 0
-
-
-@dataclass(frozen=True)
-class _Block:
+class _Block(NamedTuple):
     """Inputs `first` up to `last` of a target; `alone` is one that seemed to hang, tried again."""
 
     target: Target
@@ -145,30 +126,31 @@ def generator(seed: int, target: str, index: int) -> Draw:
 def run(
     targets: Sequence[Target],
     seed: int,
-    amount: Amount,
     *,
+    seconds: float = inf,
+    inputs: Mapping[str, int] | None = None,
+    first: int = 0,
     jobs: int | None = None,
     keep: Path | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Tally:
-    """Attack the targets and return what was counted; `keep` is the folder for failing inputs.
+    """Attack the targets and return what was counted.
 
-    Ctrl-C ends it early, with what was counted until then.
+    With so many inputs of each target from `first` on, or for seconds for all of them; `keep` is
+    the folder for failing inputs. Ctrl-C ends it early, with what was counted until then.
     """
-    until = time.monotonic() + amount.seconds
-    count = amount.inputs or dict.fromkeys([t.name for t in targets], 1 << 40)
-    waiting = deque(_Block(t, amount.first, amount.first + count[t.name]) for t in targets)
-    room = {t.room: sum(o.share for o in targets if o.room == t.room) for t in targets}
+    until, tally, running = time.monotonic() + seconds, Tally(seed), list[_Worker]()
+    count = inputs or dict.fromkeys([t.name for t in targets], 1 << 40)
+    waiting = deque(_Block(t, first, first + count[t.name]) for t in targets)
+    shares = {t.name: t.share / sum(o.share for o in targets if o.room == t.room) for t in targets}
     for target in targets:
         target.prepare()
-    tally, running = Tally(seed), list[_Worker]()
 
     def turn(block: _Block) -> float:
         """Return what a target has had of its share; its processes count from their start."""
-        target = block.target
-        begun = sum(1e-3 for w in running if w.block.target is target)
-        spent = (tally.seconds[target.name] + begun) / (target.share / room[target.room])
-        return -1.0 if block.alone else spent
+        name = block.target.name
+        begun = sum(1e-3 for w in running if w.block.target.name == name)
+        return -1.0 if block.alone else (tally.seconds.get(name, 0.0) + begun) / shares[name]
 
     try:
         while True:
@@ -197,27 +179,30 @@ def _counted(
     tally: Tally, worker: "_Worker", keep: Path | None, progress: Callable[[str], None]
 ) -> Iterator[_Block]:
     """Count what a process did and yield what is left of its block."""
-    block, name = worker.block, worker.block.target.name
-    tally.inputs[name] += worker.done + (not worker.whole) - block.alone
-    tally.accepted[name] += worker.accepted
-    tally.seconds[name] += worker.seconds
-    rest = replace(block, first=worker.index + (not worker.whole))
+    block, target = worker.block, worker.block.target
+    tally.inputs[target.name] += worker.done + (not worker.whole) - block.alone
+    tally.accepted[target.name] += worker.accepted
+    tally.seconds[target.name] = tally.seconds.get(target.name, 0.0) + worker.seconds
+    rest = block._replace(first=worker.index + (not worker.whole))
     if rest.first < block.last:
         yield rest
     for failure in worker.failures:
         if failure.kind == HANG and not block.alone:  # the machine may have been busy
-            yield _Block(block.target, failure.index, failure.index + 1, alone=True)
+            yield _Block(target, failure.index, failure.index + 1, alone=True)
             continue
-        new = tally.note(failure)
-        if new is None:
+        tally.kinds[target.name, failure.kind] += 1
+        key = (target.name, failure.kind, failure.alike)
+        known = tally.distinct.setdefault(key, Distinct(failure))
+        known.times += 1
+        if known.times > 1:
             continue
-        progress(f"{name}, input {failure.index}: {failure.kind}: {failure.sentence}")
+        progress(f"{target.name}, input {failure.index}: {failure.kind}: {failure.sentence}")
         if keep is not None:
             keep.mkdir(parents=True, exist_ok=True)
-            new.file = keep / f"{name}-{tally.seed}-{failure.index}{block.target.suffix}"
-            drawn = generator(tally.seed, name, failure.index)
-            new.file.write_bytes(block.target.make(drawn))
-            progress(f"    again: python -m tests.studies fuzz --replay {new.file}")
+            known.file = keep / f"{target.name}-{tally.seed}-{failure.index}{target.suffix}"
+            drawn = generator(tally.seed, target.name, failure.index)
+            known.file.write_bytes(target.make(drawn))
+            progress(f"    again: python -m tests.studies fuzz --replay {known.file}")
 
 
 class _Worker:
@@ -244,13 +229,15 @@ class _Worker:
                 self._hear(*self._heard.recv())
         except (EOFError, OSError):
             self._process.join()
-            self._end(None)
+            code = self._process.exitcode or 0
+            how = signal.Signals(-code).name if code < 0 else f"the process ended with {code}"
+            self._end(CRASH, how)
             return True
         hangs = time.monotonic() - self.since > self.block.target.limit_s
         if hangs and self._process.pid:
             os.kill(self._process.pid, signal.SIGUSR1)  # its Python calls go to the trace
             time.sleep(0.05)
-            self._end(f"no end within {self.block.target.limit_s:g} s")
+            self._end(HANG, f"no end within {self.block.target.limit_s:g} s")
         return hangs
 
     def _hear(self, what: str, value: int | Failure | str | float) -> None:
@@ -266,17 +253,14 @@ class _Worker:
             case int():
                 self.done, self.accepted = self.done + 1, self.accepted + value
 
-    def _end(self, said: str | None) -> None:
+    def _end(self, kind: str, how: str) -> None:
         if self.whole:
             return
         self.seconds = time.monotonic() - self._begun
-        code, kind = self._process.exitcode or 0, HANG if said else CRASH
-        how = signal.Signals(-code).name if code < 0 else f"the process ended with {code}"
         trace = (self.folder / "trace").read_text(errors="replace")[:6000]
         own = [x.strip() for x in trace.splitlines() if "psa_casadi/" in x]
         where = own[0].split("psa_casadi/")[-1].replace('"', "") if own else "an unknown place"
-        sentence = f"{said or how}, in {where}"
-        name = self.block.target.name
+        sentence, name = f"{how}, in {where}", self.block.target.name
         self.failures.append(Failure(name, kind, sentence, self.index, sentence, trace))
 
     def clean(self) -> None:
@@ -294,8 +278,8 @@ def _work(
     """Attack the inputs; Ctrl-C is for the parent, commands that are started heed signals."""
     os.setpgid(0, 0)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    for which in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(which, signal.SIG_DFL)
     with (folder / "trace").open("w") as trace:
         faulthandler.enable(trace, all_threads=False)
         faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
@@ -353,14 +337,10 @@ def _foreign(target: Target, error: Exception, index: int) -> Failure:
     frames = traceback.extract_tb(error.__traceback__)
     own = [f for f in frames if f"{os.sep}psa_casadi{os.sep}" in f.filename] or list(frames)
     where = f"{own[-1].filename.split(f'psa_casadi{os.sep}')[-1]}:{own[-1].name}"
-    alike = f"{type(error).__name__} in {where}"
-    sentence = _printable(f"{alike}: {' '.join(str(error).split())[:200]}")
-    detail = _printable("".join(traceback.format_exception(error))[-4000:])
-    return Failure(target.name, FOREIGN, sentence, index, alike, detail)
-
-
-def _printable(text: str) -> str:
-    return text.encode("utf-8", "backslashreplace").decode()
+    alike, whole = f"{type(error).__name__} in {where}", "".join(traceback.format_exception(error))
+    sentence = f"{alike}: {' '.join(str(error).split())[:200]}"
+    printable = [t.encode("utf-8", "backslashreplace").decode() for t in (sentence, whole[-4000:])]
+    return Failure(target.name, FOREIGN, printable[0], index, alike, printable[1])
 
 
 def replay(path: Path, targets: Mapping[str, Target]) -> Tally:
@@ -373,4 +353,4 @@ def replay(path: Path, targets: Mapping[str, Target]) -> Tally:
         raise InputError(f"{path}: is no saved input; its name must begin with a target and '-'.")
     data = path.read_bytes()
     target = replace(targets[name], make=lambda _: data)
-    return run([target], 0, Amount(inputs={name: 1}), jobs=1)
+    return run([target], 0, inputs={name: 1}, jobs=1)

@@ -11,11 +11,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from psa_casadi.errors import InputError
 from tests.studies.fuzz.campaign import FALSE_PASS, LEFT_OVER, WRONG_EXIT, Draw, Found, Target
@@ -43,56 +42,41 @@ _USUAL = {
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """How they are made in a folder; words of which a failure must say one, lower case.
+class Odd:
+    """Odd surroundings: how they are made, and words of which a failure must say one, lower case.
 
     Without `words` the command must work. The command runs as a user who may not do everything.
+    `place` is made in the command's folder, `variable` names it, and `output` is written there;
+    `first` is called with the folder in the process before the command begins; `streams` are
+    standard input, output and error by the files that take their place.
     """
 
-    prepare: Callable[[Path], Around]
     words: tuple[str, ...] = ()
-    output: str = ""  # folder of the output, below the one of the command
+    environment: Mapping[str, str | None] = field(default_factory=dict)
+    place: Callable[[Path], object] | None = None
+    variable: str = ""
+    name: str = "place"
+    output: bool = False
+    first: Callable[[Path], object] = lambda _: None
+    streams: Mapping[str, str] = field(default_factory=dict)
+
+    def around(self, folder: Path) -> Around:
+        """Make them for a command in a folder."""
+        if self.place is not None:
+            self.place(folder / self.name)
+        named = {self.variable: str(folder / self.name)} if self.variable else {}
+        streams = {n: _opened(path) for n, path in self.streams.items()}
+        first = lambda: (self.first(folder), None)[1]  # noqa: E731
+        return Around({**self.environment, **named}, first, streams)
 
 
-def _variables(words: tuple[str, ...] = (), /, **environment: str | None) -> Surroundings:
-    return Surroundings(lambda _: Around(environment), words)
-
-
-def _home(words: tuple[str, ...] = (), **environment: str | None) -> Surroundings:
-    """Change the folder of the user, where the cache is."""
-    return _variables((*_CACHE, *words), **_USUAL, **environment)
-
-
-def _named(
-    variable: str, make: Callable[[Path], object], *words: str, name: str = "place"
-) -> Surroundings:
-    """Let a variable name a path that is made in some way."""
-    usual = _USUAL if variable == "HOME" else {}
-
-    def prepare(folder: Path) -> Around:
-        make(folder / name)
-        return Around({**usual, variable: str(folder / name)})
-
-    return Surroundings(prepare, words)
-
-
-def _output(make: Callable[[Path], None], name: str, *words: str, **env: str) -> Surroundings:
-    """Make the folder of the output in some way."""
-
-    def prepare(folder: Path) -> Around:
-        make(folder / name)
-        return Around(env)
-
-    return Surroundings(prepare, words, name)
-
-
-def _first(do: Callable[..., object], *arguments: object, words: tuple[str, ...]) -> Surroundings:
-    """Do something in the process before the command begins."""
-    return Surroundings(lambda _: Around(first=lambda: (do(*arguments), None)[1]), words)
-
-
-def _limited(which: int, value: int, *words: str) -> Surroundings:
-    return _first(resource.setrlimit, which, (value, value), words=words)
+def _opened(path: str) -> int:
+    """Return the descriptor of a file, or of a pipe that nobody reads."""
+    if path != "a broken pipe":
+        return os.open(path, os.O_RDWR)
+    reads, writes = os.pipe()
+    os.close(reads)
+    return writes
 
 
 def _unwritable(path: Path) -> None:
@@ -117,34 +101,22 @@ def _open(path: Path) -> None:
     path.chmod(0o777)
 
 
-def _written_to(stream: str, path: str) -> Callable[[Path], Around]:
-    return lambda _: Around(streams={stream: os.open(path, os.O_RDWR)})
-
-
-def _broken_pipe(_: Path) -> Around:
-    reads, writes = os.pipe()
-    os.close(reads)
-    return Around(streams={"stdout": writes})
-
-
-def _gone(folder: Path) -> Around:
+def _leave(folder: Path) -> None:
     """Start in a folder that is no more."""
-    gone = folder / "gone"
-    _open(gone)
-
-    def first() -> None:
-        os.chdir(gone)
-        gone.rmdir()
-
-    return Around(first=first)
+    os.chdir(folder / "gone")
+    (folder / "gone").rmdir()
 
 
-def _ignore() -> None:
+def _ignore(_: Path) -> None:
     for which in (signal.SIGPIPE, signal.SIGCHLD, signal.SIGHUP):
         signal.signal(which, signal.SIG_IGN)
 
 
-def _compiler(text: str, folder: str = "tools") -> Surroundings:
+def _limited(which: int, value: int, *words: str) -> Odd:
+    return Odd(words, first=lambda _: resource.setrlimit(which, (value, value)))
+
+
+def _compiler(text: str, folder: str = "tools") -> Odd:
     """Let CC name a program by its text."""
 
     def make(path: Path) -> None:
@@ -152,78 +124,79 @@ def _compiler(text: str, folder: str = "tools") -> Surroundings:
         path.write_text(text)
         path.chmod(0o755)
 
-    return _named("CC", make, *_CC, name=f"{folder}/cc")
+    return Odd(_CC, {}, make, "CC", f"{folder}/cc")
 
 
 _CACHE = ("cache", "psa_casadi_cache", "home", "place")
 _TEMPORARY = ("temporary", "tmpdir", "place")
 _DISK = ("space", "full", "place", "disk")
 _CC = ("cc", "compiler")
-_ASCII: dict[str, Any] = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+_ASCII = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+_KEPT_IN = "PSA_CASADI_CACHE"
 
-SURROUNDINGS: dict[str, Surroundings] = {
-    "no HOME": _home(HOME=None),
-    "HOME unwritable": _named("HOME", _unwritable, *_CACHE),
-    "HOME a file": _named("HOME", _file, *_CACHE),
-    "HOME empty": _home(HOME=""),
-    "HOME missing": _home(("/nowhere",), HOME="/nowhere/at/all"),
-    "HOME relative": _home(HOME="home"),
-    "XDG_CACHE_HOME empty": _variables(_CACHE, **{**_USUAL, "XDG_CACHE_HOME": "", "HOME": "/no"}),
-    "XDG_CACHE_HOME relative": _variables(_CACHE, **{**_USUAL, "XDG_CACHE_HOME": "here"}),
-    "cache a file": _named("PSA_CASADI_CACHE", _file, *_CACHE),
-    "cache unwritable": _named("PSA_CASADI_CACHE", _unwritable, *_CACHE),
-    "cache in /proc": _variables((*_CACHE, "/proc"), PSA_CASADI_CACHE="/proc/no/such"),
-    "cache a link to nothing": _named(
-        "PSA_CASADI_CACHE", lambda p: p.symlink_to("/nowhere/x"), *_CACHE, "/nowhere"
+SURROUNDINGS: dict[str, Odd] = {
+    "no HOME": Odd(_CACHE, {**_USUAL, "HOME": None}),
+    "HOME unwritable": Odd(_CACHE, _USUAL, _unwritable, "HOME"),
+    "HOME a file": Odd(_CACHE, _USUAL, _file, "HOME"),
+    "HOME empty": Odd(_CACHE, {**_USUAL, "HOME": ""}),
+    "HOME missing": Odd((*_CACHE, "/nowhere"), {**_USUAL, "HOME": "/nowhere/at/all"}),
+    "HOME relative": Odd(_CACHE, {**_USUAL, "HOME": "home"}),
+    "XDG_CACHE_HOME empty": Odd(_CACHE, {**_USUAL, "XDG_CACHE_HOME": "", "HOME": "/no"}),
+    "XDG_CACHE_HOME relative": Odd(_CACHE, {**_USUAL, "XDG_CACHE_HOME": "here"}),
+    "cache a file": Odd(_CACHE, {}, _file, _KEPT_IN),
+    "cache unwritable": Odd(_CACHE, {}, _unwritable, _KEPT_IN),
+    "cache in /proc": Odd((*_CACHE, "/proc"), {_KEPT_IN: "/proc/no/such"}),
+    "cache a link to nothing": Odd(
+        (*_CACHE, "/nowhere"), {}, lambda p: p.symlink_to("/nowhere/x"), _KEPT_IN
     ),
-    "cache with spaces and unicode": _named(
-        "PSA_CASADI_CACHE", lambda _: None, name="mein käsch ➕ 'x'"
-    ),
-    "cache on a full disk": _named("PSA_CASADI_CACHE", _full, *_CACHE, *_DISK),
-    "TMPDIR missing": _variables((*_TEMPORARY, "/nowhere"), TMPDIR="/nowhere/at/all"),
-    "TMPDIR unwritable": _named("TMPDIR", _unwritable, *_TEMPORARY),
-    "TMPDIR a file": _named("TMPDIR", _file, *_TEMPORARY),
-    "TMPDIR on a full disk": _named("TMPDIR", _full, *_TEMPORARY, *_DISK),
-    "output on a full disk": _output(_full, "place", *_DISK, "write"),
-    "output folder unwritable": _output(_unwritable, "place", "write"),
-    "output with spaces and unicode": _output(_open, "o ü ➕"),
-    "unicode path without UTF-8": _output(_open, "ü", **_ASCII, LC_ALL="C"),
-    "LC_ALL=C": _variables(LC_ALL="C", LANG=None),
-    "POSIX without UTF-8": _variables(LC_ALL="POSIX", PYTHONIOENCODING="ascii", **_ASCII),
-    "unknown locale": _variables(LC_ALL="xx_YY.nonsense", LANG="tlh"),
-    "PYTHONOPTIMIZE=2": _variables(PYTHONOPTIMIZE="2"),
-    "stdin closed": _first(os.close, 0, words=()),
-    "stdout closed": _first(os.close, 1, words=("output", "closed", "written", "descriptor")),
-    "stderr closed": _first(os.close, 2, words=()),
-    "stdout a broken pipe": Surroundings(_broken_pipe, ("",)),
-    "stdout on a full disk": Surroundings(_written_to("stdout", "/dev/full"), (*_DISK, "output")),
-    "stderr on a full disk": Surroundings(_written_to("stderr", "/dev/full"), ("",)),
-    "COLUMNS=1": _variables(COLUMNS="1", LINES="1"),
-    "COLUMNS no number": _variables(COLUMNS="wide", TERM="dumb", NO_COLOR="1"),
-    "unknown terminal": _variables(TERM="no-such-terminal", FORCE_COLOR="1"),
-    "CC missing": _variables(_CC, CC="/nowhere/cc"),
+    "cache with spaces and unicode": Odd((), {}, None, _KEPT_IN, "mein käsch ➕ 'x'"),
+    "cache on a full disk": Odd((*_CACHE, *_DISK), {}, _full, _KEPT_IN),
+    "TMPDIR missing": Odd((*_TEMPORARY, "/nowhere"), {"TMPDIR": "/nowhere/at/all"}),
+    "TMPDIR unwritable": Odd(_TEMPORARY, {}, _unwritable, "TMPDIR"),
+    "TMPDIR a file": Odd(_TEMPORARY, {}, _file, "TMPDIR"),
+    "TMPDIR on a full disk": Odd((*_TEMPORARY, *_DISK), {}, _full, "TMPDIR"),
+    "output on a full disk": Odd((*_DISK, "write"), {}, _full, output=True),
+    "output folder unwritable": Odd(("write",), {}, _unwritable, output=True),
+    "output with spaces and unicode": Odd((), {}, _open, name="o ü ➕", output=True),
+    "unicode path without UTF-8": Odd((), {**_ASCII, "LC_ALL": "C"}, _open, "", "ü", True),
+    "LC_ALL=C": Odd((), {"LC_ALL": "C", "LANG": None}),
+    "POSIX without UTF-8": Odd((), {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii", **_ASCII}),
+    "unknown locale": Odd((), {"LC_ALL": "xx_YY.nonsense", "LANG": "tlh"}),
+    "PYTHONOPTIMIZE=2": Odd((), {"PYTHONOPTIMIZE": "2"}),
+    "stdin closed": Odd(first=lambda _: os.close(0)),
+    "stdout closed": Odd(("output", "closed", "written", "descriptor"),
+                          first=lambda _: os.close(1)),
+    "stderr closed": Odd(first=lambda _: os.close(2)),
+    "stdout a broken pipe": Odd(("",), streams={"stdout": "a broken pipe"}),
+    "stdout on a full disk": Odd((*_DISK, "output"), streams={"stdout": "/dev/full"}),
+    "stderr on a full disk": Odd(("",), streams={"stderr": "/dev/full"}),
+    "COLUMNS=1": Odd((), {"COLUMNS": "1", "LINES": "1"}),
+    "COLUMNS no number": Odd((), {"COLUMNS": "wide", "TERM": "dumb", "NO_COLOR": "1"}),
+    "unknown terminal": Odd((), {"TERM": "no-such-terminal", "FORCE_COLOR": "1"}),
+    "CC missing": Odd(_CC, {"CC": "/nowhere/cc"}),
     "CC with a space": _compiler(
         f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc "$@"\n', "my tools"
     ),
     "CC fails": _compiler("#!/bin/sh\nexit 1\n"),
     "CC is no program": _compiler("\0\1\2"),
     "CC does nothing": _compiler("#!/bin/sh\nexit 0\n"),
-    "CC with quotes": _variables(_CC, CC="cc '-DX=\"a"),
-    "PATH empty": _variables(PATH=""),
+    "CC with quotes": Odd(_CC, {"CC": "cc '-DX=\"a"}),
+    "PATH empty": Odd((), {"PATH": ""}),
     "little memory": _limited(resource.RLIMIT_AS, 700 << 20, "memory"),
     "few open files": _limited(resource.RLIMIT_NOFILE, 16, "open files", "files"),
     "small files only": _limited(
         resource.RLIMIT_FSIZE, 4096, "large", "space", "write", "cache", "compiler"
     ),
     "no new processes": _limited(resource.RLIMIT_NPROC, 1, "process", "resource", "compiler"),
-    "directory gone": Surroundings(_gone, ("directory", "folder")),
-    "umask 777": _first(os.umask, 0o777, words=(*_CACHE, *_TEMPORARY, "permission", "write")),
-    "debugging": _variables(PSA_CASADI_DEBUG="1"),
-    "SIGPIPE and SIGCHLD ignored": _first(_ignore, words=()),
-    "odd numbers of threads": _variables(
-        OPENBLAS_NUM_THREADS="0", OMP_NUM_THREADS="x", MKL_NUM_THREADS="-1"
+    "directory gone": Odd(("directory", "folder"), {}, _open, name="gone", first=_leave),
+    "umask 777": Odd((*_CACHE, *_TEMPORARY, "permission", "write"),
+                      first=lambda _: os.umask(0o777)),
+    "debugging": Odd((), {"PSA_CASADI_DEBUG": "1"}),
+    "SIGPIPE and SIGCHLD ignored": Odd(first=_ignore),
+    "odd numbers of threads": Odd(
+        (), {"OPENBLAS_NUM_THREADS": "0", "OMP_NUM_THREADS": "x", "MKL_NUM_THREADS": "-1"}
     ),
-}
+}  # fmt: skip
 
 
 #: What is run; the first needs a compiler, a cache and a temporary folder, and so does the second.
@@ -242,14 +215,14 @@ def _surround(data: bytes, where: Path) -> Iterator[Found]:
     case = json.loads(data)
     chosen, work = SURROUNDINGS[case["surroundings"]], WORKS[case["run"]]
     with place(where) as folder:
-        around = chosen.prepare(folder)
+        around = chosen.around(folder)
 
         def first() -> None:
             for right in () if os.geteuid() else _RIGHTS:
                 LIBC.prctl(_DROP, right, 0, 0, 0)
             around.first()
 
-        target = folder / chosen.output
+        target = folder / chosen.name if chosen.output else folder
         places = {n: folder / n for n in given_files()} | {n: target / n for n in work.outputs}
         named = [places.get(a, a) for a in work.arguments]  # whole paths: the folder may be gone
         what = f"{case['surroundings']}: psa {case['run']}"

@@ -1,42 +1,34 @@
 """The data set as a folder: records, base model, possible causes, the truth apart, the score."""
 
 import hashlib
-import io
 import json
 import shutil
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
+from jinja2 import Template
 
-from psa_casadi.component import Component
-from psa_casadi.effects import EFFECTS
-from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.modelica.package import export_modelica
-from psa_casadi.model.compose import Model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.variables import Parameter
+import psa_casadi as psa
 from tests.studies.benchmarks.hidden_cases import (
     NOISES,
-    ORDINARY,
     REACHED,
     STRONG,
     WEAK,
     Case,
     how_made,
 )
+from tests.studies.benchmarks.table import FloatArray, on_all_cores
 from tests.studies.plants.again import play_again
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import draw_excitation
 from tests.studies.plants.hide import SEARCH
 from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.sensor import room, temperature
-from tests.studies.plants.stack import FloatArray
 from tests.studies.plants.table import FOREIGN, KNOWN, called
 from tests.studies.plants.visibility import FREE, base_columns
 
@@ -50,8 +42,7 @@ _FIRST_ONLY = ("offset_drift", "self_heating", "voltage_saturation")
 _ATTEMPTS = 3
 
 
-@dataclass(frozen=True)
-class Half:
+class Half(NamedTuple):
     """One record of a device: (N,) times [s], voltage [V], displacement read and without noise [m],
     temperature [degC]; the fitted base [m] and what moves it (N, 11), see `base_columns`.
     """
@@ -65,17 +56,6 @@ class Half:
     columns: FloatArray
 
 
-@dataclass(frozen=True)
-class Made:
-    """A case with its record and the held-out one; `rho` is the smallest that was reached."""
-
-    case: Case
-    rho: float
-    gains: dict[str, float]
-    record: Half
-    holdout: Half
-
-
 def cases_of(seed: int, count: int) -> list[Case]:
     """Return so many cases in the order of the data set, which tells nothing of their kinds."""
     rng = np.random.default_rng(seed)
@@ -84,16 +64,22 @@ def cases_of(seed: int, count: int) -> list[Case]:
     known, foreign = (_in_turn(rng, names, count) for names in (ASKED, FOREIGN))
     weak, pairs = _in_turn(rng, ASKED, count), [_pair(rng) for _ in range(numbers["two"])]
     seeds = iter(np.random.SeedSequence(seed).generate_state(count).tolist())
-    cases = [
-        Case("known", known[k], next(seeds), ORDINARY, noise=NOISES[k % len(NOISES)])
-        for k in range(numbers["known"])
-    ]
-    cases += [
-        Case("clean", None, next(seeds), noise=NOISES[k % 2]) for k in range(numbers["clean"])
-    ]
-    cases += [Case("foreign", foreign[k], next(seeds)) for k in range(numbers["foreign"])]
-    cases += [Case("weak", weak[k], next(seeds), WEAK) for k in range(numbers["weak"])]
-    cases += [Case("two", one, next(seeds), STRONG, (more,)) for one, more in pairs]
+    cases = []
+    for kind, number in numbers.items():
+        for k in range(number):
+            own = next(seeds)
+            match kind:
+                case "known":
+                    cases.append(Case("known", known[k], own, noise=NOISES[k % len(NOISES)]))
+                case "clean":
+                    cases.append(Case("clean", None, own, noise=NOISES[k % 2]))
+                case "foreign":
+                    cases.append(Case("foreign", foreign[k], own))
+                case "weak":
+                    cases.append(Case("weak", weak[k], own, WEAK))
+                case _:
+                    one, more = pairs[k]
+                    cases.append(Case("two", one, own, STRONG, (more,)))
     return [cases[k] for k in rng.permutation(count)]
 
 
@@ -107,8 +93,8 @@ def _pair(rng: np.random.Generator) -> tuple[str, str]:
     return str(rng.choice([name for name in ASKED if name != more])), more
 
 
-def make(case: Case, folder: Path) -> Made:
-    """Make the two records of a case; a folder takes what the plants write on the way.
+def write_case(folder: Path, number: int, case: Case) -> tuple[str, dict[str, object]]:
+    """Make and write one case; return its name and its truth.
 
     Where a device does not show what is hidden as well as was asked for, another one is drawn, and
     after three of them the next effect is taken.
@@ -118,10 +104,21 @@ def make(case: Case, folder: Path) -> Made:
         drawn = replace(case, effect=_later(case.effect, tried // _ATTEMPTS), seed=seed)
         if drawn.effect in drawn.more:
             continue
-        truth = _device(drawn, folder)
-        rho = min([truth.visible, *(h.visible for h in truth.more)])
-        if drawn.effect is None or rho >= REACHED * drawn.rho[0]:
-            return _made(drawn, truth, rho, folder)
+        with tempfile.TemporaryDirectory() as temporary:
+            path = Path(temporary) / "record.csv"
+            truth = make_record(drawn.effect, seed, path, **how_made(drawn))
+            rho = min([truth.visible, *(h.visible for h in truth.more)])
+            if drawn.effect is not None and rho < REACHED * drawn.rho[0]:
+                continue
+            _write_halves(folder, f"{number:03d}", *_halves(drawn, truth, path))
+        return f"{number:03d}", {
+            "kind": drawn.kind,
+            "hidden": list(drawn.hidden),
+            "listed": drawn.kind != "foreign",
+            "gains": {called(name): gain for name, _, gain in truth.hidden},
+            "times_the_noise": round(rho, 4),
+            "noise": drawn.noise,
+        }
     raise RuntimeError(f"No device drawn from seed {case.seed} shows {case.hidden} well enough.")
 
 
@@ -132,22 +129,18 @@ def _later(effect: str | None, steps: int) -> str | None:
     return names[(names.index(effect) + steps) % len(names)]
 
 
-def _device(case: Case, folder: Path) -> Truth:
-    return make_record(case.effect, case.seed, folder / "record.csv", **how_made(case))
-
-
-def _made(case: Case, truth: Truth, rho: float, folder: Path) -> Made:
+def _halves(case: Case, truth: Truth, path: Path) -> tuple[Half, Half]:
+    """Return the record that is at a path, and the held-out one."""
     rng = np.random.default_rng([case.seed, 3])
     walk = _thermometer(truth, rng)
     played = draw_excitation(rng, truth.excitation, truth.stack.u_rated)
-    clean = play_again(truth, case.seed + 1, folder / "holdout.csv", played)
-    first = truth.times, truth.voltage, _read(folder / "record.csv"), truth.displacement
+    first = truth.times, truth.voltage, _read(path), truth.displacement
+    again = path.with_name("holdout.csv")
+    clean = play_again(truth, case.seed + 1, again, played)
     record = _half(truth, first, truth.base_displacement, walk, None)
     base = simulate_base(truth.stack, *played).displacement
-    second = *played, _read(folder / "holdout.csv"), clean
     fitted = _fitted(record, truth.base_displacement)
-    gains = {called(name): gain for name, _, gain in truth.hidden}
-    return Made(case, rho, gains, record, _half(truth, second, base, walk, fitted))
+    return record, _half(truth, (*played, _read(again), clean), base, walk, fitted)
 
 
 def _thermometer(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
@@ -176,7 +169,7 @@ def _half(
     columns = base_columns(truth.stack, times, voltage, base)
     bare = Half(times, voltage, read, clean, room(times, walk), base, columns)
     moves = _fitted(bare, base) if fitted is None else fitted
-    return replace(bare, base=base + columns @ moves)
+    return bare._replace(base=base + columns @ moves)
 
 
 def _fitted(half: Half, base: FloatArray) -> FloatArray:
@@ -201,7 +194,7 @@ LETTERS = {
 }
 
 
-def base_content(model: Model) -> dict[str, Any]:
+def base_content(model: psa.Model) -> dict[str, Any]:
     """Return the base model: equations, letters, parameters with an example's values."""
     return {
         "equations": [
@@ -217,10 +210,10 @@ def base_content(model: Model) -> dict[str, Any]:
 
 def causes_content() -> list[dict[str, Any]]:
     """Return the possible causes: definition in words and as equation, parameters, source."""
-    return [_cause(e) for e in EFFECTS.values()]
+    return [_cause(e) for e in psa.EFFECTS.values()]
 
 
-def _cause(effect: Component) -> dict[str, Any]:
+def _cause(effect: psa.Component) -> dict[str, Any]:
     return {
         "name": effect.name,
         "sits_in": effect.belongs_to,
@@ -233,7 +226,7 @@ def _cause(effect: Component) -> dict[str, Any]:
     }
 
 
-def _parameter(p: Parameter) -> dict[str, Any]:
+def _parameter(p: psa.Parameter) -> dict[str, Any]:
     low, high = p.bounds
     return {
         "name": p.name, "unit": p.unit, "example": p.value, "bounds": [low, high],
@@ -244,29 +237,6 @@ def _parameter(p: Parameter) -> dict[str, Any]:
 def json_lines(content: Any) -> str:
     """Return content as the text of a JSON file."""
     return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
-
-
-def markdown(model: Model) -> str:
-    """Return base model and causes as one page for people."""
-    base = base_content(model)
-    lines = ["# The base model", "", base["values"], base["start"], ""]
-    lines += [f"* {e['part']}: `{e['equation']}`" for e in base["equations"]]
-    lines += ["", "Letters:", ""]
-    lines += [f"* `{letter}`: {meaning}" for letter, meaning in LETTERS.items()]
-    lines += ["", "Parameters (an example's values):", ""]
-    lines += [_line(p) for p in base["parameters"]]
-    lines += ["", "# Possible causes", ""]
-    for cause in causes_content():
-        lines += [f"## {cause['name']}", ""]
-        lines += [f"Sits in: {cause['sits_in']}. {cause['definition']}.", ""]
-        lines += [f"`{cause['equation']}`", "", f"Looks like: {cause['what_it_looks_like']}.", ""]
-        lines += [*(_line(p) for p in cause["parameters"]), "", f"Source: {cause['source']}", ""]
-    return "\n".join(lines)
-
-
-def _line(p: dict[str, Any]) -> str:
-    low, high = p["bounds"]
-    return f"* `{p['name']}` [{p['unit']}]: {p['meaning']}; {p['example']:g}, {low:g} to {high:g}"
 
 
 FORMAT, VERSION = "psa_causes.data/1", "1.0"
@@ -282,20 +252,12 @@ def write(
 ) -> None:
     """Write the data set; the same seed and count give the same bytes on the same machine."""
     write_model(folder)
-    cases = list(enumerate(cases_of(seed, count), start=1))
-    truth = {}
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        for name, said in pool.map(write_case, [folder] * count, cases):
-            truth[name] = said
-            progress(f"case {name} of {count}")
+    cases = [(folder, k, case) for k, case in enumerate(cases_of(seed, count), start=1)]
+    truth = dict(on_all_cores(write_case, cases, progress, lambda c: f"case {c[0]}", jobs))
     content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "licence": LICENCE,
-        "seed": seed,
-        "cases": list(truth),
-        "causes": [c["name"] for c in causes_content()],
-    }
+        "format": FORMAT, "version": VERSION, "licence": LICENCE, "seed": seed,
+        "cases": list(truth), "causes": list(psa.EFFECTS),
+    }  # fmt: skip
     _put(folder / "data.json", json_lines(content))
     _put(folder / "truth" / "truth.json", json_lines({"format": FORMAT, "cases": truth}))
     write_sums(folder)
@@ -303,73 +265,43 @@ def write(
 
 def write_model(folder: Path) -> None:
     """Write what all cases share: base model, causes, README, score, schema of answers."""
-    model = stack_model("demo")
+    model = psa.stack_model("demo")
     (folder / "model").mkdir(parents=True, exist_ok=True)
-    export_fmu(model, folder / "model" / "base.fmu")
-    export_modelica(model, folder / "model" / "Base.mo")
-    _put(folder / "model" / "base.json", json_lines(base_content(model)))
-    _put(folder / "model" / "causes.json", json_lines(causes_content()))
-    _put(folder / "model" / "model.md", markdown(model))
+    psa.export_fmu(model, folder / "model" / "base.fmu")
+    psa.export_modelica(model, folder / "model" / "Base.mo")
+    base, causes = base_content(model), causes_content()
+    _put(folder / "model" / "base.json", json_lines(base))
+    _put(folder / "model" / "causes.json", json_lines(causes))
+    page = Template(Path(__file__).with_name("model.md.j2").read_text("utf-8"))
+    _put(folder / "model" / "model.md", page.render(base=base, causes=causes).rstrip() + "\n")
     for name in ALONG:
         shutil.copyfile(Path(__file__).with_name(name), folder / name)
 
 
-def write_case(folder: Path, numbered: tuple[int, Case]) -> tuple[str, dict[str, object]]:
-    """Make and write one case; return its name and its truth."""
-    number, case = numbered
-    name = f"{number:03d}"
-    with tempfile.TemporaryDirectory() as temporary:
-        made = make(case, Path(temporary))
+def _write_halves(folder: Path, name: str, record: Half, held: Half) -> None:
     own = folder / "cases" / name
-    record, held = made.record, made.holdout
-    _table(own / "record.csv", record, ("displacement", record.read))
+    _table(own / "record.csv", record, displacement=record.read)
     _table(own / "holdout.csv", held)
-    _table(own / "base_record.csv", record, ("base displacement", record.base))
-    _table(own / "base_holdout.csv", held, ("base displacement", held.base))
-    _arrays(own / "base.npz", record, held)
-    true = ("displacement", held.read), ("displacement without noise", held.clean)
-    _table(folder / "truth" / f"{name}.csv", held, *true)
-    return name, _truth(made)
-
-
-def _truth(made: Made) -> dict[str, object]:
-    case = made.case
-    return {
-        "kind": case.kind,
-        "hidden": list(case.hidden),
-        "listed": case.kind != "foreign",
-        "gains": made.gains,
-        "times_the_noise": round(made.rho, 4),
-        "noise": case.noise,
-    }
-
-
-def _table(path: Path, half: Half, *more: tuple[str, FloatArray]) -> None:
-    """Write times, voltage, temperature and displacements; an empty cell is no reading."""
-    head = ["time [s]", "voltage [V]", *(f"{name} [um]" for name, _ in more), "temperature [degC]"]
-    columns = [
-        (half.times, "{:.6f}"),
-        (half.voltage, "{:.3f}"),
-        *((1e6 * values, "{:.6f}") for _, values in more),
-        (half.temperature, "{:.3f}"),
-    ]
-    cells = [
-        [form.format(x) if np.isfinite(x) else "" for x in values.tolist()]
-        for values, form in columns
-    ]
-    lines = [",".join(head), *(",".join(row) for row in zip(*cells, strict=True))]
-    _put(path, "\n".join(lines) + "\n")
-
-
-def _arrays(path: Path, record: Half, held: Half) -> None:
-    stream = io.BytesIO()
+    _table(own / "base_record.csv", record, base_displacement=record.base)
+    _table(own / "base_holdout.csv", held, base_displacement=held.base)
     np.savez(
-        stream,
-        names=np.array(COLUMNS),
-        record=record.columns.astype(np.float32),
+        own / "base.npz", names=np.array(COLUMNS), record=record.columns.astype(np.float32),
         holdout=held.columns.astype(np.float32),
-    )
-    path.write_bytes(stream.getvalue())
+    )  # fmt: skip
+    true = {"displacement": held.read, "displacement_without_noise": held.clean}
+    _table(folder / "truth" / f"{name}.csv", held, **true)
+
+
+def _table(path: Path, half: Half, **more: FloatArray) -> None:
+    """Write times, voltage, temperature and displacements [m]; an empty cell is no reading."""
+    columns = {"time [s]": (half.times, 6), "voltage [V]": (half.voltage, 3)}
+    columns |= {f"{name.replace('_', ' ')} [um]": (1e6 * x, 6) for name, x in more.items()}
+    columns["temperature [degC]"] = (half.temperature, 3)
+    cells = {
+        head: [f"{x:.{digits}f}" if np.isfinite(x) else "" for x in values.tolist()]
+        for head, (values, digits) in columns.items()
+    }
+    _put(path, pd.DataFrame(cells).to_csv(index=False, lineterminator="\n"))
 
 
 def write_sums(folder: Path) -> None:

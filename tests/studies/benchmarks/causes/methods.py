@@ -11,30 +11,16 @@ effects are as small as the noise, the residual itself is regressed and not its 
 
 import json
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.diagnosis.verdict import patched_model
-from psa_casadi.errors import PsaError
-from psa_casadi.model.compose import Model
-from psa_casadi.records.read.reading import read_record
-from psa_casadi.simulation.simulate import simulate
+import psa_casadi as psa
+from tests.studies.benchmarks.table import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 FORMAT = "psa_causes.answer/1"
-
-
-def held_out_columns(case: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times [s], voltage [V] and temperature [degC] of the held-out record, (N,)."""
-    t, v, warm = column_table(case / "holdout.csv").T
-    return t, v, warm
 
 
 def column_table(path: Path) -> FloatArray:
@@ -42,63 +28,46 @@ def column_table(path: Path) -> FloatArray:
     return np.asarray(np.genfromtxt(path, delimiter=",", skip_header=1), dtype=np.float64)
 
 
-def answer(
-    name: str,
-    *,
-    detected: bool,
-    causes: Sequence[dict[str, float]],
-    predicted: FloatArray,
-    seconds: float,
-    gain: tuple[float, float, float] | None = None,
-) -> dict[str, Any]:
-    """Return an answer; `predicted` (N,) [m] is on the held-out voltage, `gain` value and interval
-    of the reduction of the held-out rms [%].
-    """
+def write_answer(method: str, answers: Path, data: Path, name: str) -> str:
+    """Answer a case by a method, as NAME.json; return what is named."""
+    begin, case = time.process_time(), data / "cases" / name
+    detected, sets, predicted, gain = METHODS[method](case)
     content: dict[str, Any] = {
         "format": FORMAT,
         "case": name,
         "detected": detected,
-        "causes": [{e: round(p, 6) for e, p in own.items()} for own in causes],
+        "causes": [{e: round(p, 6) for e, p in own.items()} for own in sets],
         "displacement_um": np.round(1e6 * predicted, 6).tolist(),
-        "seconds": round(seconds, 2),
+        "seconds": round(time.process_time() - begin, 2),
     }
     if gain is not None and np.all(np.isfinite(gain)):
-        value, low, high = (round(float(g), 3) for g in gain)
-        content["gain_percent"] = {"value": value, "low": low, "high": high}
-    return content
-
-
-def write_answer(folder: Path, content: dict[str, Any]) -> None:
-    """Write an answer as NAME.json."""
-    folder.mkdir(parents=True, exist_ok=True)
+        ends = (round(float(g), 3) for g in gain)
+        content["gain_percent"] = dict(zip(("value", "low", "high"), ends, strict=True))
+    answers.mkdir(parents=True, exist_ok=True)
     text = json.dumps(content, ensure_ascii=False, allow_nan=False)
-    (folder / f"{content['case']}.json").write_text(text + "\n", encoding="utf-8")
+    (answers / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    return f"case {name}: {content['causes'] or 'nothing named'}"
 
 
+#: Sets of causes with their probabilities.
+Sets = list[dict[str, float]]
+#: Whether something was detected, the sets, the displacement on the held-out voltage (N,) [m], and
+#: value and interval of the reduction of the held-out rms [%].
+Answer = tuple[bool, Sets, FloatArray, tuple[float, float, float] | None]
 #: 0 degC [K].
 ZERO_CELSIUS = 273.15
 #: Less than this is no statement.
 _LEAST = 0.01
 
 
-def by_psa(folder: Path, name: str) -> dict[str, Any]:
+def by_psa(case: Path) -> Answer:
     """Diagnose the record of a case, and predict the held-out one."""
-    case = folder / "cases" / name
-    begin = time.process_time()
-    d = diagnose([read_record(case / "record.csv")])
-    seconds = time.process_time() - begin
-    low, high = d.gain.interval
-    return answer(
-        name,
-        detected=d.verdict not in ("adequate", "not_driven"),
-        causes=_sets(d),
-        predicted=_predicted(d, case),
-        seconds=seconds,
-        gain=(d.gain.holdout_rms_reduction_percent, low, high) if d.causes else None,
-    )
+    d = psa.diagnose([psa.read_record(case / "record.csv")])
+    gain = (d.gain.holdout_rms_reduction_percent, *d.gain.interval) if d.causes else None
+    return d.verdict not in ("adequate", "not_driven"), _sets(d), _predicted(d, case), gain
 
 
-def _sets(d: Diagnosis) -> list[dict[str, float]]:
+def _sets(d: psa.Diagnosis) -> Sets:
     """Return each named cause with what it cannot be told from, and their probabilities.
 
     The first step's candidates have theirs; a later cause has its confidence, and what it cannot be
@@ -116,22 +85,22 @@ def _sets(d: Diagnosis) -> list[dict[str, float]]:
     return sets
 
 
-def _predicted(d: Diagnosis, case: Path) -> FloatArray:
+def _predicted(d: psa.Diagnosis, case: Path) -> FloatArray:
     """Return the displacement on the held-out voltage [m]: with the unnamed correction, where a
     remainder has no name and one is offered.
     """
     if d.patch is not None and d.verdict in ("unexplained", "partly_explained"):
         try:
-            return _run(patched_model(d), case)
-        except PsaError:
+            return _run(psa.patched_model(d), case)
+        except psa.PsaError:
             pass  # the correction cannot be simulated: the model without it is the answer
     return _run(d.model, case)
 
 
-def _run(model: Model, case: Path) -> FloatArray:
-    times, voltage, celsius = held_out_columns(case)
+def _run(model: psa.Model, case: Path) -> FloatArray:
+    times, voltage, celsius = column_table(case / "holdout.csv").T
     warm = celsius + ZERO_CELSIUS if "temperature" in model.input_names else None
-    return np.asarray(simulate(model, times, voltage, temperature=warm).displacement)
+    return np.asarray(psa.simulate(model, times, voltage, temperature=warm).displacement)
 
 
 #: Chosen on the data set of seed 4711: threshold over the residual's rms, and the least that a
@@ -207,11 +176,8 @@ def _play(x: FloatArray, r: float) -> FloatArray:
     return out
 
 
-def by_sindy(
-    folder: Path, name: str, threshold: float = THRESHOLD, least: float = LEAST
-) -> dict[str, Any]:
+def by_sindy(case: Path) -> Answer:
     """Regress the residual of a case; name the causes whose terms stay."""
-    begin, case = time.process_time(), folder / "cases" / name
     record, held = column_table(case / "record.csv"), column_table(case / "holdout.csv")
     bases = [column_table(case / f"base_{k}.csv")[:, 2] for k in ("record", "holdout")]
     moves = np.load(case / "base.npz")
@@ -230,16 +196,15 @@ def by_sindy(
     free, rest = (a - base_part @ (base_part.T @ a) for a in (raw, y))
     size = np.sqrt(np.mean(free**2, axis=0)) + 1e-12
     level = float(np.std(rest))
-    kept = _sparse(free / size, rest / level, threshold)
-    named = _named(free / size, rest / level, owner, {str(c) for c in owner[kept]}, least)
+    kept = _sparse(free / size, rest / level, THRESHOLD)
+    named = _named(free / size, rest / level, owner, {str(c) for c in owner[kept]}, LEAST)
     use = np.isin(owner, [max(s, key=lambda c: s[c]) for s in named])
     weights = np.linalg.lstsq(free[:, use] / size[use], rest, rcond=1e-6)[0] / size[use]
     after = np.column_stack([column for c in causes for column in later[c]])
     shift = np.linalg.lstsq((nuisance / scale)[told], raw[:, use] @ weights, rcond=1e-8)[0]
     added = after[:, use] @ weights - np.asarray(moves["holdout"], float) @ (shift / scale)
     predicted = 1e-6 * (bases[1] + added)
-    seconds = time.process_time() - begin
-    return answer(name, detected=bool(named), causes=named, predicted=predicted, seconds=seconds)
+    return bool(named), named, predicted, None
 
 
 def _sparse(a: FloatArray, y: FloatArray, threshold: float) -> Any:
@@ -257,11 +222,9 @@ def _criterion(a: FloatArray, y: FloatArray) -> float:
     return float(y.size * np.log(np.mean(left**2)) + a.shape[1] * np.log(y.size))
 
 
-def _named(
-    a: FloatArray, y: FloatArray, owner: Any, kept: set[str], least: float
-) -> list[dict[str, float]]:
+def _named(a: FloatArray, y: FloatArray, owner: Any, kept: set[str], least: float) -> Sets:
     """Take causes one by one while the criterion falls; those as good as the best share its set."""
-    sets: list[dict[str, float]] = []
+    sets: Sets = []
     chosen: list[str] = []
     before = _criterion(a[:, :0], y)
     while rivals := [c for c in sorted(kept) if c not in chosen]:
@@ -276,3 +239,7 @@ def _named(
         sets.append({c: float(p / total) for c, p in near.items()})
         chosen, before = [*chosen, best], after[best]
     return sets
+
+
+#: Who answers.
+METHODS = {"psa": by_psa, "sindy": by_sindy}

@@ -1,0 +1,61 @@
+"""Devices that are no stacks: identifications and diagnoses of one's own model side by side."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.report.documents.files import identification_file
+from psa_casadi.strict_json import json_text
+from tests.any_model import own_plants as plants
+from tests.any_model.own_models import motor
+from tests.report.html_page import Page
+from tests.report.test_schemas import valid
+
+
+def device(name: str, seed: int, inertia: float = 3e-5, friction: float = 0.0) -> psa.Signals:
+    record = plants.motor(seed, friction, inertia=inertia)
+    return replace(record, name=name)
+
+
+def test_identifications_of_an_own_model_are_compared(tmp_path: Path) -> None:
+    """The third of three motors is heavier by a hundredth; all else is the same."""
+    given = [device("first", 1), device("second", 2), device("third", 3, inertia=3.03e-5)]
+    results = [psa.identify(motor(), record, starts=1) for record in given]
+    path = tmp_path / "second.json"
+    path.write_text(json_text(identification_file(results[1])), encoding="utf-8")
+    content = valid("identification", path.read_text("utf-8"))
+    rows = content["records"]
+    assert [(r["output"], r["unit"], r["samples"]) for r in rows] == [
+        ("w", "rad/s", 3000), ("i", "A", 3000)
+    ]  # fmt: skip
+    assert rows[0]["rms_m"] == pytest.approx(0.3, rel=0.05)
+    assert rows[1]["noise_m"] == pytest.approx(0.005, rel=0.05)
+    found = psa.read_findings([results[0], path, results[2]])
+    assert [f.device for f in found] == ["first", "second", "third"]
+    assert [f.rms_m for f in found] == [None] * 3  # rad/s is no length
+    psa.write_comparison(found, tmp_path / "page.html")
+    page = Page((tmp_path / "page.html").read_text("utf-8"))
+    assert "Beyond noise, J differs (4 parameters compared)." in page.text
+    assert page.loaded == []
+
+
+@pytest.mark.slow
+def test_diagnoses_of_an_own_model_are_compared(tmp_path: Path) -> None:
+    fewer = ["hysteresis", "stop", "curve", "delay"]
+    given = [device("dry", 1, friction=0.012), device("oiled", 2)]
+    dry, oiled = (psa.diagnose(motor(), r, leave_out=fewer) for r in given)
+    path = tmp_path / "dry.json"
+    path.write_text(dry.to_json(), encoding="utf-8")
+    found = psa.read_findings([path, oiled])
+    assert [f.verdict for f in found] == ["cause_named", "adequate"]
+    size = found[0].parameters["friction_in_speed_size"]
+    assert size.value == json.loads(dry.to_json())["causes"][0]["parameters"][
+        "friction_in_speed_size"
+    ]["value"]  # fmt: skip
+    psa.write_comparison(found, tmp_path / "page.html")
+    page = Page((tmp_path / "page.html").read_text("utf-8"))
+    assert "Verdicts differ (dry: cause named and oiled: adequate)" in page.text
+    assert "friction in speed" in page.text

@@ -1,0 +1,308 @@
+"""Records changed a little or a lot: by 1 % of their noise, by an effect on top, cut and spoilt."""
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from time import process_time
+from typing import NamedTuple
+
+import numpy as np
+
+import psa_casadi as psa
+from psa_casadi import datasets
+from psa_casadi.records.drive import reversals
+from tests.studies.benchmarks.exam import read_back
+from tests.studies.benchmarks.hidden_cases import Case, names_of, records_of, study
+from tests.studies.benchmarks.records import noisy
+from tests.studies.benchmarks.table import (
+    FloatArray,
+    Outcome,
+    Progress,
+    TitledTable,
+    on_all_cores,
+    share,
+)
+from tests.studies.exam.record import Record as ExamRecord
+from tests.studies.exam.records import RECORDS
+from tests.studies.plants.base import simulate_base
+from tests.studies.plants.hide import hide
+from tests.studies.plants.stack import draw_stack
+from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
+from tests.studies.plants.visibility import base_directions
+
+#: The first of the seeds of `stability`, which no other benchmark uses; the change of the data over
+#: the rms of their noise; that of the measured records [m].
+FIRST, CHANGE, _MEASURED_NOISE = 480201, 0.01, 67e-9
+#: Cases of the study and draws of each; draws of records of the exam, of which a quick run takes
+#: one of so many, and of measured rows.
+CASES, DRAWS, EXAM_DRAWS, QUICK_EXAM, MEASURED_DRAWS = 40, 20, 3, 12, 9
+_KINDS = ("known", "weak", "clean", "foreign", "left out", "two", "poor", "design", "ringing")
+#: Rows of `docs/measured.md`.
+MEASURED = ("sine_1hz", "minor_loops", "both files")
+
+#: A case of the study, a record of the exam, or a row of the measured ones; and what was said of
+#: it: verdict, names, and the whole set.
+Source = Case | ExamRecord | str
+Said = tuple[str, frozenset[str], frozenset[str]]
+
+
+def stability(progress: Progress, quick: bool) -> Outcome:
+    """Diagnose everything as it is, then with white noise of 1 % of its own added."""
+    jobs: list[tuple[str, Source, int]] = [
+        (c.kind, c, 3 if quick else DRAWS) for c in chosen_cases(6 if quick else CASES)
+    ]
+    exam = RECORDS[::QUICK_EXAM] if quick else RECORDS
+    jobs += [("exam", record, 1 if quick else EXAM_DRAWS) for record in exam]
+    jobs += [("measured", row, 1 if quick else MEASURED_DRAWS) for row in MEASURED]
+    draws = [(source, k) for _, source, n in jobs for k in range(n + 1)]
+    told = lambda s: f"{s[0]} {', '.join(s[1])}"  # noqa: E731
+    said = iter(on_all_cores(said_of, draws, progress, told))
+    found = {(kind, k): list(itertools.islice(said, n + 1)) for k, (kind, _, n) in enumerate(jobs)}
+    rows = []
+    for kind in (*dict.fromkeys(kind for kind, _ in found), "all"):
+        own = [of for (name, _), of in found.items() if kind in (name, "all")]
+        pairs = [(first, s) for first, *changed in own for s in changed]
+        rows.append({
+            "cases": kind, "number": len(own),
+            "same verdict and names": share(s[:2] == first[:2] for first, s in pairs),
+            "same verdict, names in the set": share(
+                s[0] == first[0] and first[1] <= s[2] for first, s in pairs
+            ),
+            "cases without a change": sum(len({s[:2] for s in of}) == 1 for of in own),
+        })  # fmt: skip
+    note = "Everything is diagnosed as it is, and with white noise of 1 % of its own added."
+    return Outcome([TitledTable("Data changed by 1 % of their noise", rows, note)])
+
+
+def chosen_cases(count: int) -> list[Case]:
+    """Return cases of every kind in turn, evenly from a study."""
+    every = study(KNOWN, FOREIGN, 2, FIRST)
+    rows = [[c for c in every if c.kind == kind] for kind in _KINDS]
+    each = -(-count // len(rows))
+    spread = [[own[len(own) * k // each] for k in range(each)] for own in rows]
+    return [own[k] for k in range(each) for own in spread][:count]
+
+
+def said_of(source: Source, draw: int) -> Said:
+    """Return what is said of records with their readings changed by white noise; draw 0 is not."""
+    noise, records = _records(source)
+    seed = MEASURED.index(source) if isinstance(source, str) else source.seed
+    rng, level = np.random.default_rng([seed, draw]), CHANGE * noise if draw else 0.0
+    d = psa.diagnose([noisy(r, level, rng) for r in records])
+    named, within = names_of(d)
+    return d.verdict, frozenset(named), frozenset(within)
+
+
+def _records(source: Source) -> tuple[float, Sequence[psa.Record]]:
+    """Return the rms of the noise of the readings [m], and the records."""
+    if isinstance(source, Case):
+        truth, records = records_of(source)
+        return truth.sigma, records
+    if isinstance(source, ExamRecord):
+        record = read_back(source)
+        return 1e-2 * source.test.noise * record.range_m, [record]
+    sine, loops = datasets.micromanipulator()
+    rows = dict(zip(MEASURED, ([sine], [loops], [sine, loops]), strict=True))
+    return _MEASURED_NOISE, rows[source]
+
+
+#: The first of the seeds of `added`, which nothing else uses; samples of an excerpt; excerpts.
+FIRST_ADDED, LENGTH, EXCERPTS = 620401, 2400, 2
+#: Rms of what is added and the base cannot absorb, over what the extended model of the record as it
+#: was measured leaves.
+SIZE = 3.0
+#: Samples in which the plant's voltage rises from zero to where an excerpt begins.
+_LEAD = 400
+
+
+class Added(NamedTuple):
+    """What was said of an excerpt as it was measured, and with an effect on top.
+
+    `own` are the names and their sets without the effect; `named` and `within` those with it.
+    """
+
+    record: str
+    effect: str
+    own: tuple[str, ...]
+    verdict: str
+    named: tuple[str, ...]
+    within: tuple[str, ...]
+
+    @property
+    def wrong(self) -> tuple[str, ...]:
+        """Causes that neither the record has by itself nor the effect is."""
+        return tuple(n for n in self.named if n not in (*self.own, called(self.effect)))
+
+    @property
+    def alone(self) -> bool:
+        """Whether one wrong cause is named as the only one, with nothing left."""
+        return self.verdict == "cause_named" and self.named == self.wrong and len(self.named) == 1
+
+
+def added(progress: Progress, quick: bool) -> Outcome:
+    """Diagnose excerpts of the measured records as they are and with every effect on top.
+
+    A plant plays the record's own voltage with the effect and without it; the difference, scaled to
+    the record's stroke, is added to what was measured. What the record has by itself stays.
+    """
+    effects = [e for e in KNOWN if HIDDEN_EFFECTS[e].room is None][:: 5 if quick else 1]
+    pieces = excerpts_from_reversals(1 if quick else EXCERPTS)[: 1 if quick else None]
+    plain = on_all_cores(by_itself, [(p,) for p in pieces], progress)
+    jobs = [
+        (piece, effect, FIRST_ADDED + 100 * k + j, *own)
+        for k, (piece, own) in enumerate(zip(pieces, plain, strict=True))
+        for j, effect in enumerate(effects)
+    ]
+    found = on_all_cores(with_effect, jobs, progress, lambda f: f"{f.record} with {f.effect}")
+    each = [
+        {"record": f.record, "named by itself": ", ".join(f.own) or "-", "added": f.effect,
+         "verdict": f.verdict, "named": ", ".join(f.within) or "-"}
+        for f in found
+    ]  # fmt: skip
+    return Outcome((summary(found), TitledTable("What was said of each", each)))
+
+
+def excerpts_from_reversals(each: int) -> list[psa.Record]:
+    """Return excerpts of the measured records, each from a reversal on."""
+    rng = np.random.default_rng(FIRST_ADDED)
+    found = []
+    for record in datasets.micromanipulator():
+        turns = [t for t in reversals(record.voltage) if t + LENGTH <= record.n]
+        for start in np.sort(rng.choice(turns, each, replace=False)).tolist():
+            piece = record.slice(start, start + LENGTH)
+            found.append(replace(piece, name=f"{record.name} from {record.time[start]:.1f} s"))
+    return found
+
+
+def by_itself(record: psa.Record) -> tuple[tuple[str, ...], float]:
+    """Return all that is named of a record, and what its extended model leaves, rms [m]."""
+    d = psa.diagnose([record])
+    return names_of(d)[1], d.extended_errors.holdout_rms_m
+
+
+def with_effect(
+    record: psa.Record, effect: str, seed: int, own: tuple[str, ...], left: float
+) -> Added:
+    """Diagnose a record with an effect on top of what it has by itself."""
+    more = difference(record, effect, seed, SIZE * left)
+    d = psa.diagnose([replace(record, displacement=np.asarray(record.displacement) + more)])
+    return Added(record.name, effect, own, d.verdict, *names_of(d))
+
+
+def difference(record: psa.Record, effect: str, seed: int, size: float) -> FloatArray:
+    """Return what an effect adds to a plant's displacement at a record's voltage (n,) [m].
+
+    The plant's voltage is the record's over its range; `size` [m] is the rms of what a base model
+    cannot absorb.
+    """
+    rng = np.random.default_rng(seed)
+    stack, v = draw_stack(rng), record.voltage
+    command = stack.u_rated * (v - v.min()) / float(np.ptp(v))
+    lead = command[0] * 0.5 * (1.0 - np.cos(np.pi * np.arange(_LEAD) / _LEAD))
+    played = np.concatenate([lead, command])
+    times: FloatArray = record.sample_time * np.arange(played.size, dtype=np.float64)
+    run = simulate_base(stack, times, played)
+    scale = record.range_m / float(np.ptp(run.displacement[_LEAD:]))
+    hidden = hide(
+        HIDDEN_EFFECTS[effect], run, rng, base_directions(run), size / scale, 1.0, visible=1.0
+    )
+    return np.asarray(scale * hidden.added[_LEAD:], dtype=np.float64)
+
+
+def summary(found: Sequence[Added]) -> TitledTable:
+    """Return how often the effect is named, and how often another one that is not there."""
+    new = [f for f in found if called(f.effect) not in f.own]
+    figures = (
+        ("the effect in a named set", "-", [called(f.effect) in f.within for f in new]),
+        ("a single wrong name", "at most 2 %", [f.alone for f in new]),
+        ("any cause that the record has not by itself", "-", [bool(f.wrong) for f in new]),
+    )
+    return TitledTable(
+        "An effect added to a measured record",
+        [{"figure": text, "asked": asked, "reached": share(h)} for text, asked, h in figures],
+        f"{len(found) - len(new)} of {len(found)} effects are named of the record by itself and do"
+        f" not count. What is added is {SIZE:g} times what the extended model of the record leaves,"
+        " beside what the base can absorb.",
+    )
+
+
+#: The seed of `excerpts`, which no other benchmark uses; pieces; their samples.
+SEED, PIECES, QUICK_PIECES, LENGTHS = 740501, 200, 6, (300, 2500)
+#: Scales of the displacement, units mistaken by a power of ten among them; every so many samples
+#: are kept of long pieces.
+_SCALES, _KEPT, _LONG = (1.0, 1.0, 1.0, 10.0, 1e3, 1e-3), (1, 1, 2, 5), 1500
+#: Share of pieces whose displacement is turned round, and of those whose voltage is.
+_TURNED = 0.15
+
+
+class Ended(NamedTuple):
+    """How the diagnosis of a piece ended: a verdict, `refused` or `crashed`, and what was said."""
+
+    piece: str
+    how: str
+    said: str
+    seconds: float
+
+
+def excerpts(progress: Progress, quick: bool) -> Outcome:
+    """Diagnose spoilt pieces of the measured records.
+
+    Cut anywhere, at any length, decimated, scaled by powers of ten, with either column's sign
+    turned: each must end with a verdict, or be refused in a sentence, and its model must predict
+    the piece.
+    """
+    every = pieces(datasets.micromanipulator(), QUICK_PIECES if quick else PIECES)
+    told = lambda e: f"{e.piece}: {e.how}"  # noqa: E731
+    return Outcome([ends(on_all_cores(ended_of, [(piece,) for piece in every], progress, told))])
+
+
+def pieces(records: Sequence[psa.Record], count: int) -> list[psa.Record]:
+    """Return so many pieces of records, in turn, each named for what was done to it."""
+    rng, found = np.random.default_rng(SEED), []
+    for k in range(count):
+        whole = records[k % len(records)]
+        length = int(rng.integers(LENGTHS[0], min(LENGTHS[1], whole.n)))
+        first = int(rng.integers(0, whole.n - length + 1))
+        keep = int(rng.choice(_KEPT)) if length > _LONG else 1
+        scale = float(rng.choice(_SCALES))
+        turn, sign = (float(rng.choice([-1.0, 1.0], p=[_TURNED, 1 - _TURNED])) for _ in "xv")
+        part = whole.slice(first, first + length)
+        name = f"{whole.name} {first}:{first + length}:{keep}, x {scale * turn:g}, v {sign:+g}"
+        shown = scale * turn * np.asarray(part.displacement)[::keep]
+        voltage = sign * part.voltage[::keep]
+        found.append(
+            psa.Record(name=name, time=part.time[::keep], voltage=voltage, displacement=shown)
+        )
+    return found
+
+
+def ended_of(piece: psa.Record) -> Ended:
+    """Diagnose a piece; any error but a refusal in words is a crash."""
+    begin = process_time()
+    try:
+        d = psa.diagnose([piece])
+        finite = all(np.all(np.isfinite(y)) for y in (*d.base, *d.extended))
+        how: str = d.verdict if finite and d.to_json() else "crashed"
+        said = ", ".join(c.effect for c in d.causes)
+    except psa.InputError as error:
+        how, said = "refused", str(error)
+    except Exception as error:  # noqa: BLE001 - what is counted here
+        how, said = "crashed", f"{type(error).__name__}: {error}"
+    return Ended(piece.name, how, said, process_time() - begin)
+
+
+def ends(found: Sequence[Ended]) -> TitledTable:
+    """Return how the pieces ended, and what was said of those that were refused or crashed."""
+    counts = Counter(e.how for e in found)
+    counts["crashed"] += 0
+    failed = [e for e in found if e.how in ("refused", "crashed")]
+    said = Counter((f"{e.how} because", e.said.split(";")[0][:80]) for e in failed)
+    lines = [(how, n, "") for how, n in sorted(counts.items())]
+    lines += [(how, n, text) for (how, text), n in sorted(said.items())]
+    slowest = max(found, key=lambda e: e.seconds)
+    return TitledTable(
+        f"{len(found)} spoilt pieces of measured records",
+        [{"ended": how, "pieces": n, "said": text} for how, n, text in lines],
+        f"The slowest took {slowest.seconds:.0f} s of processor time: {slowest.piece}.",
+    )

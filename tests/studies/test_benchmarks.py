@@ -1,0 +1,490 @@
+"""What the benchmarks count and print: on figures made up here, so that all can be told."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.datasets.devices import linear_response
+from psa_casadi.diagnosis.result import Verdict
+from psa_casadi.records import steps, time_grid
+from psa_casadi.records.split import split
+from psa_casadi.simulation import device
+from psa_casadi.simulation.simulate import EXACT, STEPPER
+from tests.datasets.test_datasets_one_axis import N as PERIOD
+from tests.datasets.test_datasets_one_axis import driven, voltages
+from tests.simulation.cuda_host import lend
+from tests.studies.__main__ import app
+from tests.studies.benchmarks import changed, fits, floors, mirror, peers, sampling
+from tests.studies.benchmarks import diagnose as study
+from tests.studies.benchmarks import verification as paper
+from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
+from tests.studies.benchmarks.hidden_cases import Case, Found, Kind
+from tests.studies.benchmarks.table import BENCHES, FloatArray, bench, least_times
+from tests.tiers import slow
+
+
+def silent(_: str) -> None:
+    """Progress that nobody reads."""
+
+
+def test_every_benchmark_has_a_function_or_a_command() -> None:
+    for name in BENCHES:
+        assert callable(bench(name, "app") or bench(name)), name
+
+
+def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
+    said = CliRunner().invoke(app, ["identify", "--folder", str(tmp_path)])
+    assert said.exit_code == 2
+    assert "--folder: 'identify' takes none" in said.stderr.replace("\n", " ")
+    for run, words in ((floors.run, "holds no CSV file"), (mirror.run, "no model axis_1_")):
+        with pytest.raises(psa.InputError, match=words):
+            run(silent, False, folder=tmp_path)
+
+
+def test_works_are_timed_in_turns_and_a_slow_one_is_not_repeated() -> None:
+    calls: list[str] = []
+
+    def slow_one() -> None:
+        calls.append("b" if sum(range(10**6)) else "")
+
+    least = least_times([lambda: calls.append("a"), slow_one], 3, slow=1e-3)
+    assert "".join(calls) == "abaa"
+    assert all(0.0 <= s < 1.0 for times in least for s in times)
+
+
+# ---- ensembles
+
+
+@pytest.fixture
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent() -> None:
+        raise psa.InputError("there is none.")
+
+    monkeypatch.setattr(device, "device_module", absent)
+
+
+def short() -> psa.Record:
+    """Return 40 samples of the sine, up and down in 8 ms."""
+    voltage = 50.0 - 50.0 * np.cos(2.0 * np.pi * np.arange(40) / 39.0)
+    return replace(peers.cases(40)[0], voltage=voltage)
+
+
+def test_the_loosest_tolerance_is_the_first_that_is_accurate() -> None:
+    """The first set errs by 10 times the tolerance over its range, the second by 50 times."""
+    truth = np.array([[0.0, 1.0], [0.0, 2.0]])
+
+    def at(tolerance: float) -> peers.Solve:
+        return lambda: np.array([[0.0, 1.0 + 10.0 * tolerance], [0.0, 2.0 + 100.0 * tolerance]])
+
+    tolerance, error, _ = peers.loosest(at, truth)
+    assert tolerance == pytest.approx(1e-7)
+    assert error == pytest.approx(5e-6, rel=1e-6)
+    assert peers.loosest(lambda _: lambda: np.array([[0, 1], [0, np.nan]]), truth)[1] == np.inf
+
+
+@slow
+@pytest.mark.usefixtures("no_gpu")
+def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight sets of 40 samples, scipy and CVODES beside `simulate_many`."""
+    monkeypatch.setattr(peers, "find_spec", lambda _: None)
+    monkeypatch.setattr(peers, "_REPEATS", 1)
+    (table,) = peers.measured(silent, [short()], 8).tables
+    assert [(r["sets"], r["samples"]) for r in table.rows] == [(8, 40), (4, 40), (4, 40)]
+    assert [r["way"] for r in table.rows] == [peers.OURS, *list(peers.PEERS)[:2]]
+    assert all(float(str(r["largest error / range"])) <= 1e-5 for r in table.rows)
+    assert table.rows[0]["over ours"] == "1.0"
+    assert "pip install --group ensembles" in table.note
+    assert table.note.endswith("No rows of a GPU: there is none.")
+
+
+def test_a_gpu_has_rows_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve sets, on this processor in the place of a GPU."""
+    host = lend(monkeypatch, 10**9)
+    model = psa.stack_model("P-885.51")
+    tables, missing = peers.on_gpu(silent, model, [(short(), 1e-6)], 12)
+    assert not missing
+    (row,) = tables[0].table.rows
+    assert row[:5] == ("sine of 10 Hz", "12", "40", "1e-06", "0.0e+00")
+    assert "this processor" in tables[0].note
+    assert host.launches == [1, 128, 1, 128]
+
+
+# ---- fits
+
+POINTS = [
+    fits.Point(EXACT, 1e-5, 2e-5, 1.5, 0.7, 1.4),
+    fits.Point(EXACT, 1e-6, 5e-6, 2.0, 0.8, 1.9),
+    fits.Point(EXACT, 1e-7, 2e-6, 3.0, 1.2, 2.8),
+    fits.Point(STEPPER, 1e-6, 2e-5, 16.0, 7.0, 1.9),
+    fits.Point(STEPPER, 1e-7, 1e-6, 22.0, 10.0, 2.8),
+]
+TRIAL = fits.Trial("demo", "slow_creep", fits.MIXED, 1e-3)
+FINE = fits.Reached(TRIAL, 1e-6, EXACT, 5e-7, EXACT)
+LATE = FINE._replace(trial=TRIAL._replace(effect="sensor_delay"), way=STEPPER, error=1e-7)
+
+
+def test_of_each_way_the_cheapest_run_below_the_error_counts() -> None:
+    assert fits.cheapest(POINTS, EXACT, "differentiated").tolerance == 1e-6
+    assert fits.cheapest(POINTS, STEPPER, "plain").tolerance == 1e-7
+    with pytest.raises(psa.PsaError, match="No tolerance"):
+        fits.cheapest(POINTS, STEPPER, "plain", 1e-9)
+    note = fits.run_table(POINTS, 5248).note
+    assert "with 12 sensitivities 1/11 of the stepper's time" in note
+    assert "without 1/12 of the stepper's time" in note
+
+
+def test_the_base_is_no_effect_that_takes_a_way() -> None:
+    base = FINE._replace(trial=TRIAL._replace(effect="base"))
+    found = [r._replace(rtol=rtol) for rtol in (1e-4, 1e-6) for r in (base, FINE, LATE)]
+    table = fits.ways_tables(found)[0]
+    assert table.note.startswith("Of 2 effects 2 take the exact way in a fit")
+    assert table.table.rows[2] == ("sensor delay", EXACT, "0 of 1", "0 of 1")
+
+
+def test_errors_above_the_tolerance_are_counted() -> None:
+    worst = FINE._replace(trial=TRIAL._replace(record="steps"), error=3e-6)
+    (row,) = fits.ways_tables([FINE, LATE, worst, FINE])[1].table.rows
+    assert row[1:4] == ("75 % (3 of 4)", "25 % (1 of 4)", "3.0")
+    assert row[4] == "demo, slow creep, steps, 1 ms"
+
+
+def test_every_effect_is_at_work_beside_the_base_of_every_stack() -> None:
+    for stack in psa.STACKS:
+        for name, effect in psa.EFFECTS.items():
+            assert fits.with_one_effect(stack, name).values[str(effect.gain)] != 0.0
+
+
+def test_exact_steps_are_left_out_only_within() -> None:
+    def way() -> str:
+        model, (t, v) = psa.stack_model("demo"), fits.voltage("steps", 100.0, 1e-3)
+        return psa.simulate(model, t[:50], v[:50], rtol=1e-3).way
+
+    assert way() == EXACT
+    with fits.stepper_alone():
+        assert way() == STEPPER
+    assert way() == EXACT
+
+
+# ---- diagnose and excerpts
+
+
+def _found(kind: Kind, effect: str | None, named: dict[str, float], rho: float = 1.0) -> Found:
+    """Return a case in which the most probable effect is named, nothing if there is none."""
+    first = max(named, key=lambda name: named[name], default=None)
+    names, rho = ((first,) if first else ()), rho if effect else 0.0
+    verdict: Verdict = "cause_named" if first else "adequate"
+    surely = named[first] if first else 0.0
+    return Found(Case(kind, effect, 1), rho, verdict, names, names, (), surely, named, {}, 1.0, 1.0)
+
+
+FOUND = [
+    _found("known", "slow_creep", {"slow_creep": 0.97, "offset_drift": 0.03}),
+    _found("known", "slow_creep", {"slow_creep": 0.99}),
+    _found("known", "offset_drift", {"slow_creep": 0.9, "offset_drift": 0.1}),
+    _found("known", "offset_drift", {"slow_creep": 0.99}, 0.01),  # not as visible as asked for
+    _found("left out", "slow_creep", {"offset_drift": 0.98}),
+    _found("foreign", "dry_friction", {}),
+    _found("clean", None, {}),
+    _found("clean", None, {"slow_creep": 0.99}),
+]
+
+
+def test_shares_are_of_the_cases_as_visible_as_asked_for() -> None:
+    summary = study.result_tables(FOUND)[0]
+    reached = {row["figure"]: row["reached"] for row in summary.rows}
+    assert {
+        "right name alone, rho 0.3 to 3": "67 % (2 of 3)",
+        "a single wrong name, rho 0.3 to 3": "33 % (1 of 3)",
+        "clean, white noise: a cause named": "50 % (1 of 2)",
+        "own entry left out: not named alone": "0 % (0 of 1)",
+        "foreign plants: not named alone": "100 % (1 of 1)",
+    }.items() <= reached.items()
+
+
+def test_a_probability_is_held_against_how_often_the_effect_is_the_cause() -> None:
+    inside, every = study.RELIABILITY
+    assert study.in_class(FOUND, inside, 0.95, 1.0) == [(0.97, True), (0.99, True)]
+    assert study.in_class(FOUND, inside, 0.02, 0.2) == [(0.03, False), (0.1, True)]
+    assert study.in_class(FOUND, every, 0.95, 1.0)[2:] == [(0.98, False)]
+    rows = {row[0]: row[1:] for row in study.result_tables(FOUND)[1].table.rows}
+    assert rows["80 to 95 %"] == ("90 %", "0 %", "1", "90 %", "0 %", "1")
+    assert rows["95 to 100 %"] == ("98 %", "100 %", "2", "98 %", "67 %", "3")
+
+
+def test_an_interval_of_the_gain_is_held_against_the_records_it_does_not_know() -> None:
+    ends = ((45.0, 55.0), (51.0, 60.0)), ((25.0, 35.0), (20.0, 31.0))
+    found = [
+        study.Covered("slow_creep", 50.0, (40.0, 45.0), ends[0], (50.0, 50.5)),
+        study.Covered("ageing", 30.0, (10.0, 60.0), ends[1], (30.0, 30.0)),
+    ]
+    blocks, records = study.intervals_table(found).table.rows
+    assert blocks[1:] == ("50 % (1 of 2)", "27.5 %")
+    assert records[1:] == ("75 % (3 of 4)", "10.0 %")
+
+
+def test_a_refusal_is_no_crash_and_a_crash_is_told() -> None:
+    t = np.linspace(0.0, 2.999, 3000)
+    x = psa.simulate(psa.stack_model("P-885.51"), t, 50.0 - 40.0 * np.cos(2 * np.pi * t))
+    still = psa.Record(
+        name="still", time=t, voltage=np.full(3000, 3.0), displacement=x.displacement
+    )
+    refused = changed.ended_of(still)
+    assert refused.how == "refused"
+    others = [("a", "adequate", "", 2.0), ("b", "crashed", "KeyError: 'x'", 9.0)]
+    told = changed.ends([refused, *(changed.Ended(*e) for e in others)])
+    assert ("crashed", "1", "") in told.table.rows
+    assert ("crashed because", "1", "KeyError: 'x'") in told.table.rows
+    assert "The slowest took 9 s" in told.note
+
+
+# ---- floors
+
+#: Samples, and noise over the range's order of size; every fourth quarter of a hundred is held out.
+N, NOISE = 1600, 2e-3
+HELD = np.arange(N) % 100 >= 75
+
+
+def triangles(rng: np.random.Generator) -> FloatArray:
+    """Loops of other amplitudes, up and down in pieces of other length, with a little jitter."""
+    turns = np.cumsum(rng.integers(30, 90, size=60))
+    values = rng.uniform(-1.0, 1.0, size=60)
+    values[5:7] = 1.0, -1.0
+    return np.interp(np.arange(N), np.r_[0, turns], np.r_[0.0, values])
+
+
+def plant(v: FloatArray, rng: np.random.Generator, state: float = 0.0) -> FloatArray:
+    """Memory, creep and the ripple of a sensor, by none of the code that is tested."""
+    memory = np.zeros(N)
+    for threshold, weight in ((2 / 15, 0.2), (6 / 15, 0.15), (9 / 15, 0.1)):
+        s = min(max(state, v[0] - threshold), v[0] + threshold)
+        for k in range(N):
+            s = min(max(s, v[k] - threshold), v[k] + threshold)
+            memory[k] += weight * (s + 0.2 * s**2)
+    creep = lfilter([1 / 300.0], [1.0, 1 / 300.0 - 1.0], v - v[0])
+    x = v + memory + 0.1 * creep
+    return np.asarray(x + 0.01 * np.sin(8.0 * x) + NOISE * rng.standard_normal(N))
+
+
+def test_a_play_follows_behind_its_threshold_and_remembers_what_was_before() -> None:
+    v = np.array([0.0, 1.0, 0.5, -1.0])
+    np.testing.assert_allclose(play(v, 0.2, ()), [0.0, 0.8, 0.7, -0.8])
+    np.testing.assert_allclose(play(v, 0.2, (1.0,)), [0.2, 0.8, 0.7, -0.8])
+
+
+def test_prior_sizes_tell_what_acts_from_what_does_not() -> None:
+    rng = np.random.default_rng(3)
+    features = rng.standard_normal((300, 64))
+    kinds = np.r_[0, np.ones(3, dtype=int), np.full(60, 2)]
+    truth = np.r_[5.0, 1.0, -2.0, 0.5, np.zeros(60)]
+    y = features @ truth + 0.3 * rng.standard_normal(300)
+    found = ridge(features, kinds, y)
+    assert found.sigma == pytest.approx(0.3, rel=0.1)
+    np.testing.assert_allclose(found.weights[:4], truth[:4], atol=0.1)
+    plain = np.linalg.lstsq(features, y, rcond=None)[0]
+    assert np.sum((found.weights - truth) ** 2) < 0.3 * np.sum((plain - truth) ** 2)
+    without = ridge(features[:, :3], kinds[:3], y)
+    assert found.evidence > without.evidence + 10.0
+
+
+def test_the_floor_of_a_plant_of_its_kind_is_the_noise() -> None:
+    rng = np.random.default_rng(11)
+    v = triangles(rng)
+    t, x = np.linspace(0.0, 1e-3 * (N - 1), N), 1e-6 * plant(v, rng)
+    experiments = [split(psa.Record(name="own", time=t, voltage=40.0 + 30.0 * v, displacement=x))]
+    errors = floors.floor_on(experiments, silent)
+    assert errors.holdout_rms_m < 1.5e-6 * NOISE
+    # a straight line of the voltage errs fifty times more: the record does hold what is found
+    line = np.polyval(np.polyfit(v, x, 1), v)
+    assert np.std((x - line)[experiments[0].held_out]) > 30.0 * errors.holdout_rms_m
+
+
+@slow
+def test_modes_are_found_in_a_broadband_record() -> None:
+    rng = np.random.default_rng(2)
+    v = np.clip(0.25 * rng.standard_normal(700), -1.0, 1.0)
+    truth, damping, x = (0.11, 0.23), 0.03, 0.3 * v
+    for f in truth:
+        w = 2 * np.pi * f
+        poles = [1.0, -2 * np.exp(-damping * w) * np.cos(w), np.exp(-2 * damping * w)]
+        x += lfilter([0.0, 0.05], poles, v)
+    noise = 0.01 * np.std(x)
+    y = x + noise * rng.standard_normal(len(v))
+    held = HELD[: len(v)]
+    found = floor_of([Part(v, y, ~held)])
+    for f in truth:
+        mode = min(found.modes, key=lambda m: abs(m.frequency - f))
+        assert mode.frequency == pytest.approx(f, rel=0.003)
+        assert mode.damping == pytest.approx(damping, rel=0.1)
+    assert np.std((y - found.predicted[0])[held]) < 1.4 * noise
+
+
+@slow
+def test_a_line_of_the_mains_is_found_and_noise_is_none() -> None:
+    rng = np.random.default_rng(8)
+    v, noise = triangles(rng), 0.01 * rng.standard_normal(N)
+    y = v + 0.02 * np.sin(2 * np.pi * 0.2531 * np.arange(N) + 1.0) + noise
+    found = floor_of([Part(v, y, ~HELD)])
+    (line,) = [m for m in found.modes if m.damping == 0.0]
+    assert line.frequency == pytest.approx(0.2531, abs=1e-5)
+    assert np.std((y - found.predicted[0])[HELD]) < 1.1 * np.std(noise)
+    assert not floor_of([Part(v, v + noise, ~HELD)]).modes
+
+
+@slow
+def test_where_a_record_comes_from_is_found() -> None:
+    rng = np.random.default_rng(5)
+    v = 0.4 * triangles(rng)
+    found = floor_of([Part(v, plant(v, rng, state=1.0), ~HELD)]).histories[0]
+    assert found in HISTORIES
+    assert found[-1] == 1.0
+
+
+# ---- mirror: its score is that of the authors, and a model is simulated settled
+
+
+def test_an_exact_response_scores_nothing_and_noise_scores_its_share() -> None:
+    train, test = (np.tile(voltages(seed, k), (4, 1, 1, 1)) for seed, k in ((1, 6), (2, 3)))
+    y = driven(test)
+    response = linear_response(train, driven(train))
+    assert len(y) == 4 * PERIOD > mirror.SKIPPED
+    assert mirror.scores(test, y, response, 0, None)[0] < 1e-9
+    noisy = y + 1e-8 * np.random.default_rng(4).standard_normal(y.shape)
+    share, rms = mirror.scores(test, noisy, response, 1, None)
+    assert rms == pytest.approx(1e-8, rel=0.05)
+    assert share == pytest.approx(1e-8 / np.std(y[:, 1]), rel=0.1)
+
+
+def test_a_settled_model_repeats_itself_and_has_no_mean() -> None:
+    one = 20.0 * np.sin(2 * np.pi * np.arange(2000) / 500.0)
+    shown = mirror.settled(psa.stack_model("P-885.51"), np.column_stack([one, one]))
+    assert shown.shape == (2000, 2)
+    np.testing.assert_allclose(shown[:, 0], shown[:, 1], atol=2e-3 * np.ptp(shown))
+    assert abs(np.mean(shown)) < 1e-6 * np.ptp(shown)
+    assert np.ptp(shown) > 1e-7
+    assert mirror.RATE == 6400.0
+
+
+# ---- sampling: the one equation that PyMC gets shows what the whole stack shows
+
+#: NumPy under the names of PyMC's symbols.
+NUMPY = SimpleNamespace(
+    floor=np.floor, mod=np.mod, eq=np.equal, lt=np.less, switch=np.where, sqrt=np.sqrt
+)
+
+
+def test_the_reduced_equation_shows_the_stack_at_other_values() -> None:
+    model = sampling.stack().with_values({"k_L": 7.9, "A": -1.5, "delta": -0.2, "n": 1.7})
+    v, given = model.values, sampling.record()
+    p = [v["A"], v["delta"], v["n"]]
+    found = solve_ivp(
+        lambda t, y: [sampling.hysteresis_rate(y[0], t, p, v, NUMPY)], (0.0, given.time[-1]),
+        [30.0], t_eval=given.time, method="LSODA", rtol=1e-9, atol=1e-6,
+        max_step=sampling.LEG / 20,
+    )  # fmt: skip
+    compliance = 1.0 / v["k_P"] + 1.0 / v["k_B"]
+    reduced = compliance * (v["k_L"] * given.voltage + found.y[0])
+    whole = psa.simulate(model, given.time, given.voltage, memory={"f_H": 30.0}, rtol=1e-9)
+    miss = reduced - whole.displacement
+    assert np.max(np.abs(miss - np.mean(miss))) < 1e-4 * np.ptp(whole.displacement)
+    assert np.ptp(found.y[0]) > 50.0  # it is the hysteresis that is compared
+
+
+def test_the_table_states_effective_samples_per_processor_time() -> None:
+    draws = np.random.default_rng(0).standard_normal((20000, 2))
+    fast, slow = (sampling.Drawn(n, draws, 8000.0, s) for n, s in (("a", 2.0), ("b", 500.0)))
+    told = sampling.speed([fast, slow])
+    assert "250 times" in told.note
+    for row, seconds in zip(told.table.rows, (2.0, 500.0), strict=True):
+        assert float(row[4]) == pytest.approx(20000, rel=0.1)
+        assert float(row[6]) == pytest.approx(float(row[4]) / seconds, rel=0.01)
+
+
+# ---- verification: what it judges was not fitted, its figures are what they say
+
+
+@pytest.fixture(scope="module")
+def shown() -> list[paper.Comparison]:
+    return paper.synthetic("P-885.51", silent)
+
+
+@pytest.fixture(scope="module")
+def ringing() -> list[paper.Match]:
+    return paper.matches(psa.stack_model("PTBS200").values, silent, ("reciprocal",), starts=2)
+
+
+def test_what_is_kept_was_not_fitted() -> None:
+    for k in (0, 1):  # neither amplitude nor frequency
+        assert not {loop[k] for loop in paper.FITTED_LOOPS} & {loop[k] for loop in paper.KEPT_LOOPS}
+
+
+@slow
+@pytest.mark.xdist_group("verification")
+def test_a_stack_is_predicted_to_its_noise(shown: list[paper.Comparison]) -> None:
+    """Where the plant is the model, what is left on records never fitted is little but noise."""
+    assert [c.kind for c in shown] == [paper.LOOPS, paper.LOOPS, paper.STEPS, paper.OTHER]
+    for c in shown:
+        noise = paper.NOISE * c.record.range_m
+        assert 0.9 * noise < c.rms < 1.3 * noise, c.record.name
+        assert c.largest < (1.42e-2 if c.kind == paper.STEPS else 2.65e-2) * c.range_m
+        assert c.record.voltage[0] == 0.0
+        assert c.record.voltage.min() >= 0.0
+        assert c.record.voltage.max() <= psa.stack_model("P-885.51").values["u_rated"]
+
+
+@slow
+@pytest.mark.xdist_group("verification")
+def test_only_a_wrong_number_of_masses_shows_in_a_step(ringing: list[paper.Match]) -> None:
+    """Reciprocal data: a single mass misses, the one-way cascade fits almost as well."""
+    largest = {m.model: np.abs(m.step).max() for m in ringing}
+    assert largest["reciprocal"] < 2e-3
+    assert largest["cascade"] < 2e-3
+    assert largest["single_mass"] > 1e-2
+    loads = {m.model: np.sqrt(np.mean(m.load**2)) for m in ringing}
+    assert loads["reciprocal"] < 1e-3
+    assert loads["single_mass"] > 3.0 * loads["reciprocal"]
+    assert all(m.load[-1] == 0.0 for m in ringing)
+    assert next(m.mass for m in ringing if m.model == "single_mass") < 0.8
+
+
+def test_the_three_plants_are_three() -> None:
+    """One stiffness to a voltage or to a load for each: series, or the wafers' or the layers'."""
+    p = paper.with_single_mass(psa.stack_model("WYDS0808020").values)
+    time = time_grid(4.8e-3, 4e-6)
+    volt, push = (steps(time, [0.0] + 1199 * [top]) for top in (50.0, 100.0))
+    force, none = p["k_L"] * 50.0, np.zeros_like(time)
+    soft = {"cascade": p["k"], "reciprocal": p["k_P"], "single_mass": p["k"]}
+    hard = {"cascade": p["k_B"], "reciprocal": p["k"], "single_mass": p["k"]}
+    for name, stiffness in soft.items():
+        x = paper.plant_response(name, p, time, volt, none)[-1]
+        assert x == pytest.approx(force / stiffness, rel=1e-4), name
+        y = paper.plant_response(name, p, time, none, push)[-1]
+        assert y == pytest.approx(100.0 / hard[name], rel=1e-4), name
+
+
+@slow
+@pytest.mark.xdist_group("verification")
+def test_the_micromanipulator_is_judged_on_what_was_kept(
+    measured_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PSA_CASADI_DATA", str(measured_data))
+    sine, minor = paper.instrument(silent)
+    kept = np.isfinite(np.asarray(sine.record.displacement))
+    assert 0.15 < kept.mean() < 0.35
+    assert np.isnan(np.asarray(minor.record.displacement)[: minor.record.n // 10]).all()
+    assert 100.0 * sine.rms / sine.range_m < 0.5
+    assert 100.0 * minor.largest / minor.range_m < 6.0
+    assert "measured (Y. N. Aye)" in paper.verification_tables([sine, minor])[0].note
+
+
+def test_without_the_measured_records_their_rows_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PSA_CASADI_DATA", str(tmp_path))
+    assert paper.instrument(silent) == []
