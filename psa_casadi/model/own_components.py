@@ -5,11 +5,12 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeVar
 
-from psa_casadi.component import Balance, Component, FmuUsed, KeptEquations
+from psa_casadi.component import Balance, Component, FmuUsed, KeptEquations, OnDemand
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.equation_text import EquationTexts, equations_of, texts_of
 from psa_casadi.model.ode_model import check_variable
 from psa_casadi.model.ports import Opened, Port, ported
+from psa_casadi.model.structure import check_declarations
 from psa_casadi.variables import Input, Output, Parameter, State, Values, nominal_value
 
 T = TypeVar("T")
@@ -195,6 +196,7 @@ def _component(name: str, declared: OwnComponent, opener: Opener) -> Component:
     else:
         equations = equations_of(declared.equations, f"{place}.equations")
         found = Component(name=name, equations=equations, **same, **variables)
+        check_declarations(found, equations(OnDemand()))
     opened = ported(found, frozenset(declared.ports))
     kept = opened.equations.ports if isinstance(opened.equations, Opened) else ()
     for port in set(declared.ports) - set(kept):

@@ -191,6 +191,12 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "a gain": (lambda m: own(m).update(gain="z"), "'z' is a gain or linear, and no parameter"),
     "a place": (lambda m: own(m).update(belongs_to="nowhere"), "give one of 'plant', 'drive'"),
+    "no equation at a port": (
+        lambda m: own(m)["equations"].update(out={})
+        or own(m).update(ports=[{"kind": "output", "variable": "w", "unit": "rad/s"}]),
+        "lacks the equation of the output 'w'",
+    ),
+    "no word": (lambda m: own(m).update(belongs_to={}), "give one of 'plant', 'drive'"),
     "a size": (lambda m: own(m)["states"][0].update(nominal=None), "give a number"),
     "bounds": (lambda m: own(m)["parameters"][0].update(bounds=[5, 1]), "outside its bounds"),
     "too much": (
