@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, fields
 from functools import partial, reduce
 from itertools import count, filterfalse
 from typing import ClassVar
+from warnings import catch_warnings, simplefilter
 
 import casadi as ca
 
@@ -190,7 +191,9 @@ class _Reader:
                 " 'where'."
             )
         try:
-            tree = ast.parse(text.strip(), mode="eval").body
+            with catch_warnings():  # of a number that ends in a word, as in 1and x
+                simplefilter("error")
+                tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(
                 f"is {shown(text)}, which is no expression ({type(error).__name__}); write it as in"

@@ -135,6 +135,7 @@ HOSTILE = {
     "a null": "x\0y",
     "a surrogate": "\ud800",
     "infinity": "1e999",
+    "a number that ends in a word": "1and x",
     "many digits": "9" * 5_000,
     "a whole number beyond doubles": "9" * 400,
     "open brackets": "(" * 4_000,
