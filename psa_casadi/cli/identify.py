@@ -54,9 +54,9 @@ def identify(
     from psa_casadi.report.words.text import identification_text
 
     if identified_own(
-        model, records, fitting, reading, given, report=report,
+        model, records, fitting, reading, given, output=output, report=report,
         others={
-            "--output": output, "--stack": stack, "--stiffness": stiffness,
+            "--stack": stack, "--stiffness": stiffness,
             "--hysteresis": hysteresis, "--method": method != "prediction-error",
             "--profile": profile, "--json": json,
         },
