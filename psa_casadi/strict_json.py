@@ -118,7 +118,7 @@ def _parts(kind: Any, content: Any, place: str) -> Iterable[tuple[str, Any, Any]
             kinds = get_type_hints(kind)
             needed = [f for f in fields(kind) if f.name in content or _has_no_default(f)]
             return [(before + f.name, kinds[f.name], content.get(f.name, _LACKING)) for f in needed]
-        if origin is not None and issubclass(origin, Mapping):
+        if isinstance(origin, type) and issubclass(origin, Mapping):
             return [(before + name[:80], inner[1], value) for name, value in content.items()]
     if isinstance(content, list) and origin is tuple:
         kinds_in = [inner[0]] * len(content) if inner[-1] is ... else inner

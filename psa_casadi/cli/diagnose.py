@@ -74,9 +74,10 @@ def diagnose(
 
     if diagnosed_own(
         model, records, holdout or (), fitting, reading, given, leave_out=leave_out or (),
-        expect=expect, files={"--json": json, "--report": report, "--junit": junit},
+        expect=expect,
+        files={"--output": output, "--json": json, "--report": report, "--junit": junit},
         others={
-            "--output": output, "--patch": patch, "--figure": figure, "--next": next_,
+            "--patch": patch, "--figure": figure, "--next": next_,
             "--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis,
             "--events": events, "--max-error": max_error, "--timings": timings,
         },

@@ -54,9 +54,10 @@ def identify(
     from psa_casadi.report.words.text import identification_text
 
     if identified_own(
-        model, records, fitting, reading, given, files={"--json": json, "--report": report},
+        model, records, fitting, reading, given,
+        files={"--output": output, "--json": json, "--report": report},
         others={
-            "--output": output, "--stack": stack, "--stiffness": stiffness,
+            "--stack": stack, "--stiffness": stiffness,
             "--hysteresis": hysteresis, "--method": method != "prediction-error",
             "--profile": profile,
         },

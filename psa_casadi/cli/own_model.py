@@ -106,7 +106,7 @@ def identified_own(
     files: Mapping[str, Path | None],
     others: Mapping[str, object],
 ) -> bool:
-    """Fit a model of one's own, show its parameters: `files` are --json and --report.
+    """Fit a model of one's own, show its parameters: `files` are --output, --json, --report.
 
     False where the path names none. `others` are options that must be empty.
     """
@@ -121,13 +121,15 @@ def identified_own(
     given.check()
     with working("identifying", given.quiet):
         found = psa.identify(model, measured, **fitting.words)
-    json, report = files.values()
+    output, json, report = files.values()
+    if output is not None:
+        psa.save_model(found.model, output)
     if json is not None:
         atomic_write(json, json_text(identification_file(found)))
     if report is not None:
         psa.write_fit_report(found, report)
     show(repr(found), given.quiet)
-    tell_written(json, report, quiet=given.quiet)
+    tell_written(output, json, report, quiet=given.quiet)
     return True
 
 
@@ -144,7 +146,7 @@ def diagnosed_own(
     files: Mapping[str, Path | None],
     others: Mapping[str, object],
 ) -> bool:
-    """Diagnose a model of one's own: `files` are --json, --report and --junit.
+    """Diagnose a model of one's own: `files` are --output, --json, --report and --junit.
 
     False where the path names none. `others` are options that must be empty.
     """
@@ -164,13 +166,15 @@ def diagnosed_own(
         d = psa.diagnose(
             model, measured, holdout=held, leave_out=leave_out, progress=progress, **fitting.words
         )
-    json, report, junit = files.values()
+    output, json, report, junit = files.values()
+    if output is not None:
+        psa.save_model(d.model, output)
     if json is not None:
         atomic_write(json, d.to_json())
     if report is not None:
         psa.write_report(d, report)
     show(psa.story(d, width=width()), given.quiet)
-    tell_written(json, report, quiet=given.quiet)
+    tell_written(output, json, report, quiet=given.quiet)
     case = verdict_case(d.verdict, own_verdict_sentence(d), wanted)
     judge("diagnose", ", ".join(p.name for p in records), [case], junit, began, tells=True)
     return True

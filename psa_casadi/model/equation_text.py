@@ -10,18 +10,18 @@ else is refused, and so are texts that are too long or nest too deep.
 
 import ast
 import math
-import operator
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial, reduce
 from itertools import count, filterfalse
 from typing import ClassVar
+from warnings import catch_warnings, simplefilter
 
 import casadi as ca
 
 from psa_casadi.component import Equations, Expression, KeptEquations, OnDemand
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import Problems
 from psa_casadi.model.graph import ExpressionGraph
 from psa_casadi.strict_json import shown
 
@@ -30,6 +30,8 @@ _ONE += " fabs sign floor ceil erf"
 _TWO = "atan2 fmin fmax fmod remainder copysign hypot"
 #: Functions of the text, which are CasADi's own, and the count of their arguments.
 FUNCTIONS = {**dict.fromkeys(_ONE.split(), 1), **dict.fromkeys(_TWO.split(), 2), "if_else": 3}
+#: Those that CasADi makes of other operations.
+_COMPOSED = ("log10", "if_else")
 
 _SIGNS: dict[str, type[ast.operator]] = {
     "add": ast.Add, "sub": ast.Sub, "mul": ast.Mult, "div": ast.Div, "pow": ast.Pow,
@@ -39,15 +41,19 @@ _RELATIONS: dict[str, type[ast.cmpop]] = {
 }  # fmt: skip
 _CONNECTED: dict[str, type[ast.boolop]] = {"and": ast.And, "or": ast.Or}
 _MADE: dict[type[ast.AST], Callable[..., Expression]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-    ast.Pow: operator.pow, ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt,
-    ast.GtE: operator.ge, ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.And: ca.logic_and,
-    ast.Or: ca.logic_or, ast.Not: ca.logic_not, ast.USub: operator.neg, ast.UAdd: operator.pos,
+    kind: partial(ca.SX.binary, getattr(ca, f"OP_{name.upper()}"))
+    for name, kind in (*_SIGNS.items(), *_RELATIONS.items(), *_CONNECTED.items())
+} | {
+    ast.Gt: lambda x, y: ca.SX.binary(ca.OP_LT, y, x),
+    ast.GtE: lambda x, y: ca.SX.binary(ca.OP_LE, y, x),
+    ast.Not: partial(ca.SX.unary, ca.OP_NOT),
+    ast.USub: partial(ca.SX.unary, ca.OP_NEG),
+    ast.UAdd: lambda x: x,
 }  # fmt: skip
 #: An expression of more operations than this is written in parts.
 _LONG = 60
-#: What a file may hold: characters of one expression and of all, expressions, depth of a tree.
-_CHARACTERS, _ALL_CHARACTERS, _EXPRESSIONS, _DEPTH = 8_000, 1_000_000, 20_000, 100
+#: What is read of one expression: characters, and depth of its tree.
+_CHARACTERS, _DEPTH = 8_000, 100
 #: Names that no symbol can have: those of the table of symbols itself.
 _TAKEN = frozenset(dir(OnDemand()))
 
@@ -66,6 +72,11 @@ class EquationTexts:
     switches: Mapping[str, str] = field(default_factory=dict)
     next: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def every(self) -> dict[tuple[str, str], str]:
+        """All expressions by their part and name, in the order in which they are read."""
+        return {(p, n): text for p in ("where", *_PARTS) for n, text in getattr(self, p).items()}
+
 
 _PARTS = tuple(f.name for f in fields(Equations))
 
@@ -78,7 +89,7 @@ class _Graph(ExpressionGraph):
         **{
             getattr(ca, f"OP_{name.upper()}"): name
             for name in (*FUNCTIONS, *_SIGNS, *_RELATIONS, *_CONNECTED, "not", "neg")
-            if name not in ("log10", "if_else")  # which are made of others
+            if name not in _COMPOSED
         },
         ca.OP_CONSTPOW: "pow",
         ca.OP_IF_ELSE_ZERO: "if",
@@ -142,15 +153,9 @@ def equations_of(texts: EquationTexts, place: str) -> KeptEquations:
 
     Raises InputError with a sentence for each mistake, which begins with its place in the file.
     """
-    written = {(p, n): t for p in ("where", *_PARTS) for n, t in getattr(texts, p).items()}
-    if len(written) > _EXPRESSIONS or sum(map(len, written.values())) > _ALL_CHARACTERS:
-        raise InputError(
-            f"'{place}' has more than {_EXPRESSIONS} expressions, or more than {_ALL_CHARACTERS}"
-            " characters in them; simplify the equations."
-        )
     problems, reader = Problems(), _Reader()
     found: dict[tuple[str, str], Expression] = {}
-    for (part, name), text in written.items():
+    for (part, name), text in texts.every.items():
         try:
             value = reader.expression(text)
             if part == "where":
@@ -186,7 +191,9 @@ class _Reader:
                 " 'where'."
             )
         try:
-            tree = ast.parse(text.strip(), mode="eval").body
+            with catch_warnings():  # of a number that ends in a word, as in 1and x
+                simplefilter("error")
+                tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(
                 f"is {shown(text)}, which is no expression ({type(error).__name__}); write it as in"
@@ -226,7 +233,9 @@ class _Reader:
             return self._defined[name]
         if name in _TAKEN or name in FUNCTIONS:
             raise ValueError(f"has '{name}' where a number is wanted; no symbol has that name.")
-        return self.symbols.setdefault(name, ca.SX.sym(name))
+        if name not in self.symbols:
+            self.symbols[name] = ca.SX.sym(name)
+        return self.symbols[name]
 
 
 def _folded(connect: Callable[..., Expression], *given: Expression) -> Expression:
@@ -238,8 +247,10 @@ def _function(name: str, count: int) -> Callable[..., Expression]:
     if FUNCTIONS.get(name) != count:
         known = ", ".join(f"{n} ({k})" for n, k in FUNCTIONS.items())
         raise ValueError(f"calls {name[:80]} of {count}; the functions (of how many) are {known}.")
-    found: Callable[..., Expression] = getattr(ca, name)
-    return found
+    if name in _COMPOSED:
+        found: Callable[..., Expression] = getattr(ca, name)
+        return found
+    return partial((ca.SX.unary, ca.SX.binary)[count - 1], getattr(ca, f"OP_{name.upper()}"))
 
 
 def _number(value: float) -> Expression:

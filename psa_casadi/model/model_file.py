@@ -21,7 +21,7 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Evidence, contradictions
-from psa_casadi.model.own_components import OwnComponent, components_of, written
+from psa_casadi.model.own_components import OwnComponent, components_of, refuse_large, written
 from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.strict_json import (
     decode,
@@ -123,7 +123,7 @@ def dumps(model: Model) -> str:
             for c in model.effects
         ],
         "parameters": parameters,
-        **({"own": own} if own else {}),
+        **({"own": plain(own)} if own else {}),
         **({"starts": starts} if starts else {}),
         **({"interrupted": True} if origin.interrupted else {}),
         "force_scale": origin.force_scale,
@@ -141,21 +141,22 @@ def dumps(model: Model) -> str:
         ) from error
 
 
-def _written(model: Model) -> dict[str, Any]:
+def _written(model: Model) -> dict[str, OwnComponent]:
     """Return what the file has of components that are in no table and of no module, by name."""
     known = (*COMPONENTS.values(), *EFFECTS.values(), *_BESIDE.values())
-    problems, found = Problems(), {}
     about = f"The model {shown(model.name)} cannot be saved as MODEL.json:"
+    problems, found = Problems(), dict[str, OwnComponent]()
     for name, count in Counter(c.name for c in model.components).items():
         if count > 1:
             problems.add(f"{about} {count} components are named '{name}'; rename them.")
-    for component in model.components:
-        try:
+    try:
+        for component in model.components:
             if component not in known and not component.home:
-                found[component.name] = plain(written(component, model.values))
-        except InputError as error:
-            for problem in error.problems:
-                problems.add(f"{about} {problem}")
+                found[component.name] = written(component, model.values)
+        refuse_large(found.values())
+    except InputError as error:
+        for problem in error.problems:
+            problems.add(f"{about} {problem}")
     problems.raise_if_any()
     return found
 

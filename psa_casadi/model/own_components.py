@@ -1,21 +1,22 @@
 """Components of MODEL.json that no table has: their declarations, and their equations as text."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeVar
 
-from psa_casadi.component import Balance, Component, FmuUsed, KeptEquations
+from psa_casadi.component import Balance, Component, FmuUsed, KeptEquations, OnDemand
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.equation_text import EquationTexts, equations_of, texts_of
 from psa_casadi.model.ode_model import check_variable
 from psa_casadi.model.ports import Opened, Port, ported
+from psa_casadi.model.structure import check_declarations
 from psa_casadi.variables import Input, Output, Parameter, State, Values, nominal_value
 
 T = TypeVar("T")
 
-#: How many variables and sums components of a file may declare.
-_VARIABLES = 2_000
+#: What a file may hold in all: variables with sums and ports, expressions, their characters.
+_MOST = {"variables": 2_000, "expressions": 20_000, "characters of equations": 500_000}
 
 
 @dataclass(frozen=True)
@@ -140,14 +141,26 @@ def _declared(kind: type[T], variable: Any, values: Values) -> T:
     return kind(**found)
 
 
+def refuse_large(own: Iterable[OwnComponent]) -> None:
+    """Raise InputError where components have more together than is read from a file."""
+    every = list(own)
+    texts = [text for c in every for text in c.equations.every.values()]
+    variables = sum(len(getattr(c, k)) for c in every for k in (*_KINDS, "balances", "ports"))
+    counts = zip(_MOST.items(), (variables, len(texts), sum(map(len, texts))), strict=True)
+    for (what, most), count in counts:
+        if count > most:
+            raise InputError(
+                f"its own components have {count} {what}, of which a file holds {most} at most;"
+                " simplify the model."
+            )
+
+
 def components_of(own: Mapping[str, OwnComponent], opener: Opener) -> dict[str, Component]:
     """Return the components that a file declares, by name.
 
     Raises InputError with a sentence for each mistake, which begins with its place in the file.
     """
-    count = sum(len(getattr(c, k)) for c in own.values() for k in (*_KINDS, "balances", "ports"))
-    if count > _VARIABLES:
-        raise InputError(f"'own' declares {count} variables; at most {_VARIABLES} are read.")
+    refuse_large(own.values())
     problems, found = Problems(), {}
     for name, declared in own.items():
         try:
@@ -183,6 +196,7 @@ def _component(name: str, declared: OwnComponent, opener: Opener) -> Component:
     else:
         equations = equations_of(declared.equations, f"{place}.equations")
         found = Component(name=name, equations=equations, **same, **variables)
+        check_declarations(found, equations(OnDemand()))
     opened = ported(found, frozenset(declared.ports))
     kept = opened.equations.ports if isinstance(opened.equations, Opened) else ()
     for port in set(declared.ports) - set(kept):

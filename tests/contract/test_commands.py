@@ -337,7 +337,9 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     assert "identified 'oven'" in said
     assert "'warmth' is missed by" in said
     assert "oven" in fit.read_text("utf-8")
-    words = ("--report", page, "--json", told, "--leave-out", "delay", "--leave-out", "satur")
+    kept = tmp_path / "extended.json"
+    left_out = ("--leave-out", "delay", "--leave-out", "satur")
+    words = ("--report", page, "--json", told, *left_out, "-o", kept)
     said = done("diagnose", record, *asked, *words, "--expect", "cause_named").out
     assert "cause named" in said
     found = json.loads(told.read_text("utf-8"))
@@ -353,6 +355,7 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     assert "1 devices: 1 done." in said
     one = json.loads((tmp_path / "out" / "one" / "identification.json").read_text("utf-8"))
     assert one["parameters"] == json.loads(values.read_text("utf-8"))["parameters"]
+    assert dict(psa.load_model(kept).values) == found["values"]
     assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
     ended = command("diagnose", record, *asked, *words, "--expect", "adequate")
     assert ended.code == 1
@@ -362,8 +365,8 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
 def test_what_a_model_of_ones_own_does_not_have_is_told(tmp_path: Path) -> None:
     model, record = _oven(tmp_path)
     own = ("--model", f"{model}:make")
-    said = refused("identify", record, *own, "-o", tmp_path / "m.json", "--columns", "warmth=w")
-    assert "--output is not there for a model of your own" in said
+    said = refused("identify", record, *own, "--profile", "T", "--columns", "warmth=w")
+    assert "--profile is not there for a model of your own" in said
     assert "'w', which --columns names for 'warmth', is not in the header" in said
     assert "oven.py has no function 'mak'" in refused("diagnose", record, "--model", f"{model}:mak")
     assert "there is no file" in refused("diagnose", record, "--model", "none.py:make")

@@ -135,6 +135,7 @@ HOSTILE = {
     "a null": "x\0y",
     "a surrogate": "\ud800",
     "infinity": "1e999",
+    "a number that ends in a word": "1and x",
     "many digits": "9" * 5_000,
     "a whole number beyond doubles": "9" * 400,
     "open brackets": "(" * 4_000,
@@ -163,10 +164,6 @@ def test_parts_cannot_grow_beyond_what_is_written() -> None:
     doubled = {"b0": "x"} | {f"b{k}": f"b{k - 1} * b{k - 1}" for k in range(1, 2_000)}
     assert read("b1999", **doubled).function.n_instructions() < 2_010
     assert value(read("b3", **doubled), 2.0, 0.0) == 2.0**8
-    with pytest.raises(psa.InputError, match="more than 20000 expressions"):
-        read("x", **{f"c{k}": "x" for k in range(20_001)})
-    with pytest.raises(psa.InputError, match="characters in them"):
-        read("x", **{f"c{k}": "x" + " + x" * 100 for k in range(2_500)})
 
 
 @pytest.mark.parametrize("where", [{"b": "c", "c": "x"}, {"x": "y", "b": "x", "y": "1"}])

@@ -147,6 +147,12 @@ def test_two_components_of_one_name_are_not_saved() -> None:
         dumps(compose([one, replace(one)]))
 
 
+def test_what_could_not_be_read_again_is_not_saved() -> None:
+    x = ca.SX.sym("x", 1_001)
+    with pytest.raises(psa.InputError, match=r"cannot be saved as MODEL\.json: its own components"):
+        dumps(psa.ode_model({"x": x, "ode": -x, "y": x}, name="many"))
+
+
 def own(content: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = content["own"]["motor"]
     return found
@@ -185,10 +191,24 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "a gain": (lambda m: own(m).update(gain="z"), "'z' is a gain or linear, and no parameter"),
     "a place": (lambda m: own(m).update(belongs_to="nowhere"), "give one of 'plant', 'drive'"),
+    "no equation at a port": (
+        lambda m: own(m)["equations"].update(out={})
+        or own(m).update(ports=[{"kind": "output", "variable": "w", "unit": "rad/s"}]),
+        "lacks the equation of the output 'w'",
+    ),
+    "no word": (lambda m: own(m).update(belongs_to={}), "give one of 'plant', 'drive'"),
     "a size": (lambda m: own(m)["states"][0].update(nominal=None), "give a number"),
     "bounds": (lambda m: own(m)["parameters"][0].update(bounds=[5, 1]), "outside its bounds"),
     "too much": (
-        lambda m: own(m).update(states=own(m)["states"] * 2_000), "at most 2000 are read",
+        lambda m: own(m).update(states=own(m)["states"] * 2_000), "have 4007 variables, of which",
+    ),
+    "too many expressions": (
+        lambda m: own(m)["equations"].update(where={f"c{k}": "x" for k in range(20_000)}),
+        "have 20004 expressions",
+    ),
+    "too long": (
+        lambda m: own(m)["equations"].update(where={f"c{k}": "x + " * 999 for k in range(200)}),
+        "characters of equations, of which a file holds 500000",
     ),
     "not named": (lambda m: m.update(own={}), "unknown name 'motor'"),
     "a sample period": (lambda m: own(m).update(sample_period="z"), "sample period"),

@@ -16,8 +16,10 @@ from psa_casadi.diagnosis.result import Alternative
 from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import dumps
+from psa_casadi.model.ports import with_ports
 from psa_casadi.report.documents.files import FILES, check_file, identification_file, schema_texts
 from psa_casadi.strict_json import json_text
+from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, tanks
 from tests.model.evidence_models import evident_model
 from tests.report.report_cases import diagnosis, identification, with_periodic
 
@@ -49,6 +51,13 @@ def test_model_files_are_as_their_schema_says(name: str) -> None:
     valid("model", dumps(model))
     published = replace(model, publication=psa.Publication(author="A", version="1"))
     valid("model", dumps(published.with_starts({"z_c1": 1e-7})))
+
+
+@pytest.mark.parametrize("make", [oscillator, motor, tanks, pair, cylinder, oven])
+def test_files_of_own_models_are_as_their_schema_says(make: Any) -> None:
+    content = valid("model", dumps(with_ports(make())))
+    (own,) = content["own"].values()
+    assert own["ports"]
 
 
 def test_the_evidence_of_a_model_is_as_its_schema_says() -> None:
