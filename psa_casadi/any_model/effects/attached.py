@@ -106,7 +106,8 @@ def of_ones_own(model: Model, component: Component) -> Attached:
             f" add to one of {', '.join(ports)}, and name a parameter as its gain."
         )
     reads = tuple(p for name, p in ports.items() if name in symbols.made and p not in added)
-    return Attached(component, added[0], (*added[1:], *reads))
+    told = replace(component, description=f"{added[0].words}: {component.description}")
+    return Attached(told, added[0], (*added[1:], *reads))
 
 
 def extended(base: Model, effects: Iterable[Attached]) -> Model:
