@@ -168,9 +168,17 @@ def _judged(
 
     `whole` is the evidence over the plain base of the model with the cause.
 
-    Effects that bend the same curve share what the best of them has.
+    Effects that bend the same curve are refused together, and share what the best of them has.
     """
-    shared = levelled(evidence, task.alike(step.fit), set(fitted) - refused)
+    alike, good, pack = task.alike(step.fit), set(fitted) - refused, task.pack
+    for group in alike:
+        if good & set(group):
+            every = [(n, h, c) for n, h in fitted.items() for c in h.causes if n == c.name]
+            like = {n for n, h, c in every if pack.in_character(h.fit, c, task.experiments)}
+            refused = refused - (set(group) & like)
+        elif refused & set(group):
+            refused = refused | set(group)
+    shared = levelled(evidence, alike, good)
     chances = probabilities(
         {n: v for n, v in shared.items() if n not in refused}, whole, task.limits
     )
