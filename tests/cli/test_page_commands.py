@@ -105,7 +105,12 @@ def test_every_command_within_a_line_has_the_words_that_it_takes() -> None:
 def test_a_block_that_a_test_runs_is_left_to_it() -> None:
     assert run_text(TEXT.replace("run: skip, it ends", "run: in-tests")) == []
     assert [b.page for p in pages() for b in blocks_of(p) if "in-tests" in b.marks] == IN_TESTS
-    files = ("any_model/test_any_model", "any_model/test_motor", "cli/test_cli", "diagnosis/test_measured_rows")
+    files = (
+        "any_model/test_any_model",
+        "any_model/test_motor",
+        "cli/test_cli",
+        "diagnosis/test_measured_rows",
+    )
     used = "".join((ROOT / "tests" / f"{n}.py").read_text("utf-8") for n in files)
     assert all(f'block_in_tests("{page}")' in used for page in IN_TESTS)
 
