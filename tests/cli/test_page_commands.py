@@ -43,7 +43,13 @@ $ grep one file
 
 
 #: The pages whose one block a test runs.
-IN_TESTS = ["README.md", "docs/fmu.md", "docs/howto/own_model.md", "docs/python.md"]
+IN_TESTS = [
+    "README.md",
+    "docs/fmu.md",
+    "docs/howto/motor.md",
+    "docs/howto/own_model.md",
+    "docs/python.md",
+]
 
 
 def run_text(text: str) -> list[str]:
@@ -106,7 +112,12 @@ def test_a_block_that_a_test_runs_is_left_to_it() -> None:
     assert run_text(TEXT.replace("run: skip, it ends", "run: in-tests")) == []
     marked = [b.page for p in pages() for b in blocks_of(p) if "in-tests" in b.marks]
     assert list(dict.fromkeys(marked)) == IN_TESTS
-    files = ("any_model/test_any_model", "cli/test_cli", "diagnosis/test_measured_rows")
+    files = (
+        "any_model/test_any_model",
+        "any_model/test_motor",
+        "cli/test_cli",
+        "diagnosis/test_measured_rows",
+    )
     used = "".join((ROOT / "tests" / f"{n}.py").read_text("utf-8") for n in files)
     assert all(f'_in_tests("{page}")' in used for page in IN_TESTS)
 
