@@ -36,8 +36,20 @@ class Given:
 
     def __post_init__(self) -> None:
         """Read the effects."""
-        read = [self.attempt(partial(psa.own_effects, module)) for module in self.effects or ()]
+        self.own: list[psa.Component] = []
+        self._misfits: list[str] = []
+        if not self.effects:
+            return
+        from psa_casadi.model.own_effects import declared_effects, misfits
+
+        read = [self.attempt(partial(declared_effects, module)) for module in self.effects]
         self.own = [c for found in read for c in (found or {}).values()]
+        self._misfits = misfits(self.own)
+
+    def of_any_model(self) -> list[psa.Component]:
+        """Return the own effects for a model of one's own: beside a stack they need not fit."""
+        self._misfits = []
+        return self.own
 
     def add(self, sentence: str) -> None:
         """Note one problem."""
@@ -53,8 +65,8 @@ class Given:
 
     def check(self) -> None:
         """Raise an `InputError` with all problems, if there are any."""
-        if self._problems:
-            raise InputError(self._problems)
+        if self._problems or self._misfits:
+            raise InputError([*self._problems, *self._misfits])
 
     def records(
         self, paths: Sequence[Path], reading: Reading, held_out: Sequence[Path] = ()

@@ -156,7 +156,7 @@ def diagnosed_own(
     from psa_casadi.cli.diagnosis_files import expected, verdict_case
     from psa_casadi.report.words.own_words import own_verdict_sentence
 
-    began = clock.perf_counter()
+    began, own = clock.perf_counter(), given.of_any_model()
     _refuse(given, others)
     given.outputs(files, [*records, *held_out])
     measured, held = (_read(given, model, part, reading) for part in (records, held_out))
@@ -164,8 +164,9 @@ def diagnosed_own(
     given.check()
     with working("diagnosing", given.quiet) as progress:
         d = psa.diagnose(
-            model, measured, holdout=held, leave_out=leave_out, progress=progress, **fitting.words
-        )
+            model, measured, holdout=held, leave_out=leave_out, effects=own, progress=progress,
+            **fitting.words,
+        )  # fmt: skip
     output, json, report, junit = files.values()
     if output is not None:
         psa.save_model(d.model, output)

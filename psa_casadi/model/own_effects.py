@@ -42,7 +42,30 @@ def own_effects(module: str) -> Mapping[str, Component]:
     InputError where the module cannot be imported, holds none, or holds one that does not fit
     beside the base model.
     """
+    return _beside_base(declared_effects(module))
+
+
+@cache
+def declared_effects(module: str) -> Mapping[str, Component]:
+    """Return the effects that a named module holds, whether they fit beside the base or not."""
     return _effects_of(_imported(module, here=True))
+
+
+def _beside_base(found: Mapping[str, Component]) -> Mapping[str, Component]:
+    if unfit := misfits(found.values()):
+        raise InputError(unfit)
+    return found
+
+
+def misfits(effects: Iterable[Component]) -> list[str]:
+    """Return why effects do not fit beside a stack's base model, a sentence for each fault."""
+    problems: list[str] = []
+    for component in effects:
+        try:
+            compose((*BASE, component))
+        except InputError as error:
+            problems += [f"{component.home}: {sentence}" for sentence in error.problems]
+    return problems
 
 
 @cache
@@ -62,12 +85,6 @@ def _effects_of(source: ModuleType) -> Mapping[str, Component]:
     for component in found:
         if component.name in {**COMPONENTS, **EFFECTS, **series}:
             problems.add(f"{module}: an effect of this package is named '{component.name}' too.")
-            continue
-        try:
-            compose((*BASE, component))
-        except InputError as error:
-            for sentence in error.problems:
-                problems.add(f"{module}: {sentence}")
     problems.raise_if_any()
     return {c.name: replace(c, home=module) for c in found}
 
@@ -77,7 +94,7 @@ def installed_effects() -> Mapping[str, Component]:
     """Return the effects of installed packages that have the entry point; raises InputError."""
     with _installed_only():
         modules = sorted({e.value.partition(":")[0] for e in entry_points(group=GROUP)})
-    found = (_effects_of(_imported(module)) for module in modules)
+    found = (_beside_base(_effects_of(_imported(module))) for module in modules)
     return {name: c for effects in found for name, c in effects.items()}
 
 

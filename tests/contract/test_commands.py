@@ -310,6 +310,18 @@ def make():
 """
 
 
+_SCALE = """
+import psa_casadi as psa
+
+BENT_SCALE = psa.Component(
+    "bent_scale", "the scale of the thermometer is bent", "a parabola",
+    lambda s: psa.Equations(add={"shown_warmth": s.bend * s.true_warmth**2}),
+    parameters=(psa.Parameter("bend", 0.0, "1/K", (-0.1, 0.1), "curvature", scale=1e-3),),
+    gain="bend", belongs_to="sensor",
+)
+"""
+
+
 def _oven(folder: Path) -> tuple[Path, Path]:
     """Write a model of one's own, and a record whose sensor is bent, in other units."""
     model, record = folder / "oven.py", folder / "oven.csv"
@@ -360,6 +372,22 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     ended = command("diagnose", record, *asked, *words, "--expect", "adequate")
     assert ended.code == 1
     assert "The verdict is cause_named; expected adequate." in ended.words
+
+
+def test_effects_of_ones_own_are_searched_in_a_model_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An effect at a port of the model, which fits beside no stack."""
+    monkeypatch.chdir(tmp_path)
+    model, record = _oven(tmp_path)
+    Path("scale.py").write_text(_SCALE, encoding="utf-8")
+    asked = ("--model", f"{model}:make", "--hold", "zero", "--known-start", "--effects", "scale")
+    told = tmp_path / "told.json"
+    done("diagnose", record, *asked, "--leave-out", "bend", "--json", told)
+    found = json.loads(told.read_text("utf-8"))
+    assert [cause["effect"] for cause in found["causes"]] == ["bent_scale"]
+    said = refused("diagnose", record, "--effects", "scale")
+    assert "no symbol named 'true_warmth'" in said
 
 
 def test_what_a_model_of_ones_own_does_not_have_is_told(tmp_path: Path) -> None:
