@@ -252,7 +252,9 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         ' say so of these records: psa.Signals(..., hold="zero").'
     ),
     "no_column": "No record has a column '{output}'; that output is not compared.",
-    "no_unit": "{record} states no unit of {names: and }; the model's are taken.",
+    "no_unit": lambda record, names: (
+        f"{record} states no unit of {listing(names)}; the model's are taken."
+    ),
     # the fit
     "own_interrupted": "The search was interrupted; these are the best values so far.",
     "cut_off": "The fit was cut off before it converged; its values are not final.",
@@ -285,7 +287,8 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         " noise."
     ),
     "own_withdrawn": lambda names, share, output, why: (
-        f"{' and '.join(names)} would remove {share:.0%} of the held-out error above the noise"
+        f"{' and '.join(names)} would remove {f'{share:.0%}' if share > 0 else 'nothing'} of the"
+        " held-out error above the noise"
         f"{f' of {output}' if output else ''}; not named, because {why}."
     ),
     "free_beats": "a free function of {of} in {port} explains more ({share:.0%})",
