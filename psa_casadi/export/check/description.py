@@ -10,6 +10,7 @@ import casadi as ca
 import fmpy
 from fmpy.model_description import ValidationError
 
+from psa_casadi.component import KeptEquations
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.common import publication
@@ -197,8 +198,9 @@ def _differences(entry: Any, truth: dict[str, str], *, kinds: bool) -> Iterator[
 def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     """Exported again, the model gives the same description, token and sources, byte for byte.
 
-    Another version of CasADi writes other C for the same equations: what it wrote stands then as it
-    is, and its token says whether it was changed since.
+    Another version of CasADi writes other C for the same equations, and so does this one where they
+    were read from text: what was written stands then as it is, and its token says whether it was
+    changed since.
     """
     tool = str(archive.description.generationTool)
     if tool != generation_tool():
@@ -210,7 +212,7 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
         if p.is_file()
     }
     untouched = {}
-    if _other_casadi(archive):
+    if _other_casadi(archive) or _read_from_text(model):
         places = {name: f"sources/{name}" for name in sources.FROM_CASADI}
         untouched = {n: found[p].decode("utf-8") for n, p in places.items() if p in found}
     step = sources.fixed_step_of(archive.directory)
@@ -238,11 +240,18 @@ def reproducible(archive: Archive, model: Model) -> Iterable[str] | CheckRow:
     problems, other = list(unreproducible_parts(archive, model)), _other_casadi(archive)
     if problems:
         return problems
-    remark = (
-        f"its C is CasADi {other}'s, unchanged since; this is CasADi {ca.CasadiMeta.version()}:"
-        " 'equations' compares"
-    )
-    return CheckRow("reproducible", 0.0, 0.0, True, remark if other else "")
+    made = f"CasADi {other}'s, unchanged since; this is CasADi {ca.CasadiMeta.version()}"
+    if not other:
+        made = "unchanged since; equations that are read from text have another order"
+    remark = f"its C is {made}: 'equations' compares"
+    taken = bool(other) or _read_from_text(model)
+    return CheckRow("reproducible", 0.0, 0.0, True, remark if taken else "")
+
+
+def _read_from_text(model: Model) -> bool:
+    """Return whether equations of a model come from the text of a MODEL.json."""
+    plain = [getattr(c.equations, "component", c).equations for c in model.components]
+    return any(isinstance(e, KeptEquations) for e in plain)
 
 
 def _other_casadi(archive: Archive) -> str:

@@ -467,8 +467,9 @@ class Fit:
     def channels(self) -> tuple[Further, ...]:
         """The fits of all channels, the first one foremost."""
         told = tuple(k for k, n in enumerate(self.lengths) if n)
+        level = self.sigma[told[0] if told else 0]
         first = Further(
-            channel=self.channel, number=0, level=self.sigma[told[0]], spread=self.spread,
+            channel=self.channel, number=0, level=level, spread=self.spread,
             residuals=self.residuals, jacobian=self.jacobian,
             basis=np.zeros((len(self.residuals), 0)), factors=np.ones(1),
             lengths=tuple(self.lengths[k] for k in told), records=told,
