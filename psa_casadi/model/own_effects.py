@@ -45,7 +45,6 @@ def own_effects(module: str) -> Mapping[str, Component]:
     return _beside_base(declared_effects(module))
 
 
-@cache
 def declared_effects(module: str) -> Mapping[str, Component]:
     """Return the effects that a named module holds, whether they fit beside the base or not."""
     return _effects_of(_imported(module, here=True))
