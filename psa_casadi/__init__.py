@@ -46,12 +46,13 @@ if TYPE_CHECKING:
     from psa_casadi.export.fixed_step.export import CodeExport, export_c
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.importer.fmu_model import fmu_model
+    from psa_casadi.export.importer.model_with_fmu import load_model
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
     from psa_casadi.identification.identify import Identification
     from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
-    from psa_casadi.model.model_file import load_model, save_model
+    from psa_casadi.model.model_file import save_model
     from psa_casadi.model.nanopositioner import controller_for, margins_of, nanopositioner
     from psa_casadi.model.ode_model import ode_model
     from psa_casadi.model.own_effects import own_effects
@@ -112,7 +113,8 @@ _HOMES = {
     "model.system": "System connect",
     "model.nanopositioner": "controller_for margins_of nanopositioner",
     "model.ode_model": "ode_model",
-    "model.model_file": "load_model save_model",
+    "export.importer.model_with_fmu": "load_model",
+    "model.model_file": "save_model",
     "design.mechanism.mechanism": "design_mechanism mechanism_model port_model",
     "online": "HysteresisObserver FeedForward stack_values part_for OnlineIdentification"
     " AdaptiveFeedForward identifier_for",

@@ -7,9 +7,6 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from functools import partial
-from importlib import import_module
-from pathlib import Path, PurePath
 from typing import Any, Literal
 
 from psa_casadi.component import Component, FmuUsed
@@ -21,7 +18,13 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Evidence, contradictions
-from psa_casadi.model.own_components import OwnComponent, components_of, refuse_large, written
+from psa_casadi.model.own_components import (
+    Opener,
+    OwnComponent,
+    components_of,
+    refuse_large,
+    written,
+)
 from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.strict_json import (
     decode,
@@ -161,6 +164,14 @@ def _written(model: Model) -> dict[str, OwnComponent]:
     return found
 
 
+def no_fmu(used: FmuUsed, name: str, parameters: tuple[Parameter, ...]) -> Component:
+    """Refuse the FMU of a model: where this is the opener, none is run. Raises InputError."""
+    raise InputError(
+        f"the model has the FMU {shown(used.file)}, which is not opened from here; type"
+        " psa.load_model(MODEL, fmu=FMU)."
+    )
+
+
 def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = ()) -> Model:
     """Read a model; `effects` are own ones that it may have (`own_effects`).
 
@@ -170,11 +181,12 @@ def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = 
 
 
 def model_of(
-    content: Any, source: str, effects: Iterable[Component] = (), fmu: Path | None = None
+    content: Any, source: str, effects: Iterable[Component] = (), opener: Opener = no_fmu
 ) -> Model:
-    """Return the model that the content of a file holds; raises InputError as `load_model`.
+    """Return the model that the content of a file holds.
 
-    Without `fmu` no FMU is opened.
+    `opener` returns the component of an FMU that it has. Raises InputError that names every unknown
+    name, missing or bad value.
     """
     found = content.get("format") if isinstance(content, dict) else type(content).__name__
     if not isinstance(content, dict) or found != FORMAT:
@@ -184,7 +196,7 @@ def model_of(
         )
     declared = part(Mapping[str, OwnComponent], content.get("own", {})) or {}
     try:
-        own = components_of(declared, partial(_opened, fmu))
+        own = components_of(declared, opener)
     except InputError as error:
         _refuse(error.problems, source)
         raise
@@ -223,38 +235,9 @@ def save_model(model: Model, path: str | os.PathLike[str]) -> None:
     atomic_write(path, dumps(model))
 
 
-def load_model(
-    path: str | os.PathLike[str],
-    effects: Iterable[Component] = (),
-    *,
-    fmu: str | os.PathLike[str] | None = None,
-) -> Model:
-    """Read MODEL.json; `effects` are own ones of modules that it may have.
-
-    Equations in the file are read as text, none of it is run. The binary of an FMU that the model
-    has runs in this process: `fmu` is that FMU or the folder with it, by default the folder of
-    MODEL.json.
-
-    Raises InputError with every unknown name, missing or bad value, and for an FMU that is not
-    there or has another SHA-256 than when the model was saved.
-    """
-    place = Path(path).parent if fmu is None else Path(fmu)
-    return model_of(read_json(path, _ADVICE), str(path), effects, place)
-
-
-def _opened(
-    place: Path | None, used: FmuUsed, name: str, parameters: tuple[Parameter, ...]
-) -> Component:
-    """Return the component of an FMU that lies at a place, or in it."""
-    if place is None or PurePath(used.file).name != used.file:
-        raise InputError(
-            f"the model has the FMU {shown(used.file)}, which is not opened from here; type"
-            " psa.load_model(MODEL, fmu=FMU)."
-        )
-    importer = import_module("psa_casadi.export.importer.fmu_model")  # which knows models
-    file = place / used.file if place.is_dir() else place
-    found: Component = importer.component_again(file, used, name, parameters)
-    return found
+def read_content(path: str | os.PathLike[str]) -> Any:
+    """Return what a model file holds, unchecked. Raises InputError."""
+    return read_json(path, _ADVICE)
 
 
 def _refuse(sentences: Iterable[str], source: str) -> None:

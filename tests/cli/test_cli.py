@@ -28,9 +28,10 @@ from psa_casadi.diagnosis import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
 from psa_casadi.export.check.check import CheckReport, CheckRow
+from psa_casadi.export.importer.model_with_fmu import load_model
 from psa_casadi.identification import identify
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.model.model_file import load_model, save_model
+from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record
 from psa_casadi.records.split import whole
