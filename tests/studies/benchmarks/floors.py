@@ -20,16 +20,17 @@ from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
     """Diagnose the public records, or those of a folder; `quick` takes the shortest alone."""
-    sine, loops = datasets.micromanipulator()
-    cases = [("minor loops", [loops])]
     if folder is not None:
         paths = sorted(folder.glob("*.csv"))
         if not paths:
             raise psa.InputError(f"{folder}: holds no CSV file; name the folder with your records.")
         cases = [(r.name, [r]) for r in psa.read_records(paths)]
-    elif not quick:
-        axis = datasets.load("steering_mirror")[0]
-        cases += [("sine", [sine]), ("both", [sine, loops]), (axis.name, [axis])]
+    else:
+        sine, loops = datasets.micromanipulator()
+        cases = [("minor loops", [loops])]
+        if not quick:
+            axis = datasets.load("steering_mirror")[0]
+            cases += [("sine", [sine]), ("both", [sine, loops]), (axis.name, [axis])]
     rows, ratios = [], []
     for name, records in cases:
 
