@@ -99,8 +99,10 @@ def _read(
         path, source = Path(given.experiments[0].record.name), "identification"
         content = identification_file(given)
     elif isinstance(given, Diagnosis | OdeDiagnosis):
-        path, source = Path(given.experiments[0].record.name), "diagnosis"
-        content = given.to_dict()
+        path = Path(given.experiments[0].record.name)
+        return [
+            (path, _with_model(_told(given.to_dict(), "diagnosis"), _model(given.model, traces)))
+        ]
     else:
         path = Path(given) / DEVICE_FILE if Path(given).is_dir() else Path(given)
         source = str(path)
@@ -112,15 +114,24 @@ def _read(
             why = " ".join(told.problems)
             raise InputError(f"{path}: the work on this device was {told.status}: {why}")
         return [(path, device_finding(path.parent, told, effects, traces=traces))]
-    if kind == _DIAGNOSIS:
-        return [(path, _diagnosis(decode(DiagnosisFile, content, source)))]
-    if kind == OWN_DIAGNOSIS:
-        return [(path, _any_diagnosis(decode(OwnModelFile, content, source)))]
+    if kind in (_DIAGNOSIS, OWN_DIAGNOSIS):
+        return [(path, _told(content, source))]
     if kind == IDENTIFICATION:
         return [(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
         return [(path, _model(model_of(content, source, effects), traces))]
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
+
+
+def _told(content: dict[str, Any], source: str) -> Finding:
+    """Return what a diagnosis of a stack or of a model of one's own tells."""
+    if content["format"] == _DIAGNOSIS:
+        return _diagnosis(decode(DiagnosisFile, content, source))
+    own = decode(OwnModelFile, content, source)
+    errors = [
+        HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit) for e in own.errors
+    ]
+    return replace(_any_diagnosis(own), errors=tuple(errors))
 
 
 def _any_diagnosis(d: DiagnosisFile | OwnModelFile) -> Finding:
@@ -147,12 +158,14 @@ def _diagnosis(d: DiagnosisFile) -> Finding:
     return replace(
         _any_diagnosis(d),
         doubt=d.doubt,
-        errors=HeldOutErrors(
-            d.errors.base.holdout_rms_m,
-            d.errors.extended.holdout_rms_m,
-            d.errors.noise_floor_rms_m,
-            d.errors.base.holdout_nrmse_percent,
-            d.errors.extended.holdout_nrmse_percent,
+        errors=(
+            HeldOutErrors(
+                d.errors.base.holdout_rms_m,
+                d.errors.extended.holdout_rms_m,
+                d.errors.noise_floor_rms_m,
+                d.errors.base.holdout_nrmse_percent,
+                d.errors.extended.holdout_nrmse_percent,
+            ),
         ),
     )
 
@@ -200,10 +213,7 @@ def _model(model: Model, traces: bool) -> Finding:
 
 
 def _joined(found: Sequence[_Read]) -> list[_Read]:
-    """Join every model to the first finding of the same records that has none yet.
-
-    That gets all that the model holds: all parameters, and the record that it carries.
-    """
+    """Join every model to the first finding of the same records that has none yet."""
     rows = dict(enumerate(found))
     full: set[int] = set()
     for k, (_, own) in enumerate(found):
@@ -216,14 +226,19 @@ def _joined(found: Sequence[_Read]) -> list[_Read]:
         if same:
             full.add(same[0])
             path, finding = rows[same[0]]
-            parameters = {**own.parameters}
-            for name, p in finding.parameters.items():
-                meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
-                parameters[name] = replace(p, meaning=meaning)
-            whole = replace(finding, parameters=parameters, trace=own.trace)
-            rows[same[0]] = path, replace(whole, force_scale=own.force_scale)
+            rows[same[0]] = path, _with_model(finding, own)
             del rows[k]
     return list(rows.values())
+
+
+def _with_model(finding: Finding, model: Finding) -> Finding:
+    """Return a finding with all that its model holds: all parameters, and the record it carries."""
+    parameters = {**model.parameters}
+    for name, p in finding.parameters.items():
+        meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
+        parameters[name] = replace(p, meaning=meaning)
+    whole = replace(finding, parameters=parameters, trace=model.trace)
+    return replace(whole, force_scale=model.force_scale)
 
 
 def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
@@ -256,8 +271,10 @@ def finding_content(found: Finding) -> dict[str, Any]:
     causes = "; ".join(" or ".join((c.effect, *c.or_else)) for c in found.causes)
     row: dict[str, Any] = {"verdict": found.verdict, "cause": causes}
     row["confidence"] = found.causes[0].confidence if found.causes else None
-    for name in ("base", "extended", "noise"):
-        row[f"{name}_rms [m]"] = getattr(found.errors, name, None)
+    for e in found.errors or (None,):
+        output, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
+        for name in ("base", "extended", "noise"):
+            row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = found.rms_m, found.rms_percent
     for name, p in found.parameters.items():
         if p.told and p.interval is not None:
