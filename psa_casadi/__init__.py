@@ -27,7 +27,6 @@ from psa_casadi.version import __version__
 if TYPE_CHECKING:
     from psa_casadi import datasets, design, online, system
     from psa_casadi.any_model.diagnose import diagnose, identify
-    from psa_casadi.any_model.identify import OdeIdentification
     from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.component import Component, Equations, Symbols
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
     from psa_casadi.identification.identify import Identification
+    from psa_casadi.identification.multistart import OdeIdentification
     from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
     from psa_casadi.model.model_file import save_model
@@ -124,7 +124,7 @@ _HOMES = {
     "simulation.timings": "Timings timed",
     "simulation.simulate": "Trajectory memory_after settled_at simulate simulate_record",
     "any_model.diagnose": "identify diagnose",
-    "any_model.identify": "OdeIdentification",
+    "identification.multistart": "OdeIdentification",
     "any_model.result": "OdeDiagnosis",
     "posterior.sample": "Posterior sample",
     "diagnosis.verdict": "patched_model",

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import psa_casadi as psa
-from psa_casadi.any_model.identify import identify_ode
 from psa_casadi.component import OnDemand
 from psa_casadi.diagnosis.result import Verdict
+from psa_casadi.identification.multistart import identify_ode
 from psa_casadi.records import records_given
 from tests.any_model.own_models import oscillator
 from tests.report.report_cases import diagnosis, identification

@@ -199,7 +199,7 @@ def simulated_own(
         return False
     import numpy as np
 
-    from psa_casadi.any_model.runs import in_units
+    from psa_casadi.identification.experiments import in_units
     from psa_casadi.units import convert
 
     _refuse(given, others)

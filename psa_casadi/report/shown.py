@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.multistart import OdeIdentification
 from psa_casadi.model.compose import Model
 from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Population

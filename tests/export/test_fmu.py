@@ -13,7 +13,6 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.export.check.agreement import has_reference
 from psa_casadi.export.check.check import as_exported
 from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values
@@ -22,6 +21,7 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.reference import simulate
+from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import simulated

@@ -13,13 +13,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeBudget, OutputError, PortCause
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
 from psa_casadi.diagnosis.result import Candidate, Cause, Verdict, unnamed_causes
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.multistart import OdeIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import ModelFile
 from psa_casadi.posterior.sample import Posterior

@@ -8,13 +8,13 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import FORMAT as OWN_DIAGNOSIS
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.multistart import OdeIdentification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import FORMAT as MODEL
 from psa_casadi.model.model_file import model_of

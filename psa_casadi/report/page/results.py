@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.multistart import OdeIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Diagnosis
@@ -18,6 +17,7 @@ from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.multistart import OdeIdentification
 from psa_casadi.posterior.chains import column_of
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.posterior.task import Block

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.identification.determinacy import DETERMINED_WIDTH
 from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.multistart import OdeIdentification
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import Scale, listing, number, percent
 

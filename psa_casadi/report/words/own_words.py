@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.identification.experiments import varied
+from psa_casadi.identification.multistart import OdeIdentification
 from psa_casadi.model.compose import Model
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, verdict_words
 from psa_casadi.report.words.phrases import (
     added,

@@ -7,107 +7,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.runs import given_to, noise_share, runs_of, told_of_columns
-from psa_casadi.any_model.sizes import sized
-from psa_casadi.diagnosis.colour import Colour, noise_rms, uncertain
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.determinacy import Certainty, certainty
+from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.refitting import relevelled_all, weighted
+from psa_casadi.identification.refitting import (
+    refitted,
+    relevelled_all,
+    reweighted,
+    unlike,
+    with_noise,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
-from psa_casadi.records.noise import filtered, first_order_noise
+from psa_casadi.records.noise import first_order_noise
 from psa_casadi.records.signals import Hold
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.shown import Reported, frame
+from psa_casadi.simulation.sizes import sized
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.variables import Interval, Parameter, Provenance
+from psa_casadi.variables import Parameter, Provenance
 from psa_casadi.version import __version__
 
 FloatArray = npt.NDArray[np.float64]
-
-#: Noise is estimated from so many samples or more, and differs from so many standard errors on.
-_TELLING, _SURE = 32, 3.0
-
-
-def refitted(
-    before: Fit,
-    experiments: Sequence[Experiment],
-    *,
-    model: Model | None = None,
-    evaluations: int = 60,
-    tolerance: float = 1e-6,
-) -> Fit:
-    """Go on with a fit from where it stopped, or with another model from its values.
-
-    What another model has of the parameters is free, and its effects' fitted parameters too.
-    """
-    other = model or before.model
-    own = [n for n in before.unknowns.names if n in other.values]
-    own += [n for c in other.effects for n in c.fitted if n not in own]
-    return fit(
-        other, weighted(before, experiments), own, sigma=before.sigma,
-        start_states=before.starts(), evaluations=evaluations, tolerance=tolerance,
-    )  # fmt: skip
-
-
-def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
-    """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
-
-    Of every output, over the usual one of all experiments (the geometric mean by samples). A share
-    that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
-    """
-    shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
-    whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
-    shown = fit.shown(experiments) if whole else []
-    for o in fit.channels:
-        j = o.number
-        rows = ((k, experiments[k], shown[k][:, j]) for k in whole)
-        begun = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
-        fitted = zip(o.records, o.parts, strict=True)
-        found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
-        if len(found) < 2:
-            continue
-        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in found]
-        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in found])
-        for (k, part), own in zip(found, over, strict=True):
-            if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
-                shares[k][j] *= float(np.exp(own))
-    return tuple(replace(e, noise=tuple(own)) for e, own in zip(experiments, shares, strict=True))
-
-
-def unlike(experiments: Sequence[Experiment], others: Sequence[Experiment]) -> bool:
-    """Whether the shares of the noise differ."""
-    channels = range(len(experiments[0].channels))
-    pairs = zip(experiments, others, strict=True)
-    return any(a.share(j) != b.share(j) for a, b in pairs for j in channels)
-
-
-def reweighted(fit: Fit, experiments: Sequence[Experiment]) -> Fit:
-    """Fit again with other shares of the noise."""
-    return relevelled_all(refitted(fit, experiments, evaluations=100), experiments)
-
-
-def noise_left(fit: Fit, colour: Colour) -> list[float]:
-    """Return the noise in every output's residual, over the shares that weighted it."""
-    rows = zip(fit.channels, colour.each, strict=True)
-    return [noise_rms(o.residuals, own) for o, own in rows]
-
-
-def noise_told(
-    fit: Fit, colour: Colour, experiments: Sequence[Experiment]
-) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
-    """Return the experiments and every output's noise over them, in its unit, as a fit leaves it.
-
-    What a search has weighted by is from the base's residual, which holds more than noise.
-    """
-    told, levels = with_noise(fit, experiments), []
-    for o, own in zip(fit.channels, colour.each, strict=True):
-        j = o.number
-        rows = zip(o.records, o.parts, strict=True)
-        left = np.concatenate([p * (experiments[k].share(j) / told[k].share(j)) for k, p in rows])
-        levels.append(noise_rms(left, own) * noise_share(told, j))
-    return told, tuple(levels)
-
 
 #: Evaluations of a start's first fit, and how many of the best go on to the end.
 _QUICK, _FOLLOWED = 15, 2
@@ -194,7 +116,7 @@ def identify_ode(
     be simulated at its values.
     """
     refuse_unfit(model)
-    runs = runs_of(
+    runs = experiments_of(
         model, given_to(model, records, hold), judged=False, zeros=known_zeros(model, zeros),
         known_start=known_start,
     )  # fmt: skip
@@ -366,63 +288,3 @@ def refuse_unfit(model: Model) -> None:
             f"The model '{model.name}' has sampled states, whose sensitivities are not computed;"
             " leave the sampled component out."
         )
-
-
-#: A parameter with a larger standard error than this, over its ordinary change, is not determined.
-_UNDETERMINED = 0.5
-#: Half a 95 % interval over the standard error.
-_NORMAL = 1.96
-#: Correlations of neighbours below this count as none.
-_WHITE = 0.05
-
-
-@dataclass(frozen=True)
-class Certainty:
-    """Standard errors and 95 % intervals of the parameters by name, and what is wrong with some.
-
-    The interval of a parameter that spans decades is that of its logarithm; none goes beyond the
-    parameter's bounds. `undetermined` are not
-    told by the records, `on_bound` sit on a bound of their range.
-    """
-
-    errors: dict[str, float]
-    intervals: dict[str, Interval]
-    undetermined: tuple[str, ...]
-    on_bound: tuple[str, ...]
-
-
-def certainty(fit: Fit) -> Certainty:
-    """Return how sure a fit's parameters are.
-
-    Cov = (sum_j J_j^T J_j / s_j^2 + prior)^-1 over outputs j, residuals and derivatives whitened by
-    the correlation of the residual's neighbours, s_j the rms that is left.
-    """
-    information = np.diag(1.0 / fit.unknowns.prior**2)
-    for output in fit.channels:
-        white = np.column_stack([output.residuals, output.jacobian])
-        top = sum(float(p[1:] @ p[:-1]) for p in output.parts)
-        r = min(top / max(float(output.residuals @ output.residuals), 1e-300), 0.98)
-        if r >= _WHITE:  # the correlation of neighbours within the experiments
-            parts = np.split(white, np.cumsum(output.lengths)[:-1])
-            white = np.vstack([filtered([1.0, -r], [1.0], part)[1:] for part in parts])
-        level = max(float(np.sqrt(np.mean(white[:, 0] ** 2))), 1e-300)
-        information = information + white[:, 1:].T @ white[:, 1:] / level**2
-    names = fit.unknowns.names
-    spread = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[: len(names)]
-    slopes = np.diag(fit.unknowns.slopes(fit.theta))
-    errors, intervals, on_bound = {}, {}, []
-    for k, name in enumerate(names):
-        value, error = fit.model.values[name], float(spread[k] * abs(slopes[k]))
-        errors[name] = error
-        factor = float(np.exp(min(_NORMAL * spread[k], 300.0)))
-        half = _NORMAL * error
-        low, high = float(fit.unknowns.low[k]), float(fit.unknowns.high[k])
-        least, most = value - half, value + half
-        if fit.unknowns.log[k]:
-            least, most = value / factor, value * factor
-        intervals[name] = Interval(max(least, low), min(most, high))
-        edge = 1e-6 * (high - low) if np.isfinite(high - low) else 0.0
-        if value <= low + edge or value >= high - edge:
-            on_bound.append(name)
-    undetermined = [n for n, s in zip(names, spread, strict=True) if s > _UNDETERMINED]
-    return Certainty(errors, intervals, tuple(undetermined), tuple(on_bound))
