@@ -22,9 +22,8 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.multistart import (
-    OdeIdentification,
     free_of,
     identify_ode,
     known_zeros,
@@ -32,6 +31,7 @@ from psa_casadi.identification.multistart import (
     search_starts,
 )
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
+from psa_casadi.identification.result import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
@@ -143,7 +143,7 @@ def identify(
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
     progress: Progress = ...,
-) -> Identification: ...
+) -> StackIdentification: ...
 @overload
 def identify(
     model: Model,
@@ -154,7 +154,7 @@ def identify(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
-) -> OdeIdentification: ...
+) -> Identification: ...
 @_told_of(identify_ode)
 @wraps(stack.identify)
 def identify(*given: Any, **words: Any) -> Any:

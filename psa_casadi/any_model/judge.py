@@ -26,9 +26,9 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import Known, Names
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import PsaError
-from psa_casadi.identification.determinacy import certainty
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.multistart import MISSED, with_told
+from psa_casadi.identification.result import MISSED, with_told
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import FEWEST_SAMPLES
@@ -228,7 +228,8 @@ def _diagnosis(
     model = model.with_values(
         {n: v for n, v in named.fit.model.values.items() if n in model.values}
     )
-    model = with_told(model, experiments, certainty(named.fit))
+    sure, given = determinacy(named.fit, experiments), [e.record for e in experiments]
+    model = with_told(model, given, sure.names, sure.intervals, force_scale="given")
     told_noise, noise = _noise(known, named)
     partly = known.view(named).test.alarm
     shares = {}

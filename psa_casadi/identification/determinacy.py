@@ -15,7 +15,7 @@ from psa_casadi.identification.fitting.unknowns import (
     memory_sizes,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.records.noise import autocovariance, convolved, filtered
+from psa_casadi.records.noise import autocovariance, convolved
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -73,16 +73,17 @@ def determinacy(
     errors: FloatArray = np.sqrt(np.maximum(np.diag(of_values), 0.0))
     intervals, undetermined, on_bound = {}, [], []
     for k, name in enumerate(unknowns.names):
-        value, half = fit.model.values[name], _NORMAL_95 * errors[k]
+        value, half = fit.model.values[name], _NORMAL_95 * float(errors[k])
         parameter = fit.model.parameter(name)
-        if parameter.log:
+        log = parameter.log and value > 0.0
+        if log:
             factor = float(np.exp(min(half / value, 50.0)))
             intervals[name] = Interval(value / factor, value * factor)
         else:
             intervals[name] = Interval(value - half, value + half)
-        size = value if parameter.log else parameter.typical(fit.model.values)
+        size = value if log else parameter.typical(fit.model.values)
         edge = 1e-6 * abs(unknowns.scale[k])
-        vanished = parameter.log and value - unknowns.low[k] <= edge
+        vanished = log and value - unknowns.low[k] <= edge
         if name in not_unique or vanished or errors[k] > DETERMINED_WIDTH * abs(size):
             undetermined.append(name)
         elif min(value - unknowns.low[k], unknowns.high[k] - value) <= edge:
@@ -236,63 +237,3 @@ def record_information(
 def standard_errors(information: FloatArray) -> FloatArray:
     """Return the standard errors (k,) that an information matrix stands for."""
     return np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
-
-
-#: A parameter with a larger standard error than this, over its ordinary change, is not determined.
-_UNDETERMINED = 0.5
-#: Half a 95 % interval over the standard error.
-_NORMAL = 1.96
-#: Correlations of neighbours below this count as none.
-_WHITE = 0.05
-
-
-@dataclass(frozen=True)
-class Certainty:
-    """Standard errors and 95 % intervals of the parameters by name, and what is wrong with some.
-
-    The interval of a parameter that spans decades is that of its logarithm; none goes beyond the
-    parameter's bounds. `undetermined` are not
-    told by the records, `on_bound` sit on a bound of their range.
-    """
-
-    errors: dict[str, float]
-    intervals: dict[str, Interval]
-    undetermined: tuple[str, ...]
-    on_bound: tuple[str, ...]
-
-
-def certainty(fit: Fit) -> Certainty:
-    """Return how sure a fit's parameters are.
-
-    Cov = (sum_j J_j^T J_j / s_j^2 + prior)^-1 over outputs j, residuals and derivatives whitened by
-    the correlation of the residual's neighbours, s_j the rms that is left.
-    """
-    information = np.diag(1.0 / fit.unknowns.prior**2)
-    for output in fit.channels:
-        white = np.column_stack([output.residuals, output.jacobian])
-        top = sum(float(p[1:] @ p[:-1]) for p in output.parts)
-        r = min(top / max(float(output.residuals @ output.residuals), 1e-300), 0.98)
-        if r >= _WHITE:  # the correlation of neighbours within the experiments
-            parts = np.split(white, np.cumsum(output.lengths)[:-1])
-            white = np.vstack([filtered([1.0, -r], [1.0], part)[1:] for part in parts])
-        level = max(float(np.sqrt(np.mean(white[:, 0] ** 2))), 1e-300)
-        information = information + white[:, 1:].T @ white[:, 1:] / level**2
-    names = fit.unknowns.names
-    spread = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))[: len(names)]
-    slopes = np.diag(fit.unknowns.slopes(fit.theta))
-    errors, intervals, on_bound = {}, {}, []
-    for k, name in enumerate(names):
-        value, error = fit.model.values[name], float(spread[k] * abs(slopes[k]))
-        errors[name] = error
-        factor = float(np.exp(min(_NORMAL * spread[k], 300.0)))
-        half = _NORMAL * error
-        low, high = float(fit.unknowns.low[k]), float(fit.unknowns.high[k])
-        least, most = value - half, value + half
-        if fit.unknowns.log[k]:
-            least, most = value / factor, value * factor
-        intervals[name] = Interval(max(least, low), min(most, high))
-        edge = 1e-6 * (high - low) if np.isfinite(high - low) else 0.0
-        if value <= low + edge or value >= high - edge:
-            on_bound.append(name)
-    undetermined = [n for n, s in zip(names, spread, strict=True) if s > _UNDETERMINED]
-    return Certainty(errors, intervals, tuple(undetermined), tuple(on_bound))

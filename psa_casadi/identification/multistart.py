@@ -1,14 +1,13 @@
 """Identify any model from its records: several starts, and the noise that every output leaves."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.determinacy import Certainty, certainty
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import (
@@ -18,18 +17,20 @@ from psa_casadi.identification.refitting import (
     unlike,
     with_noise,
 )
+from psa_casadi.identification.result import (
+    MISSED,
+    Identification,
+    StartOutcome,
+    doubts_of,
+    with_told,
+)
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note, texts
-from psa_casadi.records.noise import first_order_noise
+from psa_casadi.notes import Note, note
 from psa_casadi.records.signals import Hold
-from psa_casadi.records.split import Experiment, noise_share
-from psa_casadi.shown import Reported, frame
+from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.variables import Parameter, Provenance
-from psa_casadi.version import __version__
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.variables import Parameter
 
 #: Evaluations of a start's first fit, and how many of the best go on to the end.
 _QUICK, _FOLLOWED = 15, 2
@@ -38,57 +39,8 @@ _SAME = 0.01
 #: Starts lie within so many natural logarithms, or ordinary changes, of the declared value.
 _DECADES, _CHANGES = 2.3, 2.0
 _SEED = 29
-#: A residual above so many times its own fast noise shows that the model misses something.
-MISSED = 1.5
 #: A fit that leaves this share of an output's standard deviation explains nothing of it.
 _ALL = 0.8
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class OdeIdentification(Reported):
-    """A model with fitted values, how sure they are, and remarks, which `warnings` tells.
-
-    `errors` are the parameters' standard errors, `intervals` their 95 % intervals in
-    `model.provenance`; `rms` is what is left of every measured output and `noise` the fast part of
-    that over all records, in the outputs' units. `costs` are those of the starts, nan for one that
-    failed; `agreed` of them led to the same minimum.
-    """
-
-    model: Model
-    fit: Fit
-    experiments: tuple[Experiment, ...]
-    errors: Mapping[str, float]
-    undetermined: tuple[str, ...]
-    rms: Mapping[str, float]
-    noise: Mapping[str, float]
-    costs: tuple[float, ...]
-    agreed: int
-    remarks: tuple[Note, ...]
-
-    def __repr__(self) -> str:
-        """Return the parameters with their standard errors, and what is left of the outputs."""
-        return str(note("own_identification", found=self))
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The remarks in sentences."""
-        return texts(self.remarks)
-
-    def to_frame(self) -> Any:
-        """Return the parameters as a pandas DataFrame: value, standard error, interval, unit."""
-        told = self.model.provenance.intervals
-        names = list(self.errors)
-        return frame(
-            {
-                "parameter": names,
-                "value": [self.model.values[n] for n in names],
-                "error": [self.errors[n] for n in names],
-                "low": [told[n].low for n in names],
-                "high": [told[n].high for n in names],
-                "unit": [self.model.parameter(n).unit for n in names],
-                "meaning": [self.model.parameter(n).description for n in names],
-            }
-        )
 
 
 def identify_ode(
@@ -100,7 +52,7 @@ def identify_ode(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
-) -> OdeIdentification:
+) -> Identification:
     """Fit the parameters of a model to all samples of all its records.
 
     `records` are `Signals`, tables with a column `time`, or CSV files, whose columns bear the names
@@ -120,8 +72,38 @@ def identify_ode(
         model, given_to(model, records, hold), judged=False, zeros=known_zeros(model, zeros),
         known_start=known_start,
     )  # fmt: skip
-    fit, runs, costs = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)
-    return _told(fit, runs, costs)
+    best, runs, outcomes = search_starts(
+        sized(model, runs), runs, free_of(model, free), starts=starts
+    )
+    found = determinacy(best, runs)
+    result = Identification(
+        model=with_told(
+            best.model, [e.record for e in runs], found.names, found.intervals,
+            force_scale="given", interrupted=best.interrupted,
+        ),
+        fit=best,
+        determinacy=found,
+        experiments=runs,
+        doubts=(),
+        starts=outcomes,
+        interrupted=best.interrupted,
+    )  # fmt: skip
+    doubts = *doubts_of(best, found, outcomes), *_of_outputs(result), *told_of_columns(model, runs)
+    return replace(result, doubts=doubts)
+
+
+def _of_outputs(found: Identification) -> list[Note]:
+    """Return which outputs a model misses, and which it does not follow at all."""
+    said, rms = [], found.rms
+    for o in found.fit.channels:
+        left, noise = rms[o.column], found.noise[o.column]
+        parts = [e.measured(o.number)[e.at(o.number)] for e in found.experiments]
+        share = left / float(np.std(np.concatenate(parts)))
+        if noise > 0 and left > MISSED * noise:
+            said.append(note("output_missed", output=o.column, ratio=left / noise))
+        if share > _ALL:
+            said.append(note("output_not_followed", output=o.column, share=share))
+    return said
 
 
 def free_of(model: Model, free: Sequence[str] | None) -> tuple[str, ...]:
@@ -144,50 +126,77 @@ def known_zeros(model: Model, zeros: Sequence[str]) -> tuple[str, ...]:
     return tuple(zeros)
 
 
+_Start = TypeVar("_Start")
+
+
+def fits_from(
+    starts: Iterable[tuple[str, _Start]], quick: Callable[[str, _Start], Fit]
+) -> list[tuple[str, Fit]]:
+    """Return the quick fits from named starts that can be simulated.
+
+    A keyboard interrupt ends it with those that there are, if any.
+    """
+    found: list[tuple[str, Fit]] = []
+    for name, start in starts:
+        try:
+            one = quick(name, start)
+        except PsaError:
+            continue
+        except KeyboardInterrupt:
+            if not found:
+                raise
+            return [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
+        found.append((name, one))
+        if one.interrupted:
+            break
+    return found
+
+
 def search_starts(
     model: Model, experiments: Sequence[Experiment], free: Sequence[str], *, starts: int
-) -> tuple[Fit, tuple[Experiment, ...], tuple[float, ...]]:
-    """Return the best fit from several starts, the experiments with their noise, and all costs.
+) -> tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]]:
+    """Return the best fit from several starts, the experiments with their noise, and the starts.
 
-    The costs are those of the starts with the same noise in all experiments. Raises SimulationError
-    where none can be simulated.
+    The costs are those with the same noise in all experiments. Raises SimulationError where none
+    can be simulated.
     """
     sigma = [experiments[0].channels[0].level] * len(experiments)
     seen = None if experiments[0].known_start else seen_starts(model, experiments)
-    found: list[Fit] = []
-    costs: list[float] = []
-    rng = np.random.default_rng(_SEED)
-    for number in range(max(1, starts)):
-        declared = model.values  # the first start; random ones about them, within the bounds
-        values = {n: _drawn(model.parameter(n), declared, rng) for n in free} if number else {}
-        try:
-            own = fit(
-                model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
-                evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4,
-            )  # fmt: skip
-        except PsaError:
-            costs.append(float("nan"))
-            continue
-        costs.append(own.cost)
-        found.append(own)
-        if own.interrupted:
-            break
+    rng, declared = np.random.default_rng(_SEED), model.values
+    drawn = [{n: _drawn(model.parameter(n), declared, rng) for n in free} for _ in range(1, starts)]
+    begins = [("declared values", {}), *((f"random values {k}", v) for k, v in enumerate(drawn, 1))]
+
+    def quick(_: str, values: Mapping[str, float]) -> Fit:
+        return fit(
+            model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
+            evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4,
+        )  # fmt: skip
+
+    found = sorted(fits_from(begins, quick), key=lambda pair: pair[1].cost)
     if not found:
         raise SimulationError(
             f"The model '{model.name}' cannot be simulated on these records from any start; check"
             " the units of its inputs, its values and their bounds."
         )
-    found.sort(key=lambda f: f.cost)
-    if found[-1].interrupted or found[0].interrupted:
-        return replace(found[0], interrupted=True, converged=False), (*experiments,), tuple(costs)
-    ended = [refitted(f, experiments, evaluations=100) for f in found[:_FOLLOWED]]
-    for quick, end in zip(found, ended, strict=False):
-        costs[costs.index(quick.cost)] = end.cost
-    best = relevelled_all(min(ended, key=lambda f: f.cost), experiments)
+    cut = any(f.interrupted for _, f in found)
+    ended = [] if cut else [refitted(f, experiments, evaluations=100) for _, f in found[:_FOLLOWED]]
+    fits = dict(found) | {name: f for (name, _), f in zip(found, ended, strict=False)}
+    best = min(fits.values(), key=lambda f: f.cost)
+    outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begins)
+    if cut:
+        return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
+    best = relevelled_all(best, experiments)
     again = with_noise(best, experiments)
     if unlike(again, experiments):
         best = reweighted(best, again)
-    return best, again, tuple(costs)
+    return best, again, outcomes
+
+
+def _outcome(name: str, end: Fit | None, best: Fit) -> StartOutcome:
+    if end is None:
+        return StartOutcome(name, float("nan"), float("nan"), None)
+    same = end.cost <= (1.0 + _SAME) * best.cost
+    return StartOutcome(name, end.cost, end.rms, True if same else None)
 
 
 def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[str, float]]:
@@ -223,60 +232,6 @@ def _drawn(p: Parameter, values: Mapping[str, float], rng: np.random.Generator) 
     else:
         drawn = value + p.typical(values) * float(rng.uniform(-_CHANGES, _CHANGES)) * 0.5
     return float(np.clip(drawn, low, high))
-
-
-def with_told(
-    model: Model, experiments: Sequence[Experiment], found: "Certainty", interrupted: bool = False
-) -> Model:
-    """Return a fitted model that says from which records it comes and how sure its values are."""
-    provenance = Provenance(
-        identified_from=tuple((e.record.name, e.record.sha256) for e in experiments),
-        package_version=__version__,
-        free=tuple(found.errors),
-        intervals=found.intervals,
-        force_scale="given",
-        interrupted=interrupted,
-    )
-    return replace(model, provenance=provenance, evidence=None)
-
-
-def _told(
-    fit: Fit, experiments: Sequence[Experiment], costs: tuple[float, ...]
-) -> OdeIdentification:
-    sure = certainty(fit)
-    noise, rms, left_of = {}, {}, {}
-    for o in fit.channels:
-        j, readings = o.number, [e.measured(o.number)[e.at(o.number)] for e in experiments]
-        noise[o.column] = first_order_noise(o.residuals)[0] * noise_share(experiments, j)
-        rows = zip(o.records, o.parts, strict=True)
-        left = np.concatenate([p * experiments[k].share(j) for k, p in rows])
-        rms[o.column] = float(np.sqrt(np.mean(left**2)))
-        left_of[o.column] = rms[o.column] / float(np.std(np.concatenate(readings)))
-    good = [c for c in costs if np.isfinite(c)]
-    agreed = sum(c <= (1.0 + _SAME) * min(good) for c in good)
-    said = []
-    if fit.interrupted or not fit.converged:
-        said.append(note("own_interrupted" if fit.interrupted else "cut_off"))
-    if len(costs) > 1 and agreed == 1:
-        said.append(note("one_start", starts=len(costs)))
-    said += [note("own_undetermined", name=n) for n in sure.undetermined]
-    said += [note("on_bound", name=n) for n in sure.on_bound]
-    missed = {n: rms[n] / noise[n] for n in rms if noise[n] > 0}
-    said += [note("output_missed", output=n, ratio=r) for n, r in missed.items() if r > MISSED]
-    said += [note("output_not_followed", output=n, share=s) for n, s in left_of.items() if s > _ALL]
-    said += told_of_columns(fit.model, experiments)
-    return OdeIdentification(
-        model=with_told(fit.model, experiments, sure, fit.interrupted),
-        fit=fit,
-        experiments=tuple(experiments),
-        errors=sure.errors,
-        undetermined=sure.undetermined,
-        rms=rms,
-        noise=noise,
-        costs=costs,
-        agreed=agreed,
-        remarks=tuple(said),
-    )
 
 
 def refuse_unfit(model: Model) -> None:

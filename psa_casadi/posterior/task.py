@@ -230,7 +230,7 @@ def own_task_of(
     declared = {n: told.parameter(n).value for n in names}
     return _around(
         told.with_values({**declared, **(prior or {})}), weighted(found.fit, found.experiments),
-        {n: told.values[n] for n in names}, widths or {}, found.fit.sigma, found.fit, found.remarks,
+        {n: told.values[n] for n in names}, widths or {}, found.fit.sigma, found.fit, found.doubts,
     )  # fmt: skip
 
 
