@@ -21,7 +21,6 @@ from psa_casadi.records import (
     Record,
     decaying_triangle,
     multisine,
-    steps,
     time_grid,
     triangle,
 )
@@ -42,6 +41,7 @@ from tests.identification.paper_cases import (
 )
 from tests.model.stack_models import PAPER_STACKS
 from tests.tiers import slow, slow_but
+from tests.voltages import steps
 
 STACK = "P-885.51"
 
