@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from psa_casadi.datasets.devices import linear_response
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.records import steps, time_grid
+from psa_casadi.records import time_grid
 from psa_casadi.records.split import split
 from psa_casadi.simulation import device
 from psa_casadi.simulation.simulate import EXACT, STEPPER
@@ -28,6 +28,7 @@ from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, 
 from tests.studies.benchmarks.hidden_cases import Case, Found, Kind
 from tests.studies.benchmarks.table import BENCHES, FloatArray, bench, least_times
 from tests.tiers import slow
+from tests.voltages import steps
 
 
 def silent(_: str) -> None:

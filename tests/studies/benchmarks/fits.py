@@ -22,7 +22,7 @@ from matplotlib.ticker import NullFormatter
 import psa_casadi as psa
 from psa_casadi.identification.fitting.fit import FIT_RTOL
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.records import concatenate, decaying_triangle, steps, time_grid, triangle
+from psa_casadi.records import decaying_triangle, time_grid, triangle
 from psa_casadi.report.words.phrases import number, plain
 from psa_casadi.simulation import simulate as simulate_module
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_exact, run_sets
@@ -33,6 +33,7 @@ from tests.model.stack_models import at_ordinary_size
 from tests.studies.benchmarks import table
 from tests.studies.benchmarks.records import hidden_record, noisy, played_again
 from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, share
+from tests.voltages import concatenate, steps
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P", "m_B")
 #: Tolerances of a step. Looser ones run exact steps at 1e-5 (`ways.LOOSEST`), so none is below.
@@ -447,9 +448,7 @@ def long_record(samples: int) -> psa.Record:
         decaying_triangle(t, 0.0, top, 6, centre=0.0),
         steps(t, levels),
     ]
-    wave = concatenate(parts, _SAMPLE_TIME)
-    x = psa.simulate(model, wave.time, wave.voltage).displacement
-    clean = psa.Record(
-        name=f"{x.size} samples", time=wave.time, voltage=wave.voltage, displacement=x
-    )
+    time, voltage = concatenate(parts, _SAMPLE_TIME)
+    x = psa.simulate(model, time, voltage).displacement
+    clean = psa.Record(name=f"{x.size} samples", time=time, voltage=voltage, displacement=x)
     return noisy(clean, _NOISE * clean.range_m, rng)
