@@ -25,8 +25,8 @@ from psa_casadi.reference import simulate
 from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import simulated
+from tests.export.ssp_master import load_ecos
 from tests.export.ssp_systems import END, RATE, monolithic
-from tests.studies.benchmarks.coupling import load_ecos
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
