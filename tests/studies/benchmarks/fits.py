@@ -31,6 +31,7 @@ from psa_casadi.simulation.start import start_on
 from tests.studies.benchmarks import table
 from tests.studies.benchmarks.records import hidden_record, noisy, played_again
 from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
+from tests.voltages import concatenate, steps
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P", "m_B")
 #: Tolerances of a step. Looser ones run exact steps at 1e-5 (`ways.LOOSEST`), so none is below.
