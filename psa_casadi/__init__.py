@@ -27,7 +27,6 @@ from psa_casadi.version import __version__
 if TYPE_CHECKING:
     from psa_casadi import datasets, design, online, system
     from psa_casadi.any_model.diagnose import diagnose, identify
-    from psa_casadi.any_model.identify import OdeIdentification
     from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.component import Component, Equations, Symbols
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
@@ -49,7 +48,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.importer.model_with_fmu import load_model
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp.archive import export_ssp
-    from psa_casadi.identification.identify import Identification
+    from psa_casadi.identification.result import Identification
     from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
     from psa_casadi.model.model_file import save_model
@@ -105,7 +104,7 @@ _HOMES = {
     "effects": "EFFECTS",
     "component": "Component Equations Symbols",
     "identification.start.two_clocks": "two_clocks",
-    "identification.identify": "Identification",
+    "identification.result": "Identification",
     "model.own_effects": "own_effects",
     "model.stacks": "STACKS stack_model",
     "model.compose": "Model compose",
@@ -124,7 +123,6 @@ _HOMES = {
     "simulation.timings": "Timings timed",
     "simulation.simulate": "Trajectory memory_after settled_at simulate simulate_record",
     "any_model.diagnose": "identify diagnose",
-    "any_model.identify": "OdeIdentification",
     "any_model.result": "OdeDiagnosis",
     "posterior.sample": "Posterior sample",
     "diagnosis.verdict": "patched_model",
@@ -155,7 +153,7 @@ __all__ = [
     "PARTS", "part_model", "compensator_for", "controller_for", "margins_of", "System", "connect",
     "nanopositioner", "ode_model", "fmu_model", "Input", "Output", "Parameter", "Publication",
     "State", "load_model", "save_model", "Trajectory", "simulate", "simulate_record",
-    "simulate_many", "memory_after", "settled_at", "run", "Identification", "OdeIdentification",
+    "simulate_many", "memory_after", "settled_at", "run", "Identification",
     "identify", "sample", "Posterior", "diagnose", "Diagnosis", "OdeDiagnosis", "load_diagnosis",
     "timed", "Timings", "story", "report", "save_figure", "write_report", "write_fit_report",
     "batch", "BatchRun", "Job", "Options", "read_findings", "write_comparison",
@@ -184,6 +182,7 @@ def __getattr__(name: str) -> Any:
 _TEXTS = {
     "note_text": "psa_casadi.report.words.notes",
     "sentence_of": "psa_casadi.report.words.advice_words",
+    "identification_file": "psa_casadi.report.documents.files",
 }
 
 

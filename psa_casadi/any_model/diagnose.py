@@ -9,21 +9,8 @@ from typing import Any, overload
 
 from psa_casadi.any_model.effects.attached import of_ones_own
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.identify import (
-    OdeIdentification,
-    free_of,
-    identify_ode,
-    known_zeros,
-    refuse_unfit,
-    reweighted,
-    search_starts,
-    unlike,
-    with_noise,
-)
 from psa_casadi.any_model.judge import judged
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import given_to, runs_of, told_of_columns
-from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import diagnose as stacks
 from psa_casadi.diagnosis.pack import Pack, Task
@@ -33,8 +20,18 @@ from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
+from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.multistart import (
+    free_of,
+    identify_ode,
+    known_zeros,
+    refuse_unfit,
+    search_starts,
+)
+from psa_casadi.identification.refitting import reweighted, unlike, with_noise
+from psa_casadi.identification.result import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
@@ -43,6 +40,7 @@ from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
+from psa_casadi.simulation.sizes import sized, sizes_of
 from psa_casadi.simulation.start import is_stack
 
 #: The steps of a search that are a stack's: they need its voltage, its loop or its resonances.
@@ -88,7 +86,7 @@ def diagnose_ode(
     none = isinstance(holdout, tuple | list) and not holdout
     held = [] if none else given_to(model, holdout, hold, len(given) + 1)
     shifted = known_zeros(model, zeros)
-    runs = runs_of(model, given, held, zeros=shifted, known_start=known_start)
+    runs = experiments_of(model, given, held, zeros=shifted, known_start=known_start)
     progress("fitting from several starts")
     base, runs, _ = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)
     if base.interrupted:
@@ -145,7 +143,7 @@ def identify(
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
     progress: Progress = ...,
-) -> Identification: ...
+) -> StackIdentification: ...
 @overload
 def identify(
     model: Model,
@@ -156,7 +154,7 @@ def identify(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
-) -> OdeIdentification: ...
+) -> Identification: ...
 @_told_of(identify_ode)
 @wraps(stack.identify)
 def identify(*given: Any, **words: Any) -> Any:

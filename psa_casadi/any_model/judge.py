@@ -7,7 +7,6 @@ import numpy as np
 
 from psa_casadi.any_model.effects.attached import Attached, extended
 from psa_casadi.any_model.free_functions import Free, correction_of, free_functions
-from psa_casadi.any_model.identify import MISSED, certainty, noise_left, noise_told, with_told
 from psa_casadi.any_model.result import (
     OdeBudget,
     OdeDiagnosis,
@@ -15,8 +14,8 @@ from psa_casadi.any_model.result import (
     PortCause,
     removed_from,
 )
-from psa_casadi.any_model.runs import missed_rms
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.diagnosis.judgement import least_share, rivals, verdict_by
 from psa_casadi.diagnosis.remedy import Size
@@ -27,11 +26,13 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.known import Known, Names
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.result import MISSED, with_told
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import FEWEST_SAMPLES
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, missed_rms
 
 
 @dataclass(frozen=True)
@@ -227,7 +228,8 @@ def _diagnosis(
     model = model.with_values(
         {n: v for n, v in named.fit.model.values.items() if n in model.values}
     )
-    model = with_told(model, experiments, certainty(named.fit))
+    sure, given = determinacy(named.fit, experiments), [e.record for e in experiments]
+    model = with_told(model, given, sure.names, sure.intervals, force_scale="given")
     told_noise, noise = _noise(known, named)
     partly = known.view(named).test.alarm
     shares = {}

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.runs import counted
 from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Candidate, Estimate, Remaining, Verdict, told
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, counted
 from psa_casadi.shown import Reported, frame, with_units
 
 FloatArray = npt.NDArray[np.float64]

@@ -92,7 +92,7 @@ def _read(
     reading: Reading,
 ) -> "tuple[psa.Model | None, psa.Record | psa.Signals | None]":
     """Return the model and the record of its inputs, `Signals` where it is no stack's."""
-    from psa_casadi.any_model.runs import in_units
+    from psa_casadi.identification.experiments import in_units
 
     chosen = own_model(given, model, Fitting())
     if chosen is not None:

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Population
@@ -29,19 +29,11 @@ from psa_casadi.simulation.simulate import Trajectory
 
 _WORDS: dict[type, Callable[..., str]] = {
     Diagnosis: story,
-    Identification: identification_text,
+    StackIdentification: identification_text,
     Posterior: posterior_text,
 }
 Told = DiagnosisFile | OwnModelFile
-Reported = (
-    Diagnosis
-    | OdeDiagnosis
-    | Identification
-    | OdeIdentification
-    | Posterior
-    | Population
-    | Sequence[Finding]
-)
+Reported = Diagnosis | OdeDiagnosis | Identification | Posterior | Population | Sequence[Finding]
 
 
 def report(result: Reported, path: str | os.PathLike[str], *, still: bool = False) -> None:
@@ -55,7 +47,7 @@ def report(result: Reported, path: str | os.PathLike[str], *, still: bool = Fals
     """
     if isinstance(result, Diagnosis | OdeDiagnosis):
         write_report(result, path, still=still)
-    elif isinstance(result, Identification | OdeIdentification):
+    elif isinstance(result, Identification):
         write_fit_report(result, path, still=still)
     elif isinstance(result, Posterior):
         write_posterior(result, path)
@@ -76,8 +68,6 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
 
 def line(result: Plotted | Told) -> str:
     """Return a result in one line."""
-    if isinstance(result, OdeIdentification | Signals):
-        return repr(result).partition("\n")[0]
     if isinstance(result, OwnModelFile | OdeDiagnosis):
         return f"<Diagnosis of an own model {result.verdict}{_causes(result)}>"
     if isinstance(result, Diagnosis | DiagnosisFile):
@@ -87,13 +77,15 @@ def line(result: Plotted | Told) -> str:
         first = f"{number(before, 2)} -> " if before != after else ""
         errors = f"{first}{number(after, 2)} % of range rms"
         return f"<Diagnosis {result.verdict}{_causes(result)}; held-out error {errors}>"
-    if isinstance(result, Identification):
+    if isinstance(result, StackIdentification):
         count = len(result.experiments)
         span = max(e.record.range_m for e in result.experiments)
         rest = number(100.0 * result.fit.rms / span, 2)
         records = f"{count} record{'' if count == 1 else 's'}"
         free = len(result.determinacy.names)
         return f"<Identification: {free} parameters from {records}; residual {rest} % of range rms>"
+    if isinstance(result, Identification | Signals):
+        return repr(result).partition("\n")[0]
     if isinstance(result, Posterior):
         names = ", ".join(f.name for f in result.figures)
         return f"<Posterior of {names}: {result.chains} chains of {result.draws} draws>"

@@ -9,9 +9,6 @@ import numpy as np
 
 from psa_casadi.any_model.effects.attached import Attached, extended, of_ones_own
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.identify import free_of, known_zeros, search_starts
-from psa_casadi.any_model.runs import given_to, runs_of
-from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.component import Component
 from psa_casadi.design.experiment.criteria import (
     Optimality,
@@ -37,13 +34,16 @@ from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.search.steps import fit_contenders, fitted_rivals
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
+from psa_casadi.identification.experiments import experiments_of, given_to
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.multistart import free_of, known_zeros, search_starts
 from psa_casadi.identification.search import CORE
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment, whole
+from psa_casadi.simulation.sizes import sized, sizes_of
 from psa_casadi.simulation.start import is_stack
 
 #: Noise of a sensor over what the output moves, where none is given.
@@ -195,7 +195,7 @@ def rivals_of(
     runs: tuple[Experiment, ...] = ()
     base: Fit | None = None
     if records is not None:
-        runs = runs_of(
+        runs = experiments_of(
             model, given_to(model, records, hold), judged=False, zeros=words["zeros"],
             known_start=known_start,
         )  # fmt: skip

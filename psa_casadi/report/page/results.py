@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.files import atomic_write
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
@@ -91,7 +91,7 @@ def write_report(
 
 
 def write_fit_report(
-    found: Identification | OdeIdentification,
+    found: Identification,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -107,7 +107,7 @@ def write_fit_report(
 
     Raises InputError when `path` cannot be written to.
     """
-    if isinstance(found, OdeIdentification):
+    if not isinstance(found, StackIdentification):
         page = _own_fit_page(found)
     else:
         series = series_of_fit(found)
@@ -176,7 +176,7 @@ def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | No
 
 
 def fit_page(
-    found: Identification,
+    found: StackIdentification,
     series: Sequence[Series],
     *,
     origin: str = "measured",
@@ -273,7 +273,7 @@ def _own_page(d: OdeDiagnosis) -> str:
     )
 
 
-def _own_fit_page(found: OdeIdentification) -> str:
+def _own_fit_page(found: Identification) -> str:
     series = own_words.own_fit_series(found)
     return render(
         "own_fit.html",
@@ -312,7 +312,7 @@ def _shared(
     series: Sequence[Series],
     given: Sequence[Experiment],
     origin: str,
-    found: Identification | None = None,
+    found: StackIdentification | None = None,
 ) -> dict[str, Any]:
     """Return what all four pages show: the record that is missed most, every record, parameters.
 

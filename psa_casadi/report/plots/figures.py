@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.posterior.chains import column_of
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.posterior.task import Block
@@ -41,7 +41,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
-Compared = Diagnosis | Identification | OdeDiagnosis | OdeIdentification
+Compared = Diagnosis | Identification | OdeDiagnosis
 Plotted = Compared | Trajectory | Posterior | Signals
 
 #: What all pictures share.
@@ -91,7 +91,7 @@ def figure_of(result: Plotted) -> Figure:
     """Return the picture of a result."""
     if isinstance(result, Diagnosis):
         return diagnosis_figure(result)
-    if isinstance(result, Identification):
+    if isinstance(result, StackIdentification):
         series = series_of_fit(result)
         figure, grid, shown = _sheet(series, "measured", "model")
         _draw_residual(figure.add_subplot(grid[1, :]), shown)
@@ -262,7 +262,7 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
 def _series(result: Compared) -> tuple[Series, ...]:
     if isinstance(result, Diagnosis):
         return series_of(result)
-    if isinstance(result, Identification):
+    if isinstance(result, StackIdentification):
         return series_of_fit(result)
     return own_series(result) if isinstance(result, OdeDiagnosis) else own_fit_series(result)
 

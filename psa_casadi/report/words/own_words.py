@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.any_model.runs import noise_share, varied
 from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.identification.experiments import varied
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, verdict_words
 from psa_casadi.report.words.phrases import (
     added,
@@ -131,7 +131,7 @@ def own_error_tables(d: OdeDiagnosis, series: Sequence[Series]) -> tuple[Table, 
     return tables[0], tables[1]
 
 
-def own_fit_table(found: OdeIdentification, series: Sequence[Series]) -> Table:
+def own_fit_table(found: Identification, series: Sequence[Series]) -> Table:
     """Return what the model leaves of every record, beside the noise."""
     rows = []
     for s in series:
@@ -144,7 +144,7 @@ def own_fit_table(found: OdeIdentification, series: Sequence[Series]) -> Table:
     return Table(("record", "unit", "rms", "noise", "rms / noise"), tuple(rows))
 
 
-def own_fit_sentence(found: OdeIdentification) -> str:
+def own_fit_sentence(found: Identification) -> str:
     """Say how far the model is from its records, and how many parameters these determine."""
     parts = []
     for name, rms in found.rms.items():
@@ -179,7 +179,7 @@ def own_series(d: OdeDiagnosis) -> tuple[Series, ...]:
     return tuple(_series(d.model, d.experiments, noise, curves))
 
 
-def own_fit_series(found: OdeIdentification) -> tuple[Series, ...]:
+def own_fit_series(found: Identification) -> tuple[Series, ...]:
     """Return every measured output of every record, with the fitted model."""
     predicted = found.fit.outputs(found.experiments)
     curves = [("model", colours.EXTENDED, predicted)]
@@ -217,7 +217,7 @@ def _series(
             )
 
 
-def _identification(found: OdeIdentification) -> str:
+def _identification(found: Identification) -> str:
     """Return the parameters with their standard errors, and what is left of the outputs."""
     model = found.model
     rows = [
@@ -256,13 +256,11 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         f"{record} states no unit of {listing(names)}; the model's are taken."
     ),
     # the fit
-    "own_interrupted": "The search was interrupted; these are the best values so far.",
     "cut_off": "The fit was cut off before it converged; its values are not final.",
     "one_start": (
         "Of {starts} starts only one led to this minimum; it is the best found, and may not be the"
         " best there is."
     ),
-    "own_undetermined": "'{name}' is not determined by these records.",
     "on_bound": "'{name}' sits on a bound of its range; its interval means nothing.",
     "output_missed": (
         "'{output}' is missed by {ratio:.2g} times its noise: the model lacks something, so that"

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.result import Identification
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words import colours, phrases

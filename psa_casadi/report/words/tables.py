@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.identify import Identification
-from psa_casadi.identification.search import StartOutcome
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment
@@ -86,7 +86,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 
 
 def parameter_table(
-    model: Model, found: Identification | None = None, only: Collection[str] | None = None
+    model: Model, found: StackIdentification | None = None, only: Collection[str] | None = None
 ) -> Table:
     """Return every parameter with value, 95 % interval, unit, how it was found, and meaning.
 
@@ -105,7 +105,7 @@ def parameter_table(
     return _table(("parameter", "value", "95 % interval", "unit", "found by", "meaning"), rows)
 
 
-def _status(model: Model, name: str, found: Identification | None) -> str:
+def _status(model: Model, name: str, found: StackIdentification | None) -> str:
     if found is not None and name in found.read_off:
         return "read off"
     if name not in model.provenance.free:

@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import OF_BINARIES
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
@@ -124,7 +124,7 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
 
 
 def identification_text(
-    found: Identification, *, origin: str = "measured", width: int = 100
+    found: StackIdentification, *, origin: str = "measured", width: int = 100
 ) -> str:
     """Return an identification: error, parameters with intervals, warnings, what is left open."""
     scale = scale_of(found.experiments, found.fit.rms)
