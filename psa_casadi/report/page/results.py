@@ -78,13 +78,12 @@ def write_report(
     `origin`, "measured" or "synthetic", is what the page calls the records; `model_file` is where
     the extended model was written, which the commands of the page read. Unless it is to be
     `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
-    page is below 3 MB; where scripts are off it has one still picture. That of a model of one's
-    own holds no model that runs.
+    page is below 3 MB; where scripts are off it has one still picture.
 
     Raises InputError when `path` cannot be written to.
     """
     if isinstance(diagnosis, OdeDiagnosis):
-        page = _own_page(diagnosis)
+        page = _own_page(diagnosis, still)
     else:
         page = _diagnosis_page(diagnosis, origin, still, model_file)
     atomic_write(path, page)
@@ -102,13 +101,12 @@ def write_fit_report(
 
     It shows what the records determine, measured and model, and what the residual is.
     `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. Unless it is to be `still`, the model runs in the page; that of one's
-    own does not.
+    beside the determinacy. Unless it is to be `still`, the model runs in the page.
 
     Raises InputError when `path` cannot be written to.
     """
     if not isinstance(found, StackIdentification):
-        page = _own_fit_page(found)
+        page = _own_fit_page(found, still)
     else:
         series = series_of_fit(found)
         live = None if still else live_fit(found, series)
@@ -227,8 +225,9 @@ def fit_page(
         )
 
 
-def _own_page(d: OdeDiagnosis) -> str:
+def _own_page(d: OdeDiagnosis, still: bool) -> str:
     series = own_words.own_series(d)
+    live = None if still else live_diagnosis(d, series)  # compiles beside what follows
     rows = [(s, residual_figures(s, s.curves[0])) for s in series]
     rows.sort(key=lambda row: -row[1].range_share)
     free = d.correction
@@ -240,6 +239,7 @@ def _own_page(d: OdeDiagnosis) -> str:
         **_shared(d.model, series, d.experiments, "measured"),
         **_diagnosed(d),
         verdict=own_words.own_verdict_sentence(d),
+        live=live,
         advice=what_now(d),
         errors=[
             (
@@ -273,13 +273,15 @@ def _own_page(d: OdeDiagnosis) -> str:
     )
 
 
-def _own_fit_page(found: Identification) -> str:
+def _own_fit_page(found: Identification, still: bool) -> str:
     series = own_words.own_fit_series(found)
+    live = None if still else live_fit(found, series)
     return render(
         "own_fit.html",
         f"Identification of {plain(found.model.name)}",
         **_shared(found.model, series, found.experiments, "measured"),
         found=found,
+        live=live,
         verdict=own_words.own_fit_sentence(found),
         errors=own_words.own_fit_table(found, series),
     )
