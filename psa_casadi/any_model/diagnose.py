@@ -36,6 +36,7 @@ from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
+from psa_casadi.progress import on_a_terminal
 from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
@@ -154,7 +155,9 @@ def identify(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
+    progress: Progress = ...,
 ) -> Identification: ...
+@on_a_terminal
 @_told_of(identify_ode)
 @wraps(stack.identify)
 def identify(*given: Any, **words: Any) -> Any:
@@ -192,6 +195,7 @@ def diagnose(
     effects: Sequence[Component] = ...,
     progress: Progress = ...,
 ) -> OdeDiagnosis: ...
+@on_a_terminal
 @_told_of(diagnose_ode)
 @wraps(stacks.diagnose)
 def diagnose(*given: Any, **words: Any) -> Any:

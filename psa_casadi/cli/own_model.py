@@ -119,8 +119,8 @@ def identified_own(
     given.outputs(files, list(records))
     measured = given.signals(model, records, reading)
     given.check()
-    with working("identifying", given.quiet):
-        found = psa.identify(model, measured, **fitting.words)
+    with working("identifying", given.quiet) as progress:
+        found = psa.identify(model, measured, progress=progress, **fitting.words)
     output, json, report = files.values()
     if output is not None:
         psa.save_model(found.model, output)

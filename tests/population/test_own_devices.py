@@ -25,6 +25,7 @@ def test_identifications_of_an_own_model_are_compared(tmp_path: Path) -> None:
     """The third of three motors is heavier by a hundredth; all else is the same."""
     given = [device("first", 1), device("second", 2), device("third", 3, inertia=3.03e-5)]
     results = [psa.identify(motor(), record, starts=1) for record in given]
+    assert len(results[0].plot().axes) == 4  # both outputs, and what is left of each
     path = tmp_path / "second.json"
     path.write_text(json_text(identification_file(results[1])), encoding="utf-8")
     content = valid("identification", path.read_text("utf-8"))
