@@ -18,8 +18,7 @@ from psa_casadi.report.page.document import render
 from psa_casadi.report.page.live import LiveModel, LiveRecord
 from psa_casadi.report.page.playground import playground
 from psa_casadi.report.words import colours
-from psa_casadi.report.words.own_words import with_its_unit
-from psa_casadi.report.words.phrases import number, plain
+from psa_casadi.report.words.phrases import number, plain, with_its_unit
 from psa_casadi.report.words.series import Curve, Series
 from psa_casadi.variables import Interval, Provenance
 from tests.any_model import own_plants as plants
