@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
-from psa_casadi.diagnosis.judgement import told_from
+from psa_casadi.diagnosis.judgement import NAMING, told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupted, Verdict
@@ -17,7 +17,7 @@ from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried
-from psa_casadi.diagnosis.verdict import NAMING, conclude
+from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.further import COLUMNS
@@ -384,7 +384,8 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     seen = driven(base, start, task)
     if not seen.follows:
         steps = unsearched(base, task)
-        found = conclude(steps, task, scale_given, driven=seen.filtered)
+        judge = StackJudge(steps, task, scale_given=scale_given, driven=seen.filtered)
+        found = judge.conclude()
         return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = steps_of(best_first(base, task), task)
     task.keep(steps[-1].fit)
@@ -403,7 +404,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         else:
             between = None
     progress("judging")
-    found = conclude(steps, task, scale_given)
+    found = StackJudge(steps, task, scale_given=scale_given).conclude()
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
     more_said = [

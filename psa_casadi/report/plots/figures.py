@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
@@ -27,7 +26,6 @@ from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
 from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.misfit_words import AXES
-from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.series import (
     FloatArray,
     Series,
@@ -41,7 +39,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
-Compared = Diagnosis | Identification | OdeDiagnosis
+Compared = OdeDiagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals
 
 #: What all pictures share.
@@ -260,11 +258,7 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
-    if isinstance(result, Diagnosis):
-        return series_of(result)
-    if isinstance(result, StackIdentification):
-        return series_of_fit(result)
-    return own_series(result) if isinstance(result, OdeDiagnosis) else own_fit_series(result)
+    return series_of(result) if isinstance(result, OdeDiagnosis) else series_of_fit(result)
 
 
 def _chosen(output: str | None, there: Collection[str], usual: str) -> str:
