@@ -8,7 +8,7 @@ or up to the fifth of a signal, each over its size. They have no memory and no t
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from math import prod
 
@@ -32,7 +32,7 @@ from psa_casadi.diagnosis.search.hypothesis import View, hypothesis
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.refitting import refitted
+from psa_casadi.identification.refitting import refit, weighted
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, true_output
 from psa_casadi.records.split import Experiment
@@ -151,9 +151,11 @@ def free_functions(known: Known, view: View, base: Model) -> tuple[Free, ...]:
         fitted: Fit | None = None
         with suppress(PsaError):
             model = root.fit.model.with_effect(attached.component)
-            fitted = refitted(
-                root.fit, experiments, model=model, evaluations=_EVALUATIONS, tolerance=1e-4
-            )
+            fitted = refit(
+                replace(root.fit, model=model), weighted(root.fit, experiments),
+                [*root.fit.unknowns.names, *attached.component.fitted],
+                sigma=root.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
+            )  # fmt: skip
         h = hypothesis((attached.component,), fitted, experiments)
         if h is not None:
             of = " and ".join(law.names)

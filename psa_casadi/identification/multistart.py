@@ -11,10 +11,11 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import (
-    refitted,
-    relevelled_all,
+    refit,
+    relevelled,
     reweighted,
     unlike,
+    weighted,
     with_noise,
 )
 from psa_casadi.identification.result import (
@@ -179,13 +180,16 @@ def search_starts(
             " the units of its inputs, its values and their bounds."
         )
     cut = any(f.interrupted for _, f in found)
-    ended = [] if cut else [refitted(f, experiments, evaluations=100) for _, f in found[:_FOLLOWED]]
+    ended = [
+        refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)
+        for _, f in found[: 0 if cut else _FOLLOWED]
+    ]
     fits = dict(found) | {name: f for (name, _), f in zip(found, ended, strict=False)}
     best = min(fits.values(), key=lambda f: f.cost)
     outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begins)
     if cut:
         return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
-    best = relevelled_all(best, experiments)
+    best = relevelled(best, experiments, every=True)[0]
     again = with_noise(best, experiments)
     if unlike(again, experiments):
         best = reweighted(best, again)
