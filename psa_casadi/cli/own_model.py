@@ -16,7 +16,6 @@ from psa_casadi.cli.options import Reading
 from psa_casadi.cli.screen import show, tell, tell_written, width, working
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
-from psa_casadi.strict_json import json_text
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
@@ -96,43 +95,6 @@ def _made(file: Path, name: str) -> psa.Model:
     return model
 
 
-def identified_own(
-    path: Path | None,
-    records: Sequence[Path],
-    fitting: Fitting,
-    reading: Reading,
-    given: Given,
-    *,
-    files: Mapping[str, Path | None],
-    others: Mapping[str, object],
-) -> bool:
-    """Fit a model of one's own, show its parameters: `files` are --output, --json, --report.
-
-    False where the path names none. `others` are options that must be empty.
-    """
-    model = own_model(given, path, fitting)
-    if model is None:
-        return False
-    from psa_casadi.report.documents.files import identification_file
-
-    _refuse(given, others)
-    given.outputs(files, list(records))
-    measured = _read(given, model, records, reading)
-    given.check()
-    with working("identifying", given.quiet):
-        found = psa.identify(model, measured, **fitting.words)
-    output, json, report = files.values()
-    if output is not None:
-        psa.save_model(found.model, output)
-    if json is not None:
-        atomic_write(json, json_text(identification_file(found)))
-    if report is not None:
-        psa.write_fit_report(found, report)
-    show(repr(found), given.quiet)
-    tell_written(output, json, report, quiet=given.quiet)
-    return True
-
-
 def diagnosed_own(
     path: Path | None,
     records: Sequence[Path],
@@ -157,9 +119,9 @@ def diagnosed_own(
     from psa_casadi.report.words.own_words import own_verdict_sentence
 
     began, own = clock.perf_counter(), given.of_any_model()
-    _refuse(given, others)
+    refuse(given, others)
     given.outputs(files, [*records, *held_out])
-    measured, held = (_read(given, model, part, reading) for part in (records, held_out))
+    measured, held = (read_on(given, model, part, reading) for part in (records, held_out))
     wanted, _ = expected(given, expect, None)
     given.check()
     with working("diagnosing", given.quiet) as progress:
@@ -202,9 +164,9 @@ def simulated_own(
     from psa_casadi.identification.experiments import in_units
     from psa_casadi.units import convert
 
-    _refuse(given, others)
+    refuse(given, others)
     given.outputs({"--output": output}, [path, input_])
-    record = next(iter(_read(given, model, [input_], reading)), None)
+    record = next(iter(read_on(given, model, [input_], reading)), None)
     problems = Problems()
     samples = record and in_units(model, record, problems)
     for sentence in problems.sentences():
@@ -230,15 +192,16 @@ def simulated_own(
     return True
 
 
-def _refuse(given: Given, others: Mapping[str, object]) -> None:
+def refuse(given: Given, others: Mapping[str, object]) -> None:
     """Refuse the options that a model of one's own does not take."""
     for option in [name for name, value in others.items() if value]:
         given.add(f"{option} is not there for a model of your own; leave it out.")
 
 
-def _read(
+def read_on(
     given: Given, model: psa.Model, paths: Sequence[Path], reading: Reading
 ) -> tuple[psa.Signals, ...]:
+    """Read records on a model of one's own, and tell what the reader took for what."""
     if not paths:
         return ()
     found = given.attempt(

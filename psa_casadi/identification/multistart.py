@@ -11,6 +11,7 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import (
+    Progress,
     refit,
     relevelled,
     reweighted,
@@ -53,6 +54,7 @@ def identify_ode(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
+    progress: Progress = lambda _: None,
 ) -> Identification:
     """Fit the parameters of a model to all samples of all its records.
 
@@ -74,7 +76,7 @@ def identify_ode(
         known_start=known_start,
     )  # fmt: skip
     best, runs, outcomes = search_starts(
-        sized(model, runs), runs, free_of(model, free), starts=starts
+        sized(model, runs), runs, free_of(model, free), starts=starts, progress=progress
     )
     found = determinacy(best, runs)
     result = Identification(
@@ -154,7 +156,12 @@ def fits_from(
 
 
 def search_starts(
-    model: Model, experiments: Sequence[Experiment], free: Sequence[str], *, starts: int
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    *,
+    starts: int,
+    progress: Progress = lambda _: None,
 ) -> tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]]:
     """Return the best fit from several starts, the experiments with their noise, and the starts.
 
@@ -167,7 +174,8 @@ def search_starts(
     drawn = [{n: _drawn(model.parameter(n), declared, rng) for n in free} for _ in range(1, starts)]
     begins = [("declared values", {}), *((f"random values {k}", v) for k, v in enumerate(drawn, 1))]
 
-    def quick(_: str, values: Mapping[str, float]) -> Fit:
+    def quick(name: str, values: Mapping[str, float]) -> Fit:
+        progress(f"fit from {name}")
         return fit(
             model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
             evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4,
