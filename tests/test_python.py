@@ -22,7 +22,7 @@ import psa_casadi as psa
 from psa_casadi.component import OnDemand
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.identification.multistart import identify_ode
-from psa_casadi.records import records_given
+from psa_casadi.records.read.reading import records_given
 from tests.any_model.own_models import oscillator
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow

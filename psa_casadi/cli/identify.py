@@ -9,7 +9,7 @@ import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
-from psa_casadi.cli.own_model import Fitting, own_model, read_on, refuse
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.cli.steps import IDENTIFY
 from psa_casadi.files import atomic_write
@@ -60,8 +60,8 @@ def identify(
     given.outputs(outputs, [*records, model])
     if own is not None:
         of_stacks = {"--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis}
-        refuse(given, {**of_stacks, "--method": method == "paper", "--profile": profile})
-        signals = read_on(given, own, records, reading)
+        given.refuse({**of_stacks, "--method": method == "paper", "--profile": profile})
+        signals = given.signals(own, records, reading)
         work: Callable[..., psa.Identification] = partial(
             psa.identify, own, signals, **fitting.words
         )

@@ -15,6 +15,7 @@ from scipy.io import savemat
 
 import psa_casadi as psa
 from psa_casadi.identification.experiments import experiments_of, given_to
+from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
 from tests.any_model import own_plants as plants
@@ -178,7 +179,7 @@ def test_a_stacks_record_drives_any_model_and_signals_a_stack() -> None:
     columns = {"voltage": VALVE, "displacement": SPEED}
     units = {"voltage": "V", "displacement": "um"}
     told = psa.Signals(name="s", time=T, columns=columns, units=units)
-    (again,) = psa.records.records_given(told)
+    (again,) = records_given(told)
     np.testing.assert_allclose(np.asarray(again.displacement), 1e-6 * SPEED, rtol=1e-12)
 
 
