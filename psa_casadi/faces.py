@@ -56,6 +56,7 @@ def identify(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
+    progress: Progress = ...,
 ) -> Identification: ...
 @_told_of(identify_ode)
 @wraps(stack.identify)

@@ -16,7 +16,6 @@ from psa_casadi.cli.options import Reading
 from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
-from psa_casadi.strict_json import json_text
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
@@ -94,43 +93,6 @@ def _made(file: Path, name: str) -> psa.Model:
             f" does, as {file}:{own[-1] if own else 'make'}."
         )
     return model
-
-
-def identified_own(
-    path: Path | None,
-    records: Sequence[Path],
-    fitting: Fitting,
-    reading: Reading,
-    given: Given,
-    *,
-    files: Mapping[str, Path | None],
-    others: Mapping[str, object],
-) -> bool:
-    """Fit a model of one's own, show its parameters: `files` are --output, --json, --report.
-
-    False where the path names none. `others` are options that must be empty.
-    """
-    model = own_model(given, path, fitting)
-    if model is None:
-        return False
-    from psa_casadi.report.documents.files import identification_file
-
-    given.refuse(others)
-    given.outputs(files, list(records))
-    measured = given.signals(model, records, reading)
-    given.check()
-    with working("identifying", given.quiet):
-        found = psa.identify(model, measured, **fitting.words)
-    output, json, report = files.values()
-    if output is not None:
-        psa.save_model(found.model, output)
-    if json is not None:
-        atomic_write(json, json_text(identification_file(found)))
-    if report is not None:
-        psa.write_fit_report(found, report)
-    show(repr(found), given.quiet)
-    tell_written(output, json, report, quiet=given.quiet)
-    return True
 
 
 def diagnosed_own(

@@ -8,7 +8,7 @@ or up to the fifth of a signal, each over its size. They have no memory and no t
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from math import prod
 
@@ -30,7 +30,7 @@ from psa_casadi.diagnosis.screening import (
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypothesis
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.refitting import refitted
+from psa_casadi.identification.refitting import refit, weighted
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, true_output
 from psa_casadi.records.split import Experiment
@@ -70,9 +70,11 @@ def free_functions(view: View, task: Task, base: Model, scale: Scale) -> list[Fr
         task.progress(f"a free function in {attached.port.words}")
         with suppress(PsaError):
             model = of.fit.model.with_effect(attached.component)
-            fit = refitted(
-                of.fit, experiments, model=model, evaluations=_EVALUATIONS, tolerance=1e-4
-            )
+            fit = refit(
+                replace(of.fit, model=model), weighted(of.fit, experiments),
+                [*of.fit.unknowns.names, *attached.component.fitted],
+                sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
+            )  # fmt: skip
             h = hypothesis((*of.causes, attached.component), fit, experiments)
             if h is not None:
                 gained = scale.evidence(h) - scale.evidence(of)
