@@ -26,9 +26,7 @@ from matplotlib.figure import Figure
 import psa_casadi as psa
 from psa_casadi.export.importer.fmu import FmuError
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.export.ssp.archive import wiring_of
-from psa_casadi.export.ssp.drawing import OUTSIDE
-from psa_casadi.export.ssp.steps import stable_step
+from psa_casadi.export.ssp import OUTSIDE, stable_step, wiring_of
 from psa_casadi.model.nanopositioner import positioner_plant
 from psa_casadi.report.words.phrases import number
 from tests.export.ssp_master import SspArchive, couple, points
