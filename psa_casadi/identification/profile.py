@@ -226,19 +226,17 @@ def _crossing(z: FloatArray, level: FloatArray) -> float | None:
     return float(z[last - 1] + (1.0 - inner) / (outer - inner) * (z[last] - z[last - 1]))
 
 
-def _spread(fit: Fit, experiments: Sequence[Experiment], name: str) -> tuple[float, float]:
+def _spread(best: Fit, experiments: Sequence[Experiment], name: str) -> tuple[float, float]:
     """Return a parameter's standard error, and its variance over that at white residuals."""
-    unknowns = fit.unknowns
+    unknowns = best.unknowns
     count = len(unknowns.names)
     gradient = np.zeros(unknowns.size)
-    gradient[:count] = unknowns.slopes(fit.theta)[unknowns.names.index(name)]
-    curvature = np.diag(1.0 / unknowns.prior**2)
-    variance, samples = 0.0, 0
-    for scaled, residuals in weighted_rows(fit, experiments):
-        curvature += scaled.T @ scaled
-        variance += float(np.sum(residuals**2))
-        samples += len(residuals)
-    white = float(gradient @ np.linalg.pinv(curvature, hermitian=True) @ gradient)
-    found = max(float(gradient @ covariance_of(fit, experiments) @ gradient), 1e-12 * white)
+    gradient[:count] = unknowns.slopes(best.theta)[unknowns.names.index(name)]
+    white, coloured = (
+        float(gradient @ covariance_of(best, experiments, white=w) @ gradient)
+        for w in (True, False)
+    )
+    found = max(coloured, 1e-12 * white)
     # a parameter that the prior holds has no ratio of its own: the residuals' variance stands in
-    return float(np.sqrt(found)), max(found / white, variance / samples)
+    rows = np.concatenate([residuals for _, residuals in weighted_rows(best, experiments)])
+    return float(np.sqrt(found)), max(found / white, float(np.mean(rows**2)))
