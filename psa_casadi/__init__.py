@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.importer.fmu_model import fmu_model
     from psa_casadi.export.importer.model_with_fmu import load_model
     from psa_casadi.export.modelica.package import export_modelica
-    from psa_casadi.export.ssp.archive import export_ssp
+    from psa_casadi.export.ssp import export_ssp
     from psa_casadi.faces import diagnose, identify
     from psa_casadi.identification.result import Identification
     from psa_casadi.identification.start.two_clocks import two_clocks
@@ -136,7 +136,7 @@ _HOMES = {
     "export.fixed_step.export": "CodeExport export_c",
     "export.fmu.archive": "export_fmu",
     "export.modelica.package": "export_modelica",
-    "export.ssp.archive": "export_ssp",
+    "export.ssp": "export_ssp",
     "export.importer.fmu_model": "fmu_model",
     "export.check.check": "CheckReport check_fmu",
     "errors": "InputError MachineError PsaError",
