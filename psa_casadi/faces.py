@@ -18,6 +18,7 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
+from psa_casadi.progress import on_a_terminal
 from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
@@ -58,6 +59,7 @@ def identify(
     hold: Hold | None = None,
     progress: Progress = ...,
 ) -> Identification: ...
+@on_a_terminal
 @_told_of(identify_ode)
 @wraps(stack.identify)
 def identify(*given: Any, **words: Any) -> Any:
@@ -95,6 +97,7 @@ def diagnose(
     effects: Sequence[Component] = ...,
     progress: Progress = ...,
 ) -> OdeDiagnosis: ...
+@on_a_terminal
 @_told_of(diagnose_ode)
 @wraps(diagnosis.diagnose)
 def diagnose(*given: Any, **words: Any) -> Any:

@@ -165,7 +165,7 @@ def test_an_oscillator_is_sampled_and_compared(
     (mu,) = names["drawn"].figures
     assert abs(mu.mean - 1.0) < 4.0 * mu.sd < 0.05
     page = Page((tmp_path / "both.html").read_text("utf-8"))
-    assert "Beyond noise, mu differs (1 parameters compared)." in page.text
+    assert "Beyond noise, mu differs (1 parameter compared)." in page.text
 
 
 @pytest.mark.slow

@@ -15,11 +15,12 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.diagnosis.noise import knowable, known_colour, noise_floor
 from psa_casadi.diagnosis.task import LIMITS
-from psa_casadi.records import multisine, sine, steps, triangle
+from psa_casadi.records import multisine, sine, triangle
 from psa_casadi.records.noise import last_place_of
 from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import noisy
 from tests.tiers import slow
+from tests.voltages import steps
 
 _SAMPLES, _RATE = 2000, 1000.0
 LINEAR = "0.1 um/V"

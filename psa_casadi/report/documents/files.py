@@ -553,7 +553,7 @@ def _finite(figure: float) -> float | None:
 
 
 _READ_ADVICE = "give a file that `psa diagnose --json` or `Diagnosis.to_json` wrote"
-_KINDS: dict[Any, type[DiagnosisFile | OwnModelFile]] = {
+DIAGNOSES: dict[Any, type[DiagnosisFile | OwnModelFile]] = {
     FORMAT: DiagnosisFile,
     ANY_MODEL: OwnModelFile,
 }
@@ -578,7 +578,7 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
 def diagnosis_in(content: Any, source: str) -> tuple[DiagnosisFile | OwnModelFile | None, Any]:
     """Return the diagnosis that a file's content is, None if it is none, and its format."""
     found = content.get("format") if isinstance(content, dict) else None
-    kind = _KINDS.get(found) if isinstance(found, str) else None
+    kind = DIAGNOSES.get(found) if isinstance(found, str) else None
     return None if kind is None else decode(kind, content, source), found
 
 

@@ -24,16 +24,18 @@ from psa_casadi.population.finding import (
     replayed,
 )
 from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
-from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.report.documents.files import (
+    DIAGNOSES,
     AnyDiagnosisFile,
     DeviceFile,
     DiagnosisFile,
     IdentificationFile,
+    OwnModelFile,
     damage,
     diagnosis_in,
     identification_file,
 )
+from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.strict_json import decode, read_json
 
 #: The file in a device's folder that says how its work ended.
@@ -96,8 +98,10 @@ def _read(
         path, source = Path(given.experiments[0].record.name), "identification"
         content = identification_file(given)
     elif isinstance(given, OdeDiagnosis):
-        path, source = Path(given.experiments[0].record.name), "diagnosis"
+        path = Path(given.experiments[0].record.name)
         content = given.to_dict()
+        finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))
+        return [(path, _with_model(finding, _model(given.model, traces)))]
     else:
         path = Path(given) / DEVICE_FILE if Path(given).is_dir() else Path(given)
         source = str(path)
@@ -121,16 +125,23 @@ def _read(
 def _diagnosis(d: AnyDiagnosisFile) -> Finding:
     b = d.budget
     shares = [] if b is None else [*b.causes, *([b.unnamed] if b.unnamed else [])]
-    errors = None
+    errors = []
     if isinstance(d, DiagnosisFile):
         base, extended = d.base_errors, d.extended_errors
-        errors = HeldOutErrors(
-            base.holdout_rms_m,
-            extended.holdout_rms_m,
-            d.noise_floor_rms_m,
-            base.holdout_nrmse_percent,
-            extended.holdout_nrmse_percent,
-        )
+        errors = [
+            HeldOutErrors(
+                base.holdout_rms_m,
+                extended.holdout_rms_m,
+                d.noise_floor_rms_m,
+                base.holdout_nrmse_percent,
+                extended.holdout_nrmse_percent,
+            )
+        ]
+    elif isinstance(d, OwnModelFile):
+        errors = [
+            HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
+            for e in d.errors
+        ]
     return Finding(
         device="",
         kind="diagnosis",
@@ -140,7 +151,7 @@ def _diagnosis(d: AnyDiagnosisFile) -> Finding:
         records=tuple((r.name, r.sha256) for r in d.records),
         verdict=d.verdict,
         doubt=d.doubt,
-        errors=errors,
+        errors=tuple(errors),
         causes=tuple(
             NamedCause(c.effect, c.confidence, c.explained_share, c.cannot_be_told_from)
             for c in d.causes
@@ -193,10 +204,7 @@ def _model(model: Model, traces: bool) -> Finding:
 
 
 def _joined(found: Sequence[_Read]) -> list[_Read]:
-    """Join every model to the first finding of the same records that has none yet.
-
-    That gets all that the model holds: all parameters, and the record that it carries.
-    """
+    """Join every model to the first finding of the same records that has none yet."""
     rows = dict(enumerate(found))
     full: set[int] = set()
     for k, (_, own) in enumerate(found):
@@ -209,14 +217,19 @@ def _joined(found: Sequence[_Read]) -> list[_Read]:
         if same:
             full.add(same[0])
             path, finding = rows[same[0]]
-            parameters = {**own.parameters}
-            for name, p in finding.parameters.items():
-                meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
-                parameters[name] = replace(p, meaning=meaning)
-            whole = replace(finding, parameters=parameters, trace=own.trace)
-            rows[same[0]] = path, replace(whole, force_scale=own.force_scale)
+            rows[same[0]] = path, _with_model(finding, own)
             del rows[k]
     return list(rows.values())
+
+
+def _with_model(finding: Finding, model: Finding) -> Finding:
+    """Return a finding with all that its model holds: all parameters, and the record it carries."""
+    parameters = {**model.parameters}
+    for name, p in finding.parameters.items():
+        meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
+        parameters[name] = replace(p, meaning=meaning)
+    whole = replace(finding, parameters=parameters, trace=model.trace)
+    return replace(whole, force_scale=model.force_scale)
 
 
 def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
@@ -249,8 +262,10 @@ def finding_content(found: Finding) -> dict[str, Any]:
     causes = "; ".join(" or ".join((c.effect, *c.or_else)) for c in found.causes)
     row: dict[str, Any] = {"verdict": found.verdict, "cause": causes}
     row["confidence"] = found.causes[0].confidence if found.causes else None
-    for name in ("base", "extended", "noise"):
-        row[f"{name}_rms [m]"] = getattr(found.errors, name, None)
+    for e in found.errors or (None,):
+        output, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
+        for name in ("base", "extended", "noise"):
+            row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = found.rms_m, found.rms_percent
     for name, p in found.parameters.items():
         if p.told and p.interval is not None:

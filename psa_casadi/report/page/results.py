@@ -83,8 +83,7 @@ def write_report(
     `origin`, "measured" or "synthetic", is what the page calls the records; `model_file` is where
     the extended model was written, which the commands of the page read. Unless it is to be
     `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
-    page is below 3 MB; where scripts are off it has one still picture. That of a model of one's
-    own holds no model that runs.
+    page is below 3 MB; where scripts are off it has one still picture.
 
     Raises InputError when `path` cannot be written to.
     """
@@ -103,8 +102,7 @@ def write_fit_report(
 
     It shows what the records determine, measured and model, and what the residual is.
     `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. Unless it is to be `still`, the model runs in the page; that of one's
-    own does not.
+    beside the determinacy. Unless it is to be `still`, the model runs in the page.
 
     Raises InputError when `path` cannot be written to.
     """
@@ -117,7 +115,7 @@ def write_fit_report(
             found=found,
             verdict=text.fit_sentence(found),
             tiles=(),
-            live=None,
+            live=None if still else live_fit(found, series),
             determined=(),
             profiles=(),
             starts=(),
@@ -144,7 +142,7 @@ def _page(
     d: OdeDiagnosis, stack: Diagnosis | None, origin: str, still: bool, model_file: str | None
 ) -> str:
     series, effects = series_of(d), {c.name: c for c in d.model.components}
-    live = live_diagnosis(stack, series) if stack and not still else None  # compiles meanwhile
+    live = None if still else live_diagnosis(d, series)  # compiles meanwhile
     gain = tables.error_table(d, series[0].residual_scale)
     by_record = len(d.experiments) > 1 and not stack
     about = f" of {plain(d.model.name)}" if not stack else ""

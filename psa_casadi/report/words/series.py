@@ -52,6 +52,11 @@ class Series:
     unit: str = ""
     against: str = "voltage [V]"
 
+    @property
+    def record(self) -> str:
+        """The name of the record, without that of the output in front."""
+        return self.name.removeprefix(f"{self.quantity} of ")
+
     def residual(self, curve: Curve) -> FloatArray:
         """Return measured minus predicted [m]."""
         return self.measured - curve.values
