@@ -12,6 +12,7 @@ from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
 from psa_casadi.diagnosis.judgement import NAMING, told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
+from psa_casadi.diagnosis.probes import laws_of, screened_with
 from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupted, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
@@ -327,8 +328,9 @@ def diagnose(
         experiments, tuple(table), STACK, method, progress, so_far.append, watch, hidden=hidden
     )
     try:
+        laws = laws_of(start, [e.record for e in experiments if e.stop], table)
         # from the end: the screening begins at the front
-        with compiled_ahead(start.with_effect(e) for e in reversed(table)):
+        with compiled_ahead(reversed(screened_with(start, table, laws))):
             found = _diagnose(start, task, scale_given)
         return replace(found, remarks=(*found.remarks, *said))
     except KeyboardInterrupt:
