@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
@@ -19,7 +21,7 @@ from psa_casadi.simulation.simulate import EXACT, STEPPER
 from tests.datasets.test_datasets_one_axis import N as PERIOD
 from tests.datasets.test_datasets_one_axis import driven, voltages
 from tests.studies.__main__ import app
-from tests.studies.benchmarks import changed, fits, floors, mirror, peers
+from tests.studies.benchmarks import changed, fits, floors, mirror, peers, sampling
 from tests.studies.benchmarks import diagnose as study
 from tests.studies.benchmarks import verification as paper
 from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
@@ -279,6 +281,41 @@ def test_a_settled_model_repeats_itself_and_has_no_mean() -> None:
     assert abs(np.mean(shown)) < 1e-6 * np.ptp(shown)
     assert np.ptp(shown) > 1e-7
     assert mirror.RATE == 6400.0
+
+
+# ---- sampling: the one equation that PyMC gets shows what the whole stack shows
+
+#: NumPy under the names of PyMC's symbols.
+NUMPY = SimpleNamespace(
+    floor=np.floor, mod=np.mod, eq=np.equal, lt=np.less, switch=np.where, sqrt=np.sqrt
+)
+
+
+def test_the_reduced_equation_shows_the_stack_at_other_values() -> None:
+    model = sampling.stack().with_values({"k_L": 7.9, "A": -1.5, "delta": -0.2, "n": 1.7})
+    v, given = model.values, sampling.record()
+    p = [v["A"], v["delta"], v["n"]]
+    found = solve_ivp(
+        lambda t, y: [sampling.hysteresis_rate(y[0], t, p, v, NUMPY)], (0.0, given.time[-1]),
+        [30.0], t_eval=given.time, method="LSODA", rtol=1e-9, atol=1e-6,
+        max_step=sampling.LEG / 20,
+    )  # fmt: skip
+    compliance = 1.0 / v["k_P"] + 1.0 / v["k_B"]
+    reduced = compliance * (v["k_L"] * given.voltage + found.y[0])
+    whole = psa.simulate(model, given.time, given.voltage, memory={"f_H": 30.0}, rtol=1e-9)
+    miss = reduced - whole.displacement
+    assert np.max(np.abs(miss - np.mean(miss))) < 1e-4 * np.ptp(whole.displacement)
+    assert np.ptp(found.y[0]) > 50.0  # it is the hysteresis that is compared
+
+
+def test_the_table_states_effective_samples_per_processor_time() -> None:
+    draws = np.random.default_rng(0).standard_normal((20000, 2))
+    fast, slow = (sampling.Drawn(n, draws, 8000.0, s) for n, s in (("a", 2.0), ("b", 500.0)))
+    told = sampling.speed([fast, slow])
+    assert "250 times" in told.note
+    for row, seconds in zip(told.table.rows, (2.0, 500.0), strict=True):
+        assert float(row[4]) == pytest.approx(20000, rel=0.1)
+        assert float(row[6]) == pytest.approx(float(row[4]) / seconds, rel=0.01)
 
 
 # ---- verification: what it judges was not fitted, its figures are what they say
