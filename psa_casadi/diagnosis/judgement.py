@@ -1,6 +1,6 @@
 """From what a search found to a diagnosis of any model: do the names stand, and what is left?"""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,7 @@ from psa_casadi.any_model.identify import MISSED, certainty, noise_left, noise_t
 from psa_casadi.any_model.runs import missed_rms
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
-from psa_casadi.diagnosis.free_functions import free_functions
+from psa_casadi.diagnosis.free_functions import fit_free_functions
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
@@ -29,7 +29,7 @@ from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.steps import Step, steps_of
-from psa_casadi.diagnosis.task import LIMITS, Thresholds
+from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment
@@ -80,37 +80,12 @@ class Weighed:
         return None
 
 
-def verdict_by(*, missing: bool, withdrawn: bool, ambiguous: bool, more: bool) -> Verdict:
-    """Return the verdict: is something `missing`, do no names stand, are there rivals, more left?
-
-    The first of these that is so decides.
-    """
-    if not missing:
-        return "adequate"
-    if withdrawn:
-        return "unexplained"
-    if ambiguous:
-        return "ambiguous"
-    return "partly_explained" if more else "cause_named"
-
-
 def told_from(step: Step, limits: Thresholds) -> tuple[str, ...]:
     """Effects that may as well be a step's cause: with the chosen one, the credible set."""
     if step.chosen is None:
         return ()
     within = credible_set(step.probability, limits.credible)
     return tuple(name for name in within if name != step.cause.name)
-
-
-def too_small(causes: Collection[Share], limits: Thresholds = LIMITS) -> tuple[Share, ...]:
-    """Return causes that are not named where structure remains: the form of the others is wrong.
-
-    Each removes less of the base's excess than a form may miss, and less than `enough` of what the
-    largest does: that one is always named.
-    """
-    most = max((c.share for c in causes), default=0.0)
-    least = min(limits.form, limits.enough * most if most > 0.0 else most)
-    return tuple(c for c in causes if c.share < least)
 
 
 class Judge:
@@ -228,17 +203,19 @@ class Judge:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """The verdict."""
-        if not self.driven:
-            return "not_driven"
+        """The verdict; the first of these that is so decides."""
         found = [s for s in self.steps if s.chosen is not None and s.cause.name not in self.vague]
         little = self.last.test.alarm and self.weighed.least[1] < self.limits.enough
-        return verdict_by(
-            missing=self.missing,
-            withdrawn=not self.stands or not found or little,
-            ambiguous=bool(found and told_from(found[0], self.limits)),
-            more=bool(self.vague) or not self.left(self.last).white,
-        )
+        if not self.driven:
+            return "not_driven"
+        if not self.missing:
+            return "adequate"
+        if not self.stands or not found or little:
+            return "unexplained"
+        if told_from(found[0], self.limits):
+            return "ambiguous"
+        more = self.vague or not self.left(self.last).white
+        return "partly_explained" if more else "cause_named"
 
     @cached_property
     def kept(self) -> tuple[Step, ...]:
@@ -273,10 +250,17 @@ class Judge:
 
     @cached_property
     def small(self) -> tuple[Share, ...]:
-        """Causes that remove too little to be named where structure remains."""
+        """Causes that are not named where structure remains: the form of the others is wrong.
+
+        Each removes less of the base's excess than a form may miss, and less than `enough` of what
+        the largest does: that one is always named.
+        """
         if not self.last.test.alarm or len(self.steps) < 2 or self.verdict not in NAMING:
             return ()
-        return too_small([c for c in self.budget.causes if c.what not in self.vague], self.limits)
+        shares = [c for c in self.budget.causes if c.what not in self.vague]
+        most = max((c.share for c in shares), default=0.0)
+        least = min(self.limits.form, self.limits.enough * most if most > 0.0 else most)
+        return tuple(c for c in shares if c.share < least)
 
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
@@ -421,7 +405,7 @@ class ModelJudge(Judge):
         if of.causes and not view.test.alarm:
             return ()
         scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
-        return free_functions(view, self.task, self.base, scale)
+        return fit_free_functions(view, self.task, self.base, scale)
 
     def unseen(self, step: Step) -> tuple[Note, float] | None:
         """Return which output's held-out samples are unlike the fitted ones."""

@@ -113,7 +113,7 @@ def write_fit_report(
         page = render(
             "fit.html",
             f"Identification of {plain(found.model.name)}",
-            **_shared(found.model, series, found.experiments, origin),
+            **_shared(found.model, series, found.experiments, origin, timed=True),
             found=found,
             verdict=text.fit_sentence(found),
             tiles=(),
@@ -280,7 +280,7 @@ def fit_page(
         return render(
             "fit.html",
             "Identification of a stack",
-            **_shared(found.model, series, found.experiments, origin, found),
+            **_shared(found.model, series, found.experiments, origin, found, timed=True),
             found=found,
             verdict=f"{error} {fit_words.determined_sentence(graded)}",
             tiles=tiles,
@@ -328,10 +328,13 @@ def _shared(
     given: Sequence[Experiment],
     origin: str,
     found: Identification | None = None,
+    *,
+    timed: bool = False,
 ) -> dict[str, Any]:
-    """Return what all four pages show: the record that is missed most, every record, parameters.
+    """Return what pages of results show: the record that is missed most, every record, parameters.
 
-    On the page of a fit, `found`, the former is only seen where no script runs.
+    The former is only seen where no script runs if all records are `timed` further below, as on
+    the page of a fit; `found` is that of a stack.
     """
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
@@ -355,7 +358,7 @@ def _shared(
             "picture": below,
         },
         "parts": [
-            _part(series[k], figures[k], origin, limit, found or series[k].name != worst.name)
+            _part(series[k], figures[k], origin, limit, timed or series[k].name != worst.name)
             for k in sorted(order[:MOST_RECORDS])
         ],
         "count": len(series),
