@@ -97,16 +97,14 @@ def diagnose(
                     own, records, held, fitting, reading, given, leave_out=left_out,
                     others={
                         "--patch": patch, "--next": next_, "--stack": stack,
-                        "--stiffness": stiffness, "--hysteresis": hysteresis, "--events": events,
-                        "--max-error": max_error,
+                        "--stiffness": stiffness, "--hysteresis": hysteresis,
                     },
                 )  # fmt: skip
             wanted = files.expected(given, expect, max_error)
             given.check()
         with working("diagnosing", given.quiet, DIAGNOSE) as progress, events_to(events) as watch:
             try:
-                d = run(progress=progress) if own else run(progress=progress, watch=watch)
-                d = files.noted(d, left_out)
+                d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = next_ or _beside(json or report)

@@ -143,9 +143,9 @@ def own_diagnosis(
     leave_out: Sequence[str],
     others: Mapping[str, object],
 ) -> Callable[..., psa.OdeDiagnosis]:
-    """Read the records of a model of one's own; return what diagnoses it, given `progress`.
+    """Read the records of a model of one's own; return what diagnoses it.
 
-    `others` are options that must be empty.
+    That takes `progress` and `watch`; `others` are options that must be empty.
     """
     own = given.of_any_model()
     _refuse(given, others)

@@ -30,6 +30,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment
@@ -372,6 +373,20 @@ class Judge:
         }
 
 
+def model_of(
+    base: Model,
+    fit: Fit,
+    effects: Sequence[Attached],
+    experiments: Sequence[Experiment],
+    *,
+    interrupted: bool = False,
+) -> Model:
+    """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
+    model = extended(base, effects)
+    values = {n: v for n, v in fit.model.values.items() if n in model.values}
+    return with_told(model.with_values(values), experiments, certainty(fit), interrupted)
+
+
 class ModelJudge(Judge):
     """The judge of any model: `base` as it was before the search, `table` effects at its ports."""
 
@@ -394,10 +409,8 @@ class ModelJudge(Judge):
     @cached_property
     def model(self) -> Model:
         """The extended model, open at the ports that it needs alone."""
-        model = extended(self.base, [self.table[s.cause.name] for s in self.kept])
-        values = self.final.fit.model.values
-        model = model.with_values({n: v for n, v in values.items() if n in model.values})
-        return with_told(model, self.experiments, certainty(self.final.fit))
+        attached = [self.table[s.cause.name] for s in self.kept]
+        return model_of(self.base, self.final.fit, attached, self.experiments)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Fit free functions beside a hypothesis; none beside causes that leave no structure."""

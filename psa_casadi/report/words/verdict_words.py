@@ -93,18 +93,25 @@ def _named(d: OdeDiagnosis) -> str:
     return f"The {are}: {gone}"
 
 
-def _base_errors(d: OdeDiagnosis) -> str:
-    """Say the base model's error in every output, over its range in all records.
+def of_range(d: OdeDiagnosis, *, extended: bool = False) -> dict[str, float]:
+    """Return a model's held-out error in every output, in % of its range in all records.
 
     That of a stack's displacement is each record's over its own range.
     """
     if isinstance(d, Diagnosis):
-        shares = {"displacement": d.base_errors.holdout_nrmse_percent}
-    else:
-        shares = {}
-        for k, e in enumerate(d.errors):
-            whole = np.concatenate([e.measured(k) for e in d.experiments])
-            shares[e.output] = 100.0 * e.base / float(np.nanmax(whole) - np.nanmin(whole))
+        errors = d.extended_errors if extended else d.base_errors
+        return {"displacement": errors.holdout_nrmse_percent}
+    shares = {}
+    for k, e in enumerate(d.errors):
+        whole = np.concatenate([e.measured(k) for e in d.experiments])
+        error = e.extended if extended else e.base
+        shares[e.output] = 100.0 * error / float(np.nanmax(whole) - np.nanmin(whole))
+    return shares
+
+
+def _base_errors(d: OdeDiagnosis) -> str:
+    """Say the base model's error in every output, over its range."""
+    shares = of_range(d)
     each = [f"{phrases.number(share, 2)} %" for share in shares.values()]
     if len(each) == 1:
         return f"the base model's held-out error is {each[0]} of the range"
