@@ -5,7 +5,6 @@ from functools import wraps
 from inspect import signature
 from typing import Any, overload
 
-from psa_casadi.any_model.identify import OdeIdentification, identify_ode
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import diagnose as diagnosis
 from psa_casadi.diagnosis.ode import diagnose_ode
@@ -13,7 +12,9 @@ from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.multistart import identify_ode
+from psa_casadi.identification.result import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
@@ -44,7 +45,7 @@ def identify(
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
     progress: Progress = ...,
-) -> Identification: ...
+) -> StackIdentification: ...
 @overload
 def identify(
     model: Model,
@@ -55,7 +56,7 @@ def identify(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
-) -> OdeIdentification: ...
+) -> Identification: ...
 @_told_of(identify_ode)
 @wraps(stack.identify)
 def identify(*given: Any, **words: Any) -> Any:

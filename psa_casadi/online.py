@@ -11,11 +11,15 @@ from psa_casadi.component import Component
 from psa_casadi.components import COMPONENTS
 from psa_casadi.components.online_identification import (
     ADAPTIVE_FEED_FORWARD,
+    COUNT,
     FEED_FORWARD,
     HYSTERESIS_OBSERVER,
     ONLINE_IDENTIFICATION,
+    TRACKED,
+    constants,
+    estimates,
+    variances,
 )
-from psa_casadi.components.online_recursion import COUNT, TRACKED, constants, estimates, variances
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.nanopositioner import nanopositioner
@@ -261,7 +265,7 @@ class OnlineIdentification(_Learning):
 
     A streaming object: one sample in, one out. `values` are the parameters of the component of the
     same name, for instance `identifier_for(model, period, noise=...).values`. See
-    `psa_casadi.components.online_recursion` for the equations and for what is done when the
+    `psa_casadi.components.online_identification` for the equations and for what is done when the
     voltage stands still.
     """
 

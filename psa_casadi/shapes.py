@@ -93,18 +93,17 @@ def stop_rates(
     return elements, dict(zip(names, rates, strict=True))
 
 
+def stop_state(name: str, description: str) -> State:
+    """Return the state of a stop element."""
+    return State(
+        name, "V", description, stop_scale, memory=True, settles=False, whole=voltage_scale
+    )
+
+
 def stop_states(prefix: str, thresholds: Sequence[str]) -> tuple[State, ...]:
     """Return the states of stop elements, whose thresholds are told in words."""
     return tuple(
-        State(
-            f"{prefix}{i}",
-            "V",
-            f"stop element {i}, threshold {threshold}",
-            stop_scale,
-            memory=True,
-            settles=False,
-            whole=voltage_scale,
-        )
+        stop_state(f"{prefix}{i}", f"stop element {i}, threshold {threshold}")
         for i, threshold in enumerate(thresholds, 1)
     )
 

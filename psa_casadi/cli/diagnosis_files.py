@@ -112,12 +112,11 @@ def with_next(
     except PsaError as error:
         reasons = (*before.reasons, f"No record could be designed: {error}")
         return replace(d, next_experiment=replace(before, reasons=reasons))
-    each = sentences(design, d.model.values.get("C_p"))
+    each = sentences(design)
     if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
         reasons = (*before.reasons, *each[:-1], *same)
         return replace(d, next_experiment=replace(before, reasons=reasons))
-    played = design.record
-    write_record(path, {"time [s]": played.time, "voltage [V]": played.voltage})
+    write_record(path, experiment.columns_to_play(design))
     reasons = (f"Apply {path} and diagnose all records together.", *each, *same)
     following = result.NextExperiment(str(path), design.names, reasons, dict(design.chance))
     return replace(d, next_experiment=following)

@@ -12,8 +12,8 @@ from typing import Any, Literal
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading
-from psa_casadi.cli.screen import show, tell, tell_written, working
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.cli.screen import show, tell_written, working
+from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.strict_json import json_text
 
@@ -114,9 +114,9 @@ def identified_own(
         return False
     from psa_casadi.report.documents.files import identification_file
 
-    _refuse(given, others)
+    given.refuse(others)
     given.outputs(files, list(records))
-    measured = _read(given, model, records, reading)
+    measured = given.signals(model, records, reading)
     given.check()
     with working("identifying", given.quiet):
         found = psa.identify(model, measured, **fitting.words)
@@ -148,80 +148,9 @@ def own_diagnosis(
     That takes `progress` and `watch`; `others` are options that must be empty.
     """
     own = given.of_any_model()
-    _refuse(given, others)
-    measured, held = (_read(given, model, part, reading) for part in (records, held_out))
+    given.refuse(others)
+    measured, held = (given.signals(model, part, reading) for part in (records, held_out))
     return partial(
         psa.diagnose, model, measured, holdout=held, leave_out=leave_out, effects=own,
         **fitting.words,
     )  # fmt: skip
-
-
-def simulated_own(
-    path: Path | None,
-    input_: Path,
-    output: Path,
-    reading: Reading,
-    given: Given,
-    *,
-    others: Mapping[str, object],
-) -> bool:
-    """Simulate a model of one's own from its start values, and write its inputs and outputs.
-
-    False where the path names none. `others` are options that must be empty.
-    """
-    model = None if path is None else _model(given, path)
-    if model is None:
-        return False
-    import numpy as np
-
-    from psa_casadi.any_model.runs import in_units
-    from psa_casadi.units import convert
-
-    _refuse(given, others)
-    given.outputs({"--output": output}, [path, input_])
-    record = next(iter(_read(given, model, [input_], reading)), None)
-    problems = Problems()
-    samples = record and in_units(model, record, problems)
-    for sentence in problems.sentences():
-        given.add(sentence)
-    given.check()
-    if samples is None:
-        return True
-    s, time = model.structure, samples.time
-    with working("simulating", given.quiet):
-        u = np.reshape([samples.columns[i.name] for i in s.inputs], (-1, samples.n)).T
-        x0 = np.array([q.start for q in s.states])
-        found = psa.run(model, time - time[0], u, x0, hold=samples.hold)
-        written = {"time [s]": time}
-        shown: list[psa.Input | psa.Output] = [*s.inputs, *s.outputs]
-        for variable, values in zip(shown, (*u.T, *found.y.T), strict=True):
-            unit = variable.display_unit or variable.unit
-            written[f"{variable.name} [{unit}]"] = convert(values, variable.unit, unit)
-        psa.write_record(output, written)
-    show("start: the start values of the model", given.quiet)
-    show(f"{samples.n} samples over {samples.duration:.6g} s", given.quiet)
-    show(f"columns: {', '.join(written)}", given.quiet)
-    tell_written(output, quiet=given.quiet)
-    return True
-
-
-def _refuse(given: Given, others: Mapping[str, object]) -> None:
-    """Refuse the options that a model of one's own does not take."""
-    for option in [name for name, value in others.items() if value]:
-        given.add(f"{option} is not there for a model of your own; leave it out.")
-
-
-def _read(
-    given: Given, model: psa.Model, paths: Sequence[Path], reading: Reading
-) -> tuple[psa.Signals, ...]:
-    if not paths:
-        return ()
-    found = given.attempt(
-        lambda: psa.read_signals(
-            paths, inputs=model.input_names, outputs=model.output_names,
-            columns=reading.columns, sample_time=reading.sample_time,
-        )
-    )  # fmt: skip
-    for note in [n for s in found or () for n in s.notes if not given.quiet]:
-        tell(f"Note: {note}")
-    return found or ()

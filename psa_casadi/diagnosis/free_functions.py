@@ -17,8 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached
-from psa_casadi.any_model.identify import refitted
-from psa_casadi.any_model.sizes import Sizes, sizes_of, states_of
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.diagnosis.corrections import FreeFunction
 from psa_casadi.diagnosis.pack import Task
@@ -32,9 +30,11 @@ from psa_casadi.diagnosis.screening import (
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypothesis
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.refitting import refitted
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, true_output
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.sizes import Sizes, sizes_of, states_of
 from psa_casadi.variables import Parameter
 
 FloatArray = npt.NDArray[np.float64]

@@ -22,10 +22,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.any_model.runs import counted
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, counted
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from psa_casadi.any_model.effects.attached import Attached, extended
-from psa_casadi.any_model.identify import MISSED, certainty, noise_left, noise_told, with_told
-from psa_casadi.any_model.runs import missed_rms
+from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
 from psa_casadi.diagnosis.free_functions import fit_free_functions
@@ -30,10 +29,12 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.result import MISSED, with_told
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, missed_rms
 from psa_casadi.simulation.timings import stage
 
 #: Verdicts that name causes.
@@ -384,7 +385,11 @@ def model_of(
     """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
     model = extended(base, effects)
     values = {n: v for n, v in fit.model.values.items() if n in model.values}
-    return with_told(model.with_values(values), experiments, certainty(fit), interrupted)
+    sure, given = determinacy(fit, experiments), [e.record for e in experiments]
+    return with_told(
+        model.with_values(values), given, sure.names, sure.intervals, force_scale="given",
+        interrupted=interrupted,
+    )  # fmt: skip
 
 
 class ModelJudge(Judge):

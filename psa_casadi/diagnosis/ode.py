@@ -7,17 +7,6 @@ from typing import Any
 
 from psa_casadi.any_model.effects.attached import Attached, of_ones_own
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.identify import (
-    free_of,
-    known_zeros,
-    refuse_unfit,
-    reweighted,
-    search_starts,
-    unlike,
-    with_noise,
-)
-from psa_casadi.any_model.runs import given_to, runs_of, told_of_columns
-from psa_casadi.any_model.sizes import sized, sizes_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.judgement import ModelJudge, model_of
 from psa_casadi.diagnosis.pack import Pack, Task
@@ -27,11 +16,20 @@ from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.rivals import fit_rivals
 from psa_casadi.diagnosis.task import Method, Tried
 from psa_casadi.errors import InputError
+from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.multistart import (
+    free_of,
+    known_zeros,
+    refuse_unfit,
+    search_starts,
+)
+from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.sizes import sized, sizes_of
 
 #: The steps of a search that are a stack's: they need its voltage, its loop or its resonances.
 _OF_STACKS = frozenset(
@@ -78,7 +76,7 @@ def diagnose_ode(
     none = isinstance(holdout, tuple | list) and not holdout
     held = [] if none else given_to(model, holdout, hold, len(given) + 1)
     shifted = known_zeros(model, zeros)
-    runs = runs_of(model, given, held, zeros=shifted, known_start=known_start)
+    runs = experiments_of(model, given, held, zeros=shifted, known_start=known_start)
     progress("fitting from several starts")
     base, runs, _ = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)
     if base.interrupted:

@@ -11,18 +11,14 @@ from psa_casadi.component import (
     Symbols,
 )
 from psa_casadi.effects.parameters import positive, share
-from psa_casadi.scales import reading_scale, stroke, stroke_scale
-from psa_casadi.variables import Input, Parameter, State, Values
+from psa_casadi.scales import reading_scale, stroke
+from psa_casadi.variables import Input, Parameter, State
 
 
 def _offset_drift(s: Symbols) -> Equations:
     """Offset drift: the sensor's zero moves with time alone."""
     bend = s.drift_bend * s.time / s.drift_span
     return Equations(add={"measured_displacement": s.drift_rate * s.time * (1 + bend)})
-
-
-def _drift_scale(p: Values) -> float:
-    return 1e-3 * stroke_scale(p)
 
 
 OFFSET_DRIFT = Component(
@@ -34,7 +30,13 @@ OFFSET_DRIFT = Component(
     equation_text="x_m gains drift_rate t (1 + drift_bend t / drift_span)",
     parameters=(
         Parameter(
-            "drift_rate", 0.0, "m/s", (-1e-3, 1e-3), "rate of the drift", "um/s", scale=_drift_scale
+            "drift_rate",
+            0.0,
+            "m/s",
+            (-1e-3, 1e-3),
+            "rate of the drift",
+            "um/s",
+            scale=reading_scale,
         ),
         share("drift_bend", (-3.0, 3.0), "change of the rate over drift_span", 0.3),
         Parameter(

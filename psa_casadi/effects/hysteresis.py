@@ -3,8 +3,7 @@
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
-from psa_casadi.effects.parameters import positive, share
-from psa_casadi.scales import stop_scale, voltage_scale
+from psa_casadi.effects.parameters import form, positive, share
 from psa_casadi.shapes import (
     direction,
     magnitude_power,
@@ -14,9 +13,10 @@ from psa_casadi.shapes import (
     spectrum_parameters,
     stop_rate,
     stop_rates,
+    stop_state,
     stop_states,
 )
-from psa_casadi.variables import Parameter, State, Values
+from psa_casadi.variables import Parameter, Values
 
 #: Force over voltage of the play elements, over k_L: loops of some 10 % of the stroke.
 _SHARE = 0.3
@@ -79,26 +79,9 @@ RATE_DEPENDENT_HYSTERESIS = Component(
         positive(
             "rate_threshold", 0.1, "1", (0.01, 1.0), "threshold of the elements over rated voltage"
         ),
-        Parameter(
-            "rate_by_threshold",
-            0.0,
-            "1",
-            (0.0, 1.0),
-            "0: the loop grows, 1: thresholds do",
-            fitted=False,
-        ),
+        form("rate_by_threshold", "0: the loop grows, 1: thresholds do"),
     ),
-    states=(
-        State(
-            "z_r",
-            "V",
-            "stop element of the thresholds that grow",
-            stop_scale,
-            memory=True,
-            settles=False,
-            whole=voltage_scale,
-        ),
-    ),
+    states=(stop_state("z_r", "stop element of the thresholds that grow"),),
     equations=_rate_dependent_hysteresis,
     probe={"rate_onset": (0.1, 3.0), "rate_by_threshold": (0.0, 1.0)},
     remedy=Remedy("undo_hysteresis", "slew"),

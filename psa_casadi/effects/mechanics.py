@@ -5,7 +5,7 @@ from functools import partial
 import casadi as ca
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Expression, Remedy, Symbols
-from psa_casadi.effects.parameters import positive, share
+from psa_casadi.effects.parameters import motion, positive, share
 from psa_casadi.scales import static_stiffness, stroke, stroke_scale, velocity_scale
 from psa_casadi.shapes import (
     ANGLES,
@@ -38,8 +38,17 @@ def _structural_mode(s: Symbols) -> Equations:
     )
 
 
-def _mode_rate_scale(p: Values) -> float:
-    return stroke_scale(p) * _TWO_PI * p["mode_frequency"]
+def _rate_scale(frequency: str, p: Values) -> float:
+    return stroke_scale(p) * _TWO_PI * p[frequency]
+
+
+def _mode(q: str, r: str, frequency: str, text: str) -> tuple[State, State]:
+    """Return displacement and velocity of a mode whose frequency is the parameter of a name."""
+    scale, speed = partial(_rate_scale, frequency), text.format("velocity")
+    return (
+        motion(q, text.format("displacement")),
+        State(r, "m/s", speed, scale, display_unit="um/s"),
+    )
 
 
 STRUCTURAL_MODE = Component(
@@ -58,10 +67,7 @@ STRUCTURAL_MODE = Component(
         Parameter("mode_lead", 0.0, "1", (-20.0, 20.0), "tangent of the phase lead", scale=1.0),
         Parameter("mode_damping", 0.02, "1", (1e-4, 0.7), "damping ratio", log=True),
     ),
-    states=(
-        State("q", "m", "modal displacement", stroke_scale, display_unit="um"),
-        State("r_q", "m/s", "modal velocity", _mode_rate_scale, display_unit="um/s"),
-    ),
+    states=_mode("q", "r_q", "mode_frequency", "modal {}"),
     equations=_structural_mode,
     probe={"mode_frequency": SPECTRAL_PEAKS, "mode_damping": (0.03,)},
     remedy=Remedy("avoid_resonance", "resonance"),
@@ -207,12 +213,10 @@ BACKLASH = Component(
         positive("backlash_width", 0.01, "1", (2e-4, 0.03), "half the gap over the stroke"),
     ),
     states=(
-        State(
+        motion(
             "z_b",
-            "m",
             "displacement within the gap, 0 in its middle",
             _stop_scale,
-            display_unit="um",
             memory=True,
             settles=False,
         ),
@@ -272,13 +276,7 @@ RECIPROCAL_COUPLING = Component(
         ),
     ),
     states=(
-        State(
-            "y_r",
-            "m",
-            "change of y from holding the output at zero, over the gain",
-            stroke_scale,
-            display_unit="um",
-        ),
+        motion("y_r", "change of y from holding the output at zero, over the gain"),
         State("v_r", "m/s", "its rate", velocity_scale, display_unit="um/s"),
     ),
     equations=_reciprocal_coupling,
@@ -318,24 +316,12 @@ def _compliance(s: Symbols) -> Expression:
         return 1.0 / s.k
 
 
-def _rate_scale(k: int, p: Values) -> float:
-    return stroke_scale(p) * _TWO_PI * p[f"series_frequency_{k}"]
-
-
 def _parameters(k: int) -> tuple[Parameter, ...]:
     return (
         share(f"series_share_{k}", (-1e3, 1e3), f"static share of mode {k}", 0.01, 0.01),
         share(f"series_ahead_{k}", (-1e3, 1e3), f"share of mode {k} a quarter period ahead", 0.01),
         positive(f"series_frequency_{k}", 1e3, "Hz", (1e-4, 1e6), f"natural frequency of mode {k}"),
         positive(f"series_damping_{k}", 0.02, "1", (1e-4, 0.7), f"damping ratio of mode {k}"),
-    )
-
-
-def _states(k: int) -> tuple[State, ...]:
-    rate = partial(_rate_scale, k)
-    return (
-        State(f"q_s{k}", "m", f"displacement of mode {k}", stroke_scale, display_unit="um"),
-        State(f"r_s{k}", "m/s", f"velocity of mode {k}", rate, display_unit="um/s"),
     )
 
 
@@ -354,7 +340,11 @@ def modal_series(count: int) -> Component:
             "  x_rest: displacement that the wafers' force has at rest"
         ),
         parameters=(gain, *(p for k in numbers for p in _parameters(k))),
-        states=tuple(s for k in numbers for s in _states(k)),
+        states=tuple(
+            s
+            for k in numbers
+            for s in _mode(f"q_s{k}", f"r_s{k}", f"series_frequency_{k}", f"{{}} of mode {k}")
+        ),
         equations=partial(_modal_series, count),
         remedy=Remedy("avoid_resonance", "resonance"),
         looks_like="the residual rings at several tones that are no poles of the stack",

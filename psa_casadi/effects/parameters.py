@@ -1,6 +1,9 @@
-"""Parameters that effects have alike: 0 where nothing is, or over decades."""
+"""Parameters and states that effects have alike."""
 
-from psa_casadi.variables import Nominal, Parameter
+from typing import Any
+
+from psa_casadi.scales import stroke_scale
+from psa_casadi.variables import Nominal, Parameter, State
 
 
 def share(
@@ -21,3 +24,13 @@ def positive(
 ) -> Parameter:
     """Return a parameter that spans decades; `limit` as in `Parameter`."""
     return Parameter(name, value, unit, bounds, description, log=True, limit=limit)
+
+
+def form(name: str, description: str) -> Parameter:
+    """Return what chooses between two forms, 0 and 1; it is tried and not fitted."""
+    return Parameter(name, 0.0, "1", (0.0, 1.0), description, fitted=False)
+
+
+def motion(name: str, description: str, scale: Nominal = stroke_scale, **more: Any) -> State:
+    """Return a displacement as a state; `more` as in `State`."""
+    return State(name, "m", description, scale, display_unit="um", **more)

@@ -5,20 +5,21 @@ and writes it on request. What it stands for is not known, so that nothing may b
 parameters; outside of the range of its records it means nothing.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.scales import reading_scale, static_stiffness, stroke_scale, voltage_scale
 from psa_casadi.shapes import stop_rate, stop_rates
-from psa_casadi.variables import Parameter, State, Values
+from psa_casadi.variables import Nominal, Parameter, State
 
 #: Terms of a curve and of one for each direction or over time; play and stop elements; relaxations.
 CURVE, BRANCH, ELEMENTS, RELAXATIONS = 24, 8, 10, 16
 #: Share of the voltage's range over which a branch changes to the other one.
 NARROW = 0.01
 GAIN = "patch_gain"
+_Equations = Callable[[Symbols], Equations]
 _SOURCE = "a form without a name, fitted to records: Prandtl-Ishlinskii elements, cosines, lags"
 
 
@@ -45,20 +46,21 @@ def _place(s: Symbols, value: Expression) -> Expression:
     return (value - s.patch_low) / (s.patch_high - s.patch_low)
 
 
-def _at_reading(s: Symbols) -> Equations:
-    curve = _cosines(s, _place(s, s.displacement), 1, CURVE)
-    return Equations(add={"measured_displacement": curve})
+def _curve(s: Symbols, value: Expression) -> Expression:
+    return _cosines(s, _place(s, value), 1, CURVE)
 
 
-def _at_voltage(s: Symbols) -> Equations:
-    curve = _cosines(s, _place(s, s.u), 1, CURVE)
-    return Equations(add={"free_force": static_stiffness(s) * curve})
+def _course(s: Symbols) -> Expression:
+    return _cosines(s, s.time / s.patch_time, 1, BRANCH)
 
 
-def _at_force(s: Symbols) -> Equations:
-    moved = (s.k_L * s.u + s.f_H) / static_stiffness(s)
-    curve = _cosines(s, _place(s, moved), 1, CURVE)
-    return Equations(add={"free_force": static_stiffness(s) * curve})
+def _moved(s: Symbols) -> Expression:
+    return (s.k_L * s.u + s.f_H) / static_stiffness(s)
+
+
+def _adding(balance: str, term: Callable[[Symbols], Expression]) -> _Equations:
+    """Return the equations that add one term to a balance."""
+    return lambda s: Equations(add={balance: term(s)})
 
 
 def _direction(s: Symbols) -> Equations:
@@ -95,16 +97,6 @@ def _relaxation(s: Symbols) -> Equations:
     )
 
 
-def _in_time(s: Symbols) -> Equations:
-    curve = _cosines(s, s.time / s.patch_time, 1, BRANCH)
-    return Equations(add={"measured_displacement": curve})
-
-
-def _gain_in_time(s: Symbols) -> Equations:
-    curve = _cosines(s, s.time / s.patch_time, 1, BRANCH)
-    return Equations(add={"displacement": _place(s, s.tip_displacement) * curve})
-
-
 def _parameters(count: int, unit: str = "") -> tuple[Parameter, ...]:
     gain = Parameter(GAIN, 0.0, "1", (0.0, 1.0), "1 with the correction, 0 without", fitted=False)
     weights = [
@@ -132,11 +124,10 @@ _RATIO = Parameter(
 )
 
 
-def _states(
-    count: int, unit: str, scale: Callable[[Values], float], *, settles: bool
-) -> tuple[State, ...]:
+def _states(count: int, unit: str, scale: Nominal) -> tuple[State, ...]:
+    """Return memories; those of a voltage rest at any value."""
     return tuple(
-        State(f"z_p{k + 1}", unit, f"element {k + 1}", scale, memory=True, settles=settles)
+        State(f"z_p{k + 1}", unit, f"element {k + 1}", scale, memory=True, settles=unit != "V")
         for k in range(count)
     )
 
@@ -144,58 +135,43 @@ def _states(
 def _patch(
     kind: str,
     port: str,
-    equations: Callable[[Symbols], Equations],
-    parameters: Sequence[Parameter],
+    equations: _Equations,
+    parameters: tuple[Parameter, ...],
     states: tuple[State, ...] = (),
-) -> Component:
-    return Component(
+) -> tuple[tuple[str, str], Component]:
+    component = Component(
         name=f"patch_{kind}_{port}".replace(" ", "_"),
         description=f"unnamed correction: {kind} at the {port}",
         source=_SOURCE,
         gain=GAIN,
-        parameters=tuple(parameters),
+        parameters=parameters,
         states=states,
         equations=equations,
         belongs_to="sensor" if port == "reading" else "plant",
         looks_like="what no effect of the table describes",
     )
+    return (kind, port), component
 
 
+_LAGS = (*_parameters(RELAXATIONS, "m"), _time("patch_time", "first time constant"), _RATIO)
+_PLAYS = _states(ELEMENTS, "V", voltage_scale)
+_BEHIND = _states(RELAXATIONS, "m", stroke_scale)
+_DURATION = _time("patch_time", "duration")
+_ON_READING = _adding("measured_displacement", lambda s: _curve(s, s.displacement))
+_ON_VOLTAGE = _adding("free_force", lambda s: static_stiffness(s) * _curve(s, s.u))
+_ON_FORCE = _adding("free_force", lambda s: static_stiffness(s) * _curve(s, _moved(s)))
+_IN_TIME = _adding("measured_displacement", _course)
+_GAIN_IN_TIME = _adding("displacement", lambda s: _place(s, s.tip_displacement) * _course(s))
 #: The corrections by kind and port.
-PATCHES: Mapping[tuple[str, str], Component] = {
-    ("curve", "reading"): _patch("curve", "reading", _at_reading, _parameters(CURVE, "m")),
-    ("curve", "drive voltage"): _patch(
-        "curve", "drive voltage", _at_voltage, _parameters(CURVE, "V")
-    ),
-    ("curve", "force"): _patch("curve", "force", _at_force, _parameters(CURVE, "m")),
-    ("direction", "force"): _patch(
-        "direction",
-        "force",
-        _direction,
-        _parameters(BRANCH, "V"),
-        _states(1, "V", voltage_scale, settles=False),
-    ),
-    ("memory", "force"): _patch(
-        "memory",
-        "force",
-        _memory,
-        _parameters(3 * ELEMENTS, "V"),
-        _states(ELEMENTS, "V", voltage_scale, settles=False),
-    ),
-    ("relaxation", "force"): _patch(
-        "relaxation",
-        "force",
-        _relaxation,
-        (*_parameters(RELAXATIONS, "m"), _time("patch_time", "first time constant"), _RATIO),
-        _states(RELAXATIONS, "m", stroke_scale, settles=True),
-    ),
-    ("time", "reading"): _patch(
-        "time", "reading", _in_time, (*_parameters(BRANCH), _time("patch_time", "duration"))
-    ),
-    ("gain in time", "force"): _patch(
-        "gain in time",
-        "force",
-        _gain_in_time,
-        (*_parameters(BRANCH, "m"), _time("patch_time", "duration")),
-    ),
-}
+PATCHES: Mapping[tuple[str, str], Component] = dict(
+    (
+        _patch("curve", "reading", _ON_READING, _parameters(CURVE, "m")),
+        _patch("curve", "drive voltage", _ON_VOLTAGE, _parameters(CURVE, "V")),
+        _patch("curve", "force", _ON_FORCE, _parameters(CURVE, "m")),
+        _patch("direction", "force", _direction, _parameters(BRANCH, "V"), _PLAYS[:1]),
+        _patch("memory", "force", _memory, _parameters(3 * ELEMENTS, "V"), _PLAYS),
+        _patch("relaxation", "force", _relaxation, _LAGS, _BEHIND),
+        _patch("time", "reading", _IN_TIME, (*_parameters(BRANCH), _DURATION)),
+        _patch("gain in time", "force", _GAIN_IN_TIME, (*_parameters(BRANCH, "m"), _DURATION)),
+    )
+)

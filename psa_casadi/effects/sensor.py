@@ -13,7 +13,7 @@ from psa_casadi.component import (
     Remedy,
     Symbols,
 )
-from psa_casadi.effects.parameters import positive, share
+from psa_casadi.effects.parameters import motion, positive, share
 from psa_casadi.scales import reading_scale, stroke, stroke_scale
 from psa_casadi.shapes import ANGLES, BEND_TEXT, bend, pade_section, shape_parameters
 from psa_casadi.variables import Parameter, State, Values
@@ -35,20 +35,8 @@ def _sensor_delay(s: Symbols) -> Equations:
 
 def _states(index: int) -> tuple[State, State]:
     return (
-        State(
-            f"z_d{index}",
-            "m",
-            f"filtered input of section {index}",
-            stroke_scale,
-            display_unit="um",
-        ),
-        State(
-            f"r_d{index}",
-            "m",
-            "its rate times the section's delay",
-            stroke_scale,
-            display_unit="um",
-        ),
+        motion(f"z_d{index}", f"filtered input of section {index}"),
+        motion(f"r_d{index}", "its rate times the section's delay"),
     )
 
 
@@ -100,15 +88,7 @@ SENSOR_LAG = Component(
             "sensor_lag_time", 0.0, "s", (0.0, 0.1), "time constant of the sensor", "ms", scale=1e-4
         ),
     ),
-    states=(
-        State(
-            "sensor_lag_displacement",
-            "m",
-            "displacement behind the lag",
-            stroke_scale,
-            display_unit="um",
-        ),
-    ),
+    states=(motion("sensor_lag_displacement", "displacement behind the lag"),),
     equations=_sensor_lag,
     remedy=Remedy("faster_sensor", "slew"),
     looks_like="phase of a first-order lag, which saturates at 90 degrees, and roll-off with it",

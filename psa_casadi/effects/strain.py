@@ -3,8 +3,7 @@
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
-from psa_casadi.effects.parameters import positive, share
-from psa_casadi.scales import stroke_scale
+from psa_casadi.effects.parameters import form, motion, positive, share
 from psa_casadi.shapes import magnitude_power, rate_magnitude, smooth_magnitude
 from psa_casadi.variables import Parameter, State, Values
 
@@ -15,24 +14,12 @@ _CREEP_RATIOS = (1.0, 10.0, 100.0)
 def _slow_creep(s: Symbols) -> Equations:
     """Slow creep: displacement that keeps growing for seconds to hours at constant voltage."""
     relaxed = [s.z_c1, s.z_c2, s.z_c3]
-    names = ("z_c1", "z_c2", "z_c3")
     return Equations(
         der={
-            name: (s.tip_displacement - z) / (s.creep_time * ratio)
-            for name, z, ratio in zip(names, relaxed, _CREEP_RATIOS, strict=True)
+            f"z_c{k}": (s.tip_displacement - relaxed[k - 1]) / (s.creep_time * ratio)
+            for k, ratio in enumerate(_CREEP_RATIOS, 1)
         },
         add={"displacement": s.creep_gain * sum(relaxed)},
-    )
-
-
-def _state(index: int) -> State:
-    return State(
-        f"z_c{index}",
-        "m",
-        f"elongation relaxed with time constant {_CREEP_RATIOS[index - 1]:g} creep_time",
-        stroke_scale,
-        display_unit="um",
-        memory=True,
     )
 
 
@@ -46,7 +33,12 @@ SLOW_CREEP = Component(
         share("creep_gain", (0.0, 0.5), "creep per decade of time over elongation", 0.01),
         positive("creep_time", 0.1, "s", (1e-3, 1e4), "fastest time constant of the creep"),
     ),
-    states=(_state(1), _state(2), _state(3)),
+    states=tuple(
+        motion(
+            f"z_c{k}", f"elongation relaxed with time constant {ratio:g} creep_time", memory=True
+        )
+        for k, ratio in enumerate(_CREEP_RATIOS, 1)
+    ),
     equations=_slow_creep,
     probe={"creep_time": (0.03, 0.3, 3.0)},
     remedy=Remedy("wait_or_feed_forward", "hold"),
@@ -87,10 +79,6 @@ FIELD_DEPENDENT_GAIN = Component(
 )
 
 
-#: Width of the smooth magnitude, over rated voltage.
-_WIDTH = 1e-3
-
-
 def _field_dependent_capacitance(s: Symbols) -> Equations:
     """Field-dependent capacitance: the stack takes more charge per volt at high voltage.
 
@@ -98,7 +86,7 @@ def _field_dependent_capacitance(s: Symbols) -> Equations:
     displacement shows no more of it than a drive whose lag grows with the voltage, so that it is
     looked for where a charge or a current was measured.
     """
-    share = smooth_magnitude(s.u, _WIDTH * s.u_rated) / s.u_rated
+    share = smooth_magnitude(s.u, _REVERSAL_WIDTH * s.u_rated) / s.u_rated
     grown = s.capacitance_gain * share
     return Equations(
         add={
@@ -250,9 +238,7 @@ AGEING = Component(
     parameters=(
         share("ageing_gain", (0.0, 0.3), "share of the gain lost per decade", 0.01),
         positive("ageing_time", 1.0, "s", (1e-3, 1e7), "age at time 0 of the record's clock"),
-        Parameter(
-            "ageing_by_travel", 0.0, "1", (0.0, 1.0), "0: time ages, 1: cycles do", fitted=False
-        ),
+        form("ageing_by_travel", "0: time ages, 1: cycles do"),
     ),
     states=(
         State("travel", "s", "cycles at rated voltage, 1 s each", 1.0, memory=True, settles=False),

@@ -10,6 +10,7 @@ voltage, so that a slow amplifier counts as creep and mechanics.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.identify import Identification, with_provenance
+from psa_casadi.identification.identify import StackIdentification, with_provenance
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
@@ -49,14 +50,13 @@ class Step:
     """The normalised response to one jump of the voltage that is then held.
 
     `time` (n,) [s] begins at 0 in the middle of the jump, `g` (n,) is (x - x_0)/(x_s - x_0),
-    `volts` the height of the jump [V], `rise` its duration [s], `k` = (x_s - x_0)/volts [m/V].
+    `volts` the height of the jump [V], `k` = (x_s - x_0)/volts [m/V].
     """
 
     name: str
     time: FloatArray
     g: FloatArray
     volts: float
-    rise: float
     k: float
 
 
@@ -118,7 +118,7 @@ def _step_of(record: Record) -> Step | None:
         return None
     g = np.concatenate([[0.0], (x[after] - x_0) / (x_s - x_0)])
     time = np.concatenate([[0.0], t[after] - middle])
-    return Step(record.name, time, g, volts, rise, (x_s - x_0) / volts)
+    return Step(record.name, time, g, volts, (x_s - x_0) / volts)
 
 
 def _loop_of(record: Record) -> Loop | None:
@@ -161,31 +161,24 @@ _STEADY = 0.05
 _OVERSHOOT = 0.01
 
 
-@dataclass(frozen=True, eq=False)
-class LinearPart:
-    """Coefficients of eq. (15) [s to s^5, then s] and what is doubtful about them."""
+def linear_part(step: Step) -> tuple[dict[str, float], list[Note]]:
+    """Return a_1..a_5 [s to s^5], b_1 [s], eq. (15), of one step response, and their doubts.
 
-    coefficients: Mapping[str, float]
-    notes: tuple[Note, ...]
-
-
-def linear_part(step: Step) -> LinearPart:
-    """Return a_1..a_5, b_1 by the iterated integrals of one step response, and their doubts."""
+    They are found by its iterated integrals.
+    """
     found = moment_coefficients(step.time, step.g)
     kept = step.time <= (1.0 - _CUT) * step.time[-1]
     other = moment_coefficients(step.time[kept], step.g[kept])
     change = np.abs(other - found) / np.maximum(np.abs(found), 1e-300)
-    worst = int(np.argmax(change))
-    notes = []
+    worst, notes = int(np.argmax(change)), []
     if change[worst] > _STEADY:
         reasons, name = _reasons(step) or [("short", 0.0)], COEFFICIENTS[worst]
         notes.append(
             note("window", name=step.name, coefficient=name, change=change[worst], reasons=reasons)
         )
     wrong = [name for name, value in zip(COEFFICIENTS, found, strict=True) if not value > 0.0]
-    if wrong:
-        notes.append(note("signs", names=wrong))
-    return LinearPart(dict(zip(COEFFICIENTS, found.tolist(), strict=True)), tuple(notes))
+    notes += [note("signs", names=wrong)] if wrong else []
+    return dict(zip(COEFFICIENTS, found.tolist(), strict=True)), notes
 
 
 def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
@@ -318,30 +311,29 @@ _QUIET, _LONGEST = 2e-3, 0.1
 _TOO_MUCH = 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class Rates:
-    """A loop, smoothed: u [V], u' [V/s], h = x - k u [m], x' [m/s], all (n,).
+class Rates(NamedTuple):
+    """A loop, smoothed: u [V], u' [V/s], h = x - k u [m], h' [m/s], all (n,).
 
-    `inner` marks samples whose window holds no turn and no end; `branches` are its runs, slices of
-    samples on which the voltage goes one way.
+    `branches` are slices of samples on which the voltage goes one way and whose windows hold no
+    turn and no end; each with 1 where the voltage rises, else -1.
     """
 
-    name: str
-    k: float
     u: FloatArray
     u_rate: FloatArray
     h: FloatArray
-    x_rate: FloatArray
-    inner: BoolArray
-    branches: tuple[slice, ...]
-    notes: tuple[Note, ...]
+    h_rate: FloatArray
+    branches: list[tuple[float, slice]]
 
-    def sign(self, branch: slice) -> float:
-        """Return 1 on a branch on which the voltage rises, else -1."""
-        return float(np.sign(np.mean(self.u_rate[branch])))
+    @property
+    def inner(self) -> BoolArray:
+        """Marks the samples on branches (n,)."""
+        marked = np.zeros(len(self.u), dtype=np.bool_)
+        for _, branch in self.branches:
+            marked[branch] = True
+        return marked
 
 
-def rates_of(loop: Loop, k: float) -> Rates:
+def rates_of(loop: Loop, k: float) -> tuple[Rates, list[Note]]:
     """Differentiate a loop by Savitzky and Golay's filter of third order.
 
     The window is the shortest odd one with s |c| <= 0.002 * 2 f range(x), where s is the white
@@ -359,30 +351,22 @@ def rates_of(loop: Loop, k: float) -> Rates:
         if excess <= 1.0 or window >= longest:
             break
         window = min(longest, max(window + 2, int(1.2 * window) // 2 * 2 + 1))
-    u, u_rate, x, x_rate = (
-        np.asarray(
-            scipy.signal.savgol_filter(
-                values, window, _ORDER, deriv=derivative, delta=loop.sample_time
-            ),
-            dtype=np.float64,
-        )
-        for values in (loop.voltage, loop.displacement)
-        for derivative in (0, 1)
+    smooth = partial(scipy.signal.savgol_filter, window_length=window, polyorder=_ORDER)
+    u, u_rate, h, h_rate = (
+        np.asarray(smooth(values, deriv=order, delta=loop.sample_time), dtype=np.float64)
+        for values in (loop.voltage, loop.displacement - k * loop.voltage)
+        for order in (0, 1)
     )
     margin = window // 2 + 1
-    branches = tuple(
+    branches = [
         slice(first + margin, last - margin + 1)
         for first, last in pairwise([0, *loop.turns.tolist(), len(u) - 1])
         if last - first > 2 * margin + 2
-    )
-    inner = np.zeros(len(u), dtype=np.bool_)
-    for branch in branches:
-        inner[branch] = True
-    notes = (note("rough_velocity", loop=loop.name, share=100.0 * _QUIET * excess),)
-    return Rates(
-        loop.name, k, u, u_rate, x - k * u, x_rate, inner, branches,
-        notes if excess > _TOO_MUCH else (),
-    )  # fmt: skip
+    ]
+    signs = [float(np.sign(np.mean(u_rate[branch]))) for branch in branches]
+    rough = note("rough_velocity", loop=loop.name, share=100.0 * _QUIET * excess)
+    found = Rates(u, u_rate, h, h_rate, list(zip(signs, branches, strict=True)))
+    return found, [rough] if excess > _TOO_MUCH else []
 
 
 #: Samples count in (31), (34) where h and |u'| exceed this share of their largest values.
@@ -416,14 +400,6 @@ class HysteresisPart:
     notes: tuple[Note, ...] = ()
 
 
-class Crossing(NamedTuple):
-    """Voltage [V], u' [V/s] and x' [m/s] where x = k u on one branch."""
-
-    u: float
-    u_rate: float
-    x_rate: float
-
-
 class _Line(NamedTuple):
     """Slope and factor of sign e^intercept h^slope, and the share of samples of the other sign."""
 
@@ -440,24 +416,26 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
     (34) takes the logarithm of (gamma - beta) h^n. A loop that lags has beta > gamma; then the
     logarithm of (beta - gamma) h^n is taken, which says the same, and a sentence tells it.
     """
-    rates = [rates_of(loop, k) for loop in loops]
-    notes = [note for r in rates for note in r.notes]
-    crossed = [[(r.sign(b), _crossing(r, b)) for b in r.branches] for r in rates]
+    differentiated = [rates_of(loop, k) for loop in loops]
+    rates = [r for r, _ in differentiated]
+    notes = [note for _, own in differentiated for note in own]
+    crossed = [[(sign, _crossing(r, b)) for sign, b in r.branches] for r in rates]
     pairs = [pair for own in crossed for pair in _periods(own)]
     if not pairs:
         seen = {sign for own in crossed for sign, at in own if at is not None}
         missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in seen]
         return HysteresisPart(notes=(*notes, note("no_crossing", branches=missing)))
-    each = np.array([_slope_and_asymmetry(up, down, k) for up, down in pairs])
+    # eq. (29) less k u': h'_+ = A_i u'_+ + delta_i u_+,  h'_- = A_i u'_- - delta_i u_-
+    each = np.array([_solved(up, down) for up, down in pairs])
     A, delta = (float(v) for v in each.mean(axis=0))
     scatter = float(np.std(each[:, 0]) / max(abs(float(np.mean(each[:, 0]))), 1e-300))
     if scatter > _SCATTER:
         notes.append(note("scatter", share=100.0 * scatter))
-    widest = max(rates, key=lambda r: float(np.ptp(r.u)))
+    loop, widest = max(zip(loops, rates, strict=True), key=lambda pair: float(np.ptp(pair[1].u)))
     top = int(np.argmax(np.abs(widest.u)))
     share = abs(float(widest.h[top])) / float(np.max(np.abs(widest.h)))
     if share < _CLOSED:  # the loop closes on the line x = k u
-        notes.append(note("secant", loop=widest.name, share=100.0 * share))
+        notes.append(note("secant", loop=loop.name, share=100.0 * share))
     rising, falling = (_logarithms(rates, A, delta, sign) for sign in (1.0, -1.0))
     notes += _lost(rising, "rising", "beta + gamma") + _lost(falling, "falling", "gamma - beta")
     if rising is None or falling is None:
@@ -473,8 +451,8 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
 
 
 def _periods(
-    branches: Sequence[tuple[float, Crossing | None]],
-) -> list[tuple[Crossing, Crossing]]:
+    branches: Sequence[tuple[float, FloatArray | None]],
+) -> list[tuple[FloatArray, FloatArray]]:
     """Return each crossing of x = k u on a rising branch with that of the next falling branch.
 
     Where no rising branch with a crossing is followed by such a falling one, a falling branch is
@@ -489,20 +467,17 @@ def _periods(
     return up_first or [(then, first) for _, first, then in pairs]
 
 
-def _slope_and_asymmetry(up: Crossing, down: Crossing, k: float) -> tuple[float, float]:
-    """Return A_i [m/V] and delta_i [m/(V.s)] of one period, eq. (29).
-
-    x'_+ = (A_i + k) u'_+ + delta_i u_+,  x'_- = (A_i + k) u'_- - delta_i u_-.
-    """
-    below = up.u_rate * down.u + down.u_rate * up.u
+def _solved(up: FloatArray, down: FloatArray) -> tuple[float, float]:
+    """Return A_i [m/V] and delta_i [m/(V.s)] of two crossings (u, u', h'), eq. (29)."""
+    below = up[1] * down[0] + down[1] * up[0]
     if below == 0.0:
-        return (up.x_rate + down.x_rate) / (up.u_rate + down.u_rate) - k, 0.0
-    slope = (up.x_rate * down.u + down.x_rate * up.u) / below
-    return slope - k, (up.x_rate * down.u_rate - down.x_rate * up.u_rate) / below
+        return (up[2] + down[2]) / (up[1] + down[1]), 0.0
+    slope = (up[2] * down[0] + down[2] * up[0]) / below
+    return slope, (up[2] * down[1] - down[2] * up[1]) / below
 
 
-def _crossing(r: Rates, branch: slice) -> Crossing | None:
-    """Return the middle one of the crossings on a branch, linear between samples, or None.
+def _crossing(r: Rates, branch: slice) -> FloatArray | None:
+    """Return u, u', h' (3,) at the middle crossing of x = k u, linear between samples, or None.
 
     Near 0 V none counts: there h is 0 at rest, on either side of the line by noise alone.
     """
@@ -514,8 +489,8 @@ def _crossing(r: Rates, branch: slice) -> Crossing | None:
     j = int(where[where.size // 2])
     jump = float(h[j] - h[j + 1])
     share = float(h[j]) / jump if jump else 0.5
-    pairs = [values[branch][j : j + 2] for values in (r.u, r.u_rate, r.x_rate)]
-    return Crossing(*(float(first + share * (then - first)) for first, then in pairs))
+    pairs = np.array([values[branch][j : j + 2] for values in (r.u, r.u_rate, r.h_rate)])
+    return np.asarray(pairs[:, 0] + share * (pairs[:, 1] - pairs[:, 0]))
 
 
 def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> _Line | None:
@@ -530,8 +505,7 @@ def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> 
         part: BoolArray = r.inner & (r.h > _CLEAR * largest)
         part &= sign * r.u_rate > _CLEAR * float(np.max(np.abs(r.u_rate)))
         h.append(r.h[part])
-        h_rate = r.x_rate[part] - r.k * r.u_rate[part]
-        argument.append(A - (h_rate - sign * delta * r.u[part]) / r.u_rate[part])
+        argument.append(A - (r.h_rate[part] - sign * delta * r.u[part]) / r.u_rate[part])
     bend, log_h = np.concatenate(argument), np.log(np.concatenate(h))
     common = 1.0 if np.count_nonzero(bend > 0.0) >= 0.5 * bend.size else -1.0
     good = common * bend > 0.0
@@ -557,18 +531,19 @@ def _lost(line: _Line | None, branch: str, what: str) -> list[Note]:
 _SLOW, _QUASI_STATIC = 1.0, 0.01
 
 
-def conditions(step: Step | None, loops: Sequence[Loop], linear: LinearPart | None) -> list[Note]:
+def conditions(
+    step: Step | None, loops: Sequence[Loop], linear: Mapping[str, float] | None
+) -> list[Note]:
     """Note what the records lack: a step, a loop, loops that are slow, from 0 V, without gaps."""
     notes = [note("no_step", loops=bool(loops))] if step is None else []
     notes += [] if loops else [note("no_loop")]
-    notes += linear.notes if linear else ()
     if not loops:
         return notes
     frequency = loops[0].frequency
     if frequency > 1.001 * _SLOW:
         notes.append(note("fast_loops", frequency=frequency))
     if linear is not None:
-        delay = linear.coefficients["a_1"] - linear.coefficients["b_1"]
+        delay = linear["a_1"] - linear["b_1"]
         angle = 2.0 * np.pi * frequency * delay
         if angle > _QUASI_STATIC:
             notes.append(note("lagging_step", delay=1e3 * delay, angle=angle, frequency=frequency))
@@ -597,7 +572,7 @@ def in_forces(
     critical = {f"c_{q}": 2.0 * float(np.sqrt(p[f"k_{q}"] * p[f"m_{q}"])) for q in "PB"}
     still = dict.fromkeys(("A", "beta", "gamma", "delta"), 0.0)
     usual = start.with_values({**still, **{c: max(v, p[c]) for c, v in critical.items()}})
-    motion, notes = (
+    motion, doubts = (
         ({}, ()) if coefficients is None else mechanics_of(coefficients, p["k_P"], p["k_B"])
     )
     wanted = dict(motion)
@@ -609,7 +584,7 @@ def in_forces(
         wanted |= {"beta": beta * unit, "gamma": gamma * unit}
     if k is not None:
         wanted["k_L"] = k / compliance
-    kept, refused = {}, []
+    kept, notes = {}, list(doubts)
     for name, value in wanted.items():
         parameter = usual.parameter(name)
         low, high = parameter.bounds
@@ -617,20 +592,11 @@ def in_forces(
         if within or (name == "n" and np.isfinite(value)):
             kept[name] = float(np.clip(value, low, high))
         if not within:
+            limits = {"unit": parameter.unit, "low": low, "high": high}
             instead = kept.get(name, usual.values[name])
-            refused.append(
-                note(
-                    "out_of_range",
-                    name=name,
-                    value=value,
-                    unit=parameter.unit,
-                    low=low,
-                    high=high,
-                    instead=instead,
-                )
-            )
+            notes.append(note("out_of_range", name=name, value=value, instead=instead, **limits))
     found = tuple(name for name in start.parameter_names if name in kept)
-    return usual.with_values(kept), found, [*notes, *refused]
+    return usual.with_values(kept), found, notes
 
 
 #: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
@@ -641,15 +607,14 @@ _TIP = (0.8, 0.97)
 class PaperIdentification:
     """What the paper's method finds; None where it finds nothing.
 
-    `coefficients` are a_1 [s] to a_5 [s^5] and b_1 [s] of eq. (15). `k` [m/V] and the `loop` are in
-    displacement units, eqs. (25), (26). `model` has
-    them in forces; without a loop its f_H is 0, and what else was not found has ordinary values.
+    `coefficients` are a_1 [s] to a_5 [s^5] and b_1 [s] of eq. (15), `k` [m/V] is that of eq. (25).
+    `model` has all in forces; without a loop its f_H is 0, and what else was not found has
+    ordinary values.
     `found` names the parameters that the method set; `notes` tell what failed or is doubtful.
     """
 
     coefficients: Mapping[str, float] | None
     k: float | None
-    loop: HysteresisPart
     model: Model
     found: tuple[str, ...]
     notes: tuple[Note, ...]
@@ -670,21 +635,13 @@ def paper_method(
     """
     steps, loops = find_steps(records), find_loops(records)
     step = steps[0] if steps else None
-    linear = linear_part(step) if step is not None else None
+    linear, doubts = (None, list[Note]()) if step is None else linear_part(step)
     slowest = [loop for loop in loops if loop.frequency < 1.05 * loops[0].frequency]
     k = step.k if step is not None else _slope_at_tip(slowest)
     bend = hysteresis_part(slowest, k) if slowest and k is not None else HysteresisPart()
-    model, found, notes = in_forces(
-        starting_model(records, stiffness), k, linear.coefficients if linear else None, bend
-    )
-    return PaperIdentification(
-        coefficients=linear.coefficients if linear else None,
-        k=k,
-        loop=bend,
-        model=model,
-        found=found,
-        notes=(*conditions(step, slowest, linear), *bend.notes, *notes),
-    )
+    model, found, notes = in_forces(starting_model(records, stiffness), k, linear, bend)
+    told = (*doubts, *conditions(step, slowest, linear), *bend.notes, *notes)
+    return PaperIdentification(linear, k, model, found, told)
 
 
 def identify_by_paper(
@@ -692,7 +649,7 @@ def identify_by_paper(
     *,
     stiffness: float | None = None,
     progress: Callable[[str], None] = lambda _: None,
-) -> Identification:
+) -> StackIdentification:
     """Return the paper's identification with its residuals on all records, as `identify` does.
 
     Nothing is fitted but each record's memory and offset; so there are no intervals. The warnings
@@ -715,7 +672,7 @@ def identify_by_paper(
     model = with_provenance(best.model, nothing, records, stiffness is not None)
     notes = (*model.provenance.notes, str(note("paper", names=found)))
     provenance = replace(model.provenance, notes=notes)
-    return Identification(
+    return StackIdentification(
         model=replace(model, provenance=provenance),
         fit=best,
         determinacy=nothing,

@@ -24,7 +24,7 @@ from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured, predict
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
-from psa_casadi.records.noise import high_frequency_noise
+from psa_casadi.records.noise import first_order_noise, high_frequency_noise, uncertain
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
@@ -180,6 +180,68 @@ def relevelled_all(best: Fit, experiments: Sequence[Experiment], rounds: int = 4
 def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]:
     """Return the experiments with the levels of the further channels that weighted a fit."""
     return [e.beside(f.channel for f in before.further) for e in experiments]
+
+
+#: Noise is estimated from so many samples or more, and differs from so many standard errors on.
+_TELLING, _SURE = 32, 3.0
+
+
+def refitted(
+    before: Fit,
+    experiments: Sequence[Experiment],
+    *,
+    model: Model | None = None,
+    evaluations: int = 60,
+    tolerance: float = 1e-6,
+) -> Fit:
+    """Go on with a fit from where it stopped, or with another model from its values.
+
+    What another model has of the parameters is free, and its effects' fitted parameters too.
+    """
+    other = model or before.model
+    own = [n for n in before.unknowns.names if n in other.values]
+    own += [n for c in other.effects for n in c.fitted if n not in own]
+    return fit(
+        other, weighted(before, experiments), own, sigma=before.sigma,
+        start_states=before.starts(), evaluations=evaluations, tolerance=tolerance,
+    )  # fmt: skip
+
+
+def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+    """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
+
+    Of every output, over the usual one of all experiments (the geometric mean by samples). A share
+    that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
+    """
+    shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
+    whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
+    shown = fit.shown(experiments) if whole else []
+    for o in fit.channels:
+        j = o.number
+        rows = ((k, experiments[k], shown[k][:, j]) for k in whole)
+        begun = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
+        fitted = zip(o.records, o.parts, strict=True)
+        found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
+        if len(found) < 2:
+            continue
+        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in found]
+        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in found])
+        for (k, part), own in zip(found, over, strict=True):
+            if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
+                shares[k][j] *= float(np.exp(own))
+    return tuple(replace(e, noise=tuple(own)) for e, own in zip(experiments, shares, strict=True))
+
+
+def unlike(experiments: Sequence[Experiment], others: Sequence[Experiment]) -> bool:
+    """Whether the shares of the noise differ."""
+    channels = range(len(experiments[0].channels))
+    pairs = zip(experiments, others, strict=True)
+    return any(a.share(j) != b.share(j) for a, b in pairs for j in channels)
+
+
+def reweighted(fit: Fit, experiments: Sequence[Experiment]) -> Fit:
+    """Fit again with other shares of the noise."""
+    return relevelled_all(refitted(fit, experiments, evaluations=100), experiments)
 
 
 def refit_or_keep(

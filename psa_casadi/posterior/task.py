@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.identify import free_of, identify_ode
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.identification.fitting.fit import (
     Fit,
@@ -20,6 +19,7 @@ from psa_casadi.identification.fitting.further import further_of
 from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum
 from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
+from psa_casadi.identification.multistart import free_of, identify_ode
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import noise_levels, weighted
 from psa_casadi.identification.search import free_parameters
@@ -230,7 +230,7 @@ def own_task_of(
     declared = {n: told.parameter(n).value for n in names}
     return _around(
         told.with_values({**declared, **(prior or {})}), weighted(found.fit, found.experiments),
-        {n: told.values[n] for n in names}, widths or {}, found.fit.sigma, found.fit, found.remarks,
+        {n: told.values[n] for n in names}, widths or {}, found.fit.sigma, found.fit, found.doubts,
     )  # fmt: skip
 
 

@@ -2,26 +2,14 @@
 
 Every function takes instants `time` [s], shape (n,), that begin at the start of its own part, and
 the lowest and highest voltage `low`, `high` [V] that the stack may see, and returns voltages [V],
-shape (n,), which never leave that range. The periodic ones begin at `low`. `concatenate` puts
-parts one after the other. Between samples the voltage is meant to be linear.
+shape (n,), which never leave that range and begin at `low`, but for the multisine. Between samples
+the voltage is meant to be linear.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike
 
 from psa_casadi.errors import InputError
 from psa_casadi.units import FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Waveform:
-    """A planned voltage: instants `time` [s] and `voltage` [V], both of shape (n,)."""
-
-    time: FloatArray
-    voltage: FloatArray
 
 
 def time_grid(duration: float, sample_time: float) -> FloatArray:
@@ -36,11 +24,6 @@ def time_grid(duration: float, sample_time: float) -> FloatArray:
             f"give a positive sample time and a longer duration."
         )
     return np.arange(round(duration / sample_time), dtype=np.float64) * sample_time
-
-
-def hold(time: FloatArray, level: float) -> FloatArray:
-    """Return the constant voltage `level` [V]. Use: creep, drift, leakage and the noise floor."""
-    return np.full(time.shape, float(level))
 
 
 def sine(time: FloatArray, low: float, high: float, frequency: float) -> FloatArray:
@@ -94,23 +77,6 @@ def decaying_triangle(
     return np.clip(np.interp(time, turns * length / (2 * periods), levels), low, high)
 
 
-def steps(time: FloatArray, levels: ArrayLike) -> FloatArray:
-    """Return the voltages `levels` [V] one after the other, each for the same share of the grid.
-
-    Use: transients of drive and mechanics; with long holds also creep.
-
-    Raises:
-        InputError: there are no levels, or more than samples.
-    """
-    values = np.atleast_1d(np.asarray(levels, dtype=np.float64))
-    if not 0 < values.size <= time.size:
-        raise InputError(
-            f"{values.size} levels do not fit on {time.size} samples; give at least one level and "
-            f"at least one sample for each."
-        )
-    return values[np.arange(time.size) * values.size // time.size]
-
-
 def multisine(
     time: FloatArray, low: float, high: float, band: tuple[float, float], *, seed: int
 ) -> FloatArray:
@@ -140,22 +106,6 @@ def multisine(
     bottom, top = signal.min(), signal.max()
     voltage: FloatArray = low + (high - low) * (signal - bottom) / (top - bottom)
     return np.clip(voltage, low, high)
-
-
-def concatenate(parts: Sequence[FloatArray], sample_time: float) -> Waveform:
-    """Return the voltages of `parts` one after the other on one uniform time grid.
-
-    A difference between the end of a part and the start of the next becomes a ramp of one sample.
-
-    Raises:
-        InputError: there are no parts, or the sample time is not positive.
-    """
-    if not parts or not sample_time > 0:
-        raise InputError(
-            "a sequence of voltages needs at least one part and a positive sample time; give both."
-        )
-    voltage = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
-    return Waveform(np.arange(voltage.size, dtype=np.float64) * sample_time, voltage)
 
 
 def _length(time: FloatArray) -> float:

@@ -244,6 +244,29 @@ class Experiment:
         return found
 
 
+def noise_share(experiments: Sequence[Experiment], channel: int) -> float:
+    """Return the rms of a channel's `noise` over the samples that judge, else over the fitted."""
+    counts = [int(c.sum()) for c in counted(experiments, channel)]
+    squares = [e.share(channel) ** 2 for e in experiments]
+    return float(np.sqrt(np.average(squares, weights=counts)))
+
+
+def missed_rms(
+    experiments: Sequence[Experiment], shown: Sequence[FloatArray], channel: int
+) -> float:
+    """Return the rms of measured minus predicted of a channel, in its unit, over these samples."""
+    rows = zip(experiments, shown, counted(experiments, channel), strict=True)
+    errors = np.concatenate([(e.measured(channel) - y[:, channel])[c] for e, y, c in rows])
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def counted(experiments: Sequence[Experiment], channel: int) -> list[BoolArray]:
+    """Return the samples of a channel that judge, the fitted ones where none does."""
+    judged = [e.at(channel, e.held_out) for e in experiments]
+    some = any(j.any() for j in judged)
+    return judged if some else [e.at(channel) for e in experiments]
+
+
 def whole(record: Record) -> Experiment:
     """Return the experiment that uses every valid sample of a record and holds out none."""
     return Experiment(record, record.mask, np.zeros(record.n, dtype=bool))

@@ -4,7 +4,7 @@ They are recognised from the record alone and masked; nothing is put in their pl
 can do (ring after a step, follow a jump of the voltage, turn sharply) is not suspect.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,7 +17,6 @@ from psa_casadi.records.noise import (
     BLOCK,
     high_frequency_noise,
     last_place_of,
-    local_scale,
     quantum_of,
     runs_of,
 )
@@ -31,9 +30,8 @@ Columns = Mapping[str, FloatArray]
 
 #: Samples that no spike exceeds, and standard deviations of its surroundings that make an outlier.
 SPIKE, LIMIT = 3, 8.0
-#: Samples before a sudden change of voltage or load in which the stack may move fast, and by which
-#: share of what it may do at once it may still move so many samples after it.
-BEFORE, AFTER = 4, ((1.0, 24), (0.25, 48), (0.03, 96))
+#: Samples before and after a run of equal ones in which the voltage may move the stack.
+BEFORE, AFTER = 4, 24
 #: Equal samples in a row that may be a sensor at rest, and the share of the range it missed.
 EQUAL, MISSED = 8, 0.05
 #: Share of fast changes of the voltage without a new reading from which on the stack is late.
@@ -71,7 +69,7 @@ def equal_runs(
         sign = np.sign(before) or 1.0
         into, out = sign * before, sign * after  # both positive where it is off to one side
         expected = slope * float(np.ptp(voltage[start:stop]))
-        near = swing[max(0, start - AFTER[0][1]) : stop + BEFORE]
+        near = swing[max(0, start - AFTER) : stop + BEFORE]
         off, sudden = max(floor, 3.0 * float(np.max(near))), 0.5 * MISSED * span
         returns = abs(into - out) < 0.5 * min(into, out) + 1.5 * expected
         rests = stop - start >= max(EQUAL, 4.0 * usual) and expected > floor
@@ -215,12 +213,9 @@ def _slope(y: FloatArray, voltage: FloatArray, inside: BoolArray) -> float:
 
 Kind = Literal["outlier", "drop-out", "stuck", "saturated"]
 
-#: Samples that a running line is laid through; no spike of up to `SPIKE` samples moves it.
-WINDOW = 13
 #: A sample is an outlier beyond `LIMIT` standard deviations of its surroundings, and beyond this
 #: share of the record's range, however quiet the sensor.
 SMALLEST = 1e-3
-_ROWS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,22 +256,15 @@ class Suspects:
         )  # fmt: skip
 
 
-#: Which of some samples of an output are outliers: their places, values, and the sensor's step.
-Outliers = Callable[[NDArray[np.int64], FloatArray, float | None], BoolArray]
-
-
 def suspects(record: Record) -> Suspects:
     """Return the samples of a stack's displacement that the sensor, not the stack, has made.
 
     A record without displacement has none. Work and memory grow with the number of samples.
     """
-
-    def outliers(places: NDArray[np.int64], y: FloatArray, quantum: float | None) -> BoolArray:
-        return _outliers(y, _explained(record)[places], quantum)
-
     unmeasured = np.full(record.n, np.nan)
     y = unmeasured if record.displacement is None else record.displacement
-    return _suspects(y, record.voltage, record.displacement_unit, outliers)
+    inputs = {n: record.columns[n] for n in ("voltage", "load_force") if n in record.columns}
+    return _suspects(y, record.voltage, inputs, record.displacement_unit)
 
 
 def suspects_of(name: str, output: FloatArray, unit: str, inputs: Columns) -> Suspects:
@@ -289,18 +277,9 @@ def suspects_of(name: str, output: FloatArray, unit: str, inputs: Columns) -> Su
     there = np.isfinite(output)
     alike = {n: _correlation(u[there], output[there]) for n, u in inputs.items()}
     drive = max(alike, key=lambda n: alike[n], default="")
-    table = np.column_stack([np.empty((output.size, 0)), *inputs.values()])
-
-    def outliers(places: NDArray[np.int64], y: FloatArray, quantum: float | None) -> BoolArray:
-        known = np.full(output.size, np.nan)
-        known[places] = y
-        smallest = max(SMALLEST * float(np.ptp(y)), 0.5 * LIMIT * (quantum or 0.0))
-        return spikes_in(known, table, LIMIT, smallest, SPIKE)[places]
-
     moving = inputs.get(drive, np.zeros(output.size))
-    found = _suspects(
-        output, moving, unit, outliers, equal=bool(there.any()) and _is_noisy(output[there])
-    )
+    equal = bool(there.any()) and _is_noisy(output[there])
+    found = _suspects(output, moving, inputs, unit, equal=equal)
     if 2 * found.mask.sum() > there.sum():
         found = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)
     return replace(found, names=(name, drive, name))
@@ -314,7 +293,7 @@ def _correlation(u: FloatArray, y: FloatArray) -> float:
 
 
 def _suspects(
-    output: FloatArray, drive: FloatArray, unit: str, outliers: Outliers, *, equal: bool = True
+    output: FloatArray, drive: FloatArray, inputs: Columns, unit: str, *, equal: bool = True
 ) -> Suspects:
     """Return the outliers of an output, and where readings are `equal` as of a failing sensor."""
     mask = np.zeros(output.size, dtype=np.bool_)
@@ -325,7 +304,7 @@ def _suspects(
     y, moving = output[valid], drive[valid]
     quantum = quantum_of(y)
     ends: tuple[FlatEnd, ...] = ()
-    stuck, dropped, flat, outlying = (np.zeros(valid.size, dtype=np.bool_) for _ in range(4))
+    stuck, dropped, flat = (np.zeros(valid.size, dtype=np.bool_) for _ in range(3))
     if equal:
         stuck, dropped = equal_runs(y, moving, quantum)
         again = missed_a_move(y, moving, quantum) | repeated_in_noise(y, moving, quantum)
@@ -333,9 +312,14 @@ def _suspects(
         ends = flat_ends(y, moving) if quantum is None else ()
         flat = np.any([flat, *(e.where for e in ends)], axis=0)
         stuck, dropped = stuck & ~flat, dropped & ~flat
-    rest = ~(stuck | dropped)
-    outlying[rest] = outliers(valid[rest], y[rest], quantum)
-    kinds = (outlying & ~flat, dropped, stuck, flat)
+    rest = valid[~(stuck | dropped | flat)]
+    known = np.full(output.size, np.nan)
+    known[rest] = output[rest]
+    span = float(np.ptp(output[rest])) if rest.size else 0.0
+    table = np.column_stack([np.empty((output.size, 0)), *inputs.values()])
+    smallest = max(SMALLEST * span, 0.5 * LIMIT * (quantum or 0.0))
+    outlying = spikes_in(known, table, LIMIT, smallest, SPIKE)[valid]
+    kinds = (outlying, dropped, stuck, flat)
     for kind, found in zip(counts, kinds, strict=True):
         counts[kind] = int(found.sum())
         mask[valid[found]] = True
@@ -352,70 +336,3 @@ def masked(record: Record, found: Suspects) -> Record:
     if record.displacement is None or not found.mask.any():
         return record
     return replace(record, displacement=np.where(found.mask, np.nan, record.displacement))
-
-
-def _outliers(y: FloatArray, explained: FloatArray, quantum: float | None) -> BoolArray:
-    """Return which samples are spikes: Hampel's rule with the scale around them.
-
-    Each may leave its surroundings as far as is `explained` (n,).
-    """
-    away = _away_from_surroundings(y)
-    scale = np.maximum(local_scale(away), 0.5 * (quantum or 0.0))
-    allowed = np.maximum(LIMIT * scale, SMALLEST * float(np.ptp(y)))
-    allowed = np.maximum(allowed, explained)
-    found = np.abs(away) > allowed
-    for start, stop in runs_of(found):
-        sign = np.sign(away[start])
-        around = -sign * np.r_[away[max(0, start - SPIKE) : start], away[stop : stop + SPIKE]]
-        swings = around.size > 0 and float(np.max(around)) > 0.4 * abs(away[start])
-        if stop - start > SPIKE or swings:
-            found[start:stop] = False
-    return found
-
-
-def _away_from_surroundings(y: FloatArray) -> FloatArray:
-    """Return each sample's distance from the straight line through the samples around it, (n,).
-
-    The slope is the median of the slopes between samples `WINDOW // 2` apart, the height the median
-    of the window less that slope: neither is moved by a spike of up to `SPIKE` samples.
-    """
-    half = WINDOW // 2
-    steps = np.arange(-half, half + 1)
-    padded = np.pad(y, half, mode="reflect", reflect_type="odd")
-    away = np.empty(y.size)
-    for start in range(0, y.size, _ROWS):
-        part = padded[start : start + _ROWS + 2 * half]
-        window = np.lib.stride_tricks.sliding_window_view(part, WINDOW)
-        slope = np.median(window[:, half:] - window[:, : half + 1], axis=1) / half
-        level = np.median(window - slope[:, None] * steps, axis=1)
-        away[start : start + _ROWS] = window[:, half] - level
-    return away
-
-
-def _explained(record: Record) -> FloatArray:
-    """Return how far the displacement may leave its surroundings after a sudden change, (n,).
-
-    Four times what the usual slope makes of a bend of the voltage that stands out from the bends
-    around it; without limit after a sudden change of the load force.
-    """
-    y, reach = record.displacement, float(np.ptp(record.voltage))
-    slope = float(np.nanmax(y) - np.nanmin(y)) / reach if y is not None and reach > 0 else 0.0
-    limits = 4.0 * slope * _sudden(record.voltage)
-    if record.load_force is not None:
-        limits[_sudden(record.load_force) > 0] = np.inf
-    limits[0] = max(limits[0], slope * reach)  # a record may begin while the stack still moves
-    fading = [
-        share * scipy.ndimage.maximum_filter1d(
-            limits, BEFORE + after + 1, mode="nearest", origin=(after - BEFORE) // 2
-        )
-        for share, after in AFTER
-    ]  # fmt: skip
-    return np.asarray(np.max(fading, axis=0), dtype=float)
-
-
-def _sudden(signal: FloatArray) -> FloatArray:
-    """Return the size of a signal's bends where they stand out from those around them, else 0."""
-    bend = np.zeros(signal.size)
-    bend[1:-1] = np.abs(np.diff(signal, 2))
-    around = local_scale(bend) / 1.4826
-    return np.where(bend > np.maximum(6.0 * around, 1e-6 * np.ptp(signal)), bend, 0.0)

@@ -16,13 +16,13 @@ from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.runs import runs_of
-from psa_casadi.any_model.sizes import Sizes, sizes_of
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
+from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.sizes import Sizes, sizes_of
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor, oscillator, pair, tanks
 from tests.report.browser import DARK, find_browser
@@ -246,7 +246,7 @@ def test_an_interrupt_keeps_the_best_model_so_far(word: str, effects: list[str])
 @pytest.mark.parametrize("make", [oscillator, tanks, pair])
 def test_ports_and_effects_of_gain_0_leave_a_model_as_it_is(make: Callable[[], psa.Model]) -> None:
     model = make()
-    runs = runs_of(model, [_quiet(model)], judged=False)
+    runs = experiments_of(model, [_quiet(model)], judged=False)
     table = effects_of(model, sizes_of(model, runs))
     assert len({e.name for e in table}) == len(table)
     opened, every = with_ports(model), extended(model, table)

@@ -9,6 +9,7 @@ from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, excitation
+from tests.voltages import steps
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ TIME = grid(20_000)
 SINE = excitation.sine(TIME, 0.0, 100.0, 2.0)
 MULTISINE = excitation.multisine(TIME, 0.0, 100.0, (0.5, 20.0), seed=1)
 LEVELS = (0.0, 50.0, 20.0, 80.0, 0.0, 100.0, 30.0, 60.0)
-STEPS = excitation.steps(TIME, LEVELS)
+STEPS = steps(TIME, LEVELS)
 
 
 def noise(samples: int, correlation: float, seed: int) -> FloatArray:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.loop_start import loop_start
-from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.start.ordinary import loop_start, starting_model
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from tests.studies.benchmarks.coverage import quantities

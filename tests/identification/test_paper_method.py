@@ -21,7 +21,6 @@ from psa_casadi.records import (
     Record,
     decaying_triangle,
     multisine,
-    steps,
     time_grid,
     triangle,
 )
@@ -42,6 +41,7 @@ from tests.identification.paper_cases import (
 )
 from tests.model.stack_models import PAPER_STACKS
 from tests.tiers import slow, slow_but
+from tests.voltages import steps
 
 STACK = "P-885.51"
 
@@ -224,7 +224,7 @@ def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
 
 @slow
 def test_nothing_is_said_against_a_step_that_serves() -> None:
-    assert linear_part(find_steps([_quiet(6e-3, 40001)])[0]).notes == ()
+    assert linear_part(find_steps([_quiet(6e-3, 40001)])[0])[1] == []
     found = paper_method([_quiet(6e-3, 40001), loop()])
     assert not any("not to be trusted" in s or "no stack's" in s for s in found.sentences)
     assert set(found.found) >= {"k_L", "A", "beta", "gamma", "delta", "n", "tau", "m_B", "c_B"}

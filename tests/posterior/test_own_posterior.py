@@ -1,5 +1,6 @@
 """Posteriors of a model of one's own: several records and outputs, truths that are known."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ import psa_casadi as psa
 from psa_casadi.posterior.task import Task, own_task_of
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
+from tests.contract.helpers import done, refused
 from tests.report.html_page import Page
 
 TRUTH = {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}
@@ -94,3 +96,19 @@ def test_what_a_model_of_ones_own_does_not_take_is_refused() -> None:
     empty = replace(records(1)[0], columns={"voltage": records(1)[0].columns["voltage"]}, sha256="")
     with pytest.raises(psa.InputError, match="no output of the model 'motor'"):
         psa.sample(motor(), empty)
+
+
+def test_the_command_samples_a_model_of_ones_own(tmp_path: Path) -> None:
+    pytest.importorskip("nutpie")
+    psa.save_model(motor(), tmp_path / "motor.json")
+    records(1)[0].to_frame().to_csv(tmp_path / "run.csv", index=False)
+    files = [tmp_path / name for name in ("draws.nc", "figures.json", "p.html")]
+    done(
+        "sample", tmp_path / "run.csv", "--model", tmp_path / "motor.json", "--free", "R", "--free",
+        "k", "--zeros", "i", "--known-start", "--chains", "1", "--draws", "4", "--tune", "4",
+        "-o", files[0], "--json", files[1], "--report", files[2],
+    )  # fmt: skip
+    assert list(json.loads(files[1].read_text("utf-8"))["parameters"]) == ["R", "k"]
+    assert all(file.stat().st_size for file in files)
+    told = refused("sample", tmp_path / "run.csv", "--known-start", "--free", "R")
+    assert "--known-start is said of a model of your own; add --model" in told

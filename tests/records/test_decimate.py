@@ -16,12 +16,13 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification import prepare
 from psa_casadi.identification.identify import identify
-from psa_casadi.records import Record, hold, sine, split, steps, time_grid
+from psa_casadi.records import Record, sine, split, time_grid
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.split import LEAST, MOST, PARTS, excerpts
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.stack import draw_stack
 from tests.tiers import slow
+from tests.voltages import steps
 
 FloatArray = NDArray[np.float64]
 SLOPE, NOISE = 1e-7, 1e-8
@@ -127,7 +128,7 @@ def test_short_uneven_and_planned_records() -> None:
 
 def test_other_columns_are_averaged_and_a_sudden_load_is_kept() -> None:
     base = loop()
-    wide = replace(base, current=1e-3 + 0.0 * T, temperature=293.0 + T, load_force=hold(T, 5.0))
+    wide = replace(base, current=1e-3 + 0.0 * T, temperature=293.0 + T, load_force=0.0 * T + 5.0)
     small, q = decimated(wide, NOISE, SLOPE)
     assert q > 1
     assert small.temperature is not None

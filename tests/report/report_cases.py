@@ -15,7 +15,7 @@ from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import Simulated, measured
 from psa_casadi.identification.fitting.unknowns import unknowns_of
-from psa_casadi.identification.identify import identify
+from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.records import multisine, sine, time_grid
 from psa_casadi.records.split import Experiment, split, whole
 from psa_casadi.report.words.series import Curve, Series
@@ -150,14 +150,14 @@ def diagnosis(
 
 
 @cache
-def identification() -> psa.Identification:
+def identification() -> StackIdentification:
     """Return the fit of the base model to two short records that drift."""
     return identify(
         [experiment(name, n)[0].record for name, n in (("rig_a", 1500), ("rig_b", 800))]
     )
 
 
-def long_fit(records: int, samples: int) -> tuple[psa.Identification, tuple[Series, ...]]:
+def long_fit(records: int, samples: int) -> tuple[StackIdentification, tuple[Series, ...]]:
     """Return a fit that claims to come from long records of loops, and their curves.
 
     Every record has one sample that is 3 um off, and one missing stretch of a fiftieth.

@@ -2,18 +2,16 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.datasets.devices import linear_response
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.records import steps, time_grid
+from psa_casadi.records import time_grid
 from psa_casadi.records.split import split
 from psa_casadi.simulation import device
 from psa_casadi.simulation.simulate import EXACT, STEPPER
@@ -21,13 +19,14 @@ from tests.datasets.test_datasets_one_axis import N as PERIOD
 from tests.datasets.test_datasets_one_axis import driven, voltages
 from tests.simulation.cuda_host import lend
 from tests.studies.__main__ import app
-from tests.studies.benchmarks import changed, fits, floors, mirror, peers, sampling
+from tests.studies.benchmarks import changed, fits, floors, mirror, peers
 from tests.studies.benchmarks import diagnose as study
 from tests.studies.benchmarks import verification as paper
 from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
 from tests.studies.benchmarks.hidden_cases import Case, Found, Kind
 from tests.studies.benchmarks.table import BENCHES, FloatArray, bench, least_times
 from tests.tiers import slow
+from tests.voltages import steps
 
 
 def silent(_: str) -> None:
@@ -125,9 +124,6 @@ POINTS = [
     fits.Point(STEPPER, 1e-6, 2e-5, 16.0, 7.0, 1.9),
     fits.Point(STEPPER, 1e-7, 1e-6, 22.0, 10.0, 2.8),
 ]
-TRIAL = fits.Trial("demo", "slow_creep", fits.MIXED, 1e-3)
-FINE = fits.Reached(TRIAL, 1e-6, EXACT, 5e-7, EXACT)
-LATE = FINE._replace(trial=TRIAL._replace(effect="sensor_delay"), way=STEPPER, error=1e-7)
 
 
 def test_of_each_way_the_cheapest_run_below_the_error_counts() -> None:
@@ -140,31 +136,10 @@ def test_of_each_way_the_cheapest_run_below_the_error_counts() -> None:
     assert "without 1/12 of the stepper's time" in note
 
 
-def test_the_base_is_no_effect_that_takes_a_way() -> None:
-    base = FINE._replace(trial=TRIAL._replace(effect="base"))
-    found = [r._replace(rtol=rtol) for rtol in (1e-4, 1e-6) for r in (base, FINE, LATE)]
-    table = fits.ways_tables(found)[0]
-    assert table.note.startswith("Of 2 effects 2 take the exact way in a fit")
-    assert table.table.rows[2] == ("sensor delay", EXACT, "0 of 1", "0 of 1")
-
-
-def test_errors_above_the_tolerance_are_counted() -> None:
-    worst = FINE._replace(trial=TRIAL._replace(record="steps"), error=3e-6)
-    (row,) = fits.ways_tables([FINE, LATE, worst, FINE])[1].table.rows
-    assert row[1:4] == ("75 % (3 of 4)", "25 % (1 of 4)", "3.0")
-    assert row[4] == "demo, slow creep, steps, 1 ms"
-
-
-def test_every_effect_is_at_work_beside_the_base_of_every_stack() -> None:
-    for stack in psa.STACKS:
-        for name, effect in psa.EFFECTS.items():
-            assert fits.with_one_effect(stack, name).values[str(effect.gain)] != 0.0
-
-
 def test_exact_steps_are_left_out_only_within() -> None:
     def way() -> str:
-        model, (t, v) = psa.stack_model("demo"), fits.voltage("steps", 100.0, 1e-3)
-        return psa.simulate(model, t[:50], v[:50], rtol=1e-3).way
+        t = 1e-3 * np.arange(50.0)
+        return psa.simulate(psa.stack_model("demo"), t, 1e3 * t, rtol=1e-3).way
 
     assert way() == EXACT
     with fits.stepper_alone():
@@ -369,41 +344,6 @@ def test_a_settled_model_repeats_itself_and_has_no_mean() -> None:
     assert abs(np.mean(shown)) < 1e-6 * np.ptp(shown)
     assert np.ptp(shown) > 1e-7
     assert mirror.RATE == 6400.0
-
-
-# ---- sampling: the one equation that PyMC gets shows what the whole stack shows
-
-#: NumPy under the names of PyMC's symbols.
-NUMPY = SimpleNamespace(
-    floor=np.floor, mod=np.mod, eq=np.equal, lt=np.less, switch=np.where, sqrt=np.sqrt
-)
-
-
-def test_the_reduced_equation_shows_the_stack_at_other_values() -> None:
-    model = sampling.stack().with_values({"k_L": 7.9, "A": -1.5, "delta": -0.2, "n": 1.7})
-    v, given = model.values, sampling.record()
-    p = [v["A"], v["delta"], v["n"]]
-    found = solve_ivp(
-        lambda t, y: [sampling.hysteresis_rate(y[0], t, p, v, NUMPY)], (0.0, given.time[-1]),
-        [30.0], t_eval=given.time, method="LSODA", rtol=1e-9, atol=1e-6,
-        max_step=sampling.LEG / 20,
-    )  # fmt: skip
-    compliance = 1.0 / v["k_P"] + 1.0 / v["k_B"]
-    reduced = compliance * (v["k_L"] * given.voltage + found.y[0])
-    whole = psa.simulate(model, given.time, given.voltage, memory={"f_H": 30.0}, rtol=1e-9)
-    miss = reduced - whole.displacement
-    assert np.max(np.abs(miss - np.mean(miss))) < 1e-4 * np.ptp(whole.displacement)
-    assert np.ptp(found.y[0]) > 50.0  # it is the hysteresis that is compared
-
-
-def test_the_table_states_effective_samples_per_processor_time() -> None:
-    draws = np.random.default_rng(0).standard_normal((20000, 2))
-    fast, slow = (sampling.Drawn(n, draws, 8000.0, s) for n, s in (("a", 2.0), ("b", 500.0)))
-    told = sampling.speed([fast, slow])
-    assert "250 times" in told.note
-    for row, seconds in zip(told.table.rows, (2.0, 500.0), strict=True):
-        assert float(row[4]) == pytest.approx(20000, rel=0.1)
-        assert float(row[6]) == pytest.approx(float(row[4]) / seconds, rel=0.01)
 
 
 # ---- verification: what it judges was not fitted, its figures are what they say

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
-from psa_casadi.records.read.by_name import ByName
-from psa_casadi.records.read.choose import ASK_UNIT, Choice, Question, with_usual_units
+from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.table import (

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.result import (
     ANY_MODEL,
@@ -26,8 +25,9 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.model_file import ModelFile
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.report.words.fit_words import Degree, grade
@@ -406,9 +406,7 @@ class IdentificationFile:
     profiles: Mapping[str, ProfileInterval]
 
 
-def identification_file(
-    found: Identification | OdeIdentification, profiles: Iterable[Profile] = ()
-) -> dict[str, Any]:
+def identification_file(found: Identification, profiles: Iterable[Profile] = ()) -> dict[str, Any]:
     """Return what `--json` writes of an identification, of any model."""
     intervals = found.model.provenance.intervals
     parameters = {
@@ -421,7 +419,7 @@ def identification_file(
         )
         for p in found.model.structure.parameters
     }
-    stack = found if isinstance(found, Identification) else None
+    stack = found if isinstance(found, StackIdentification) else None
     records = []
     for output in found.fit.channels:
         j, channel = output.number, output.channel
@@ -430,7 +428,7 @@ def identification_file(
                 continue
             e, sigma = found.experiments[k], found.fit.sigma[k]
             rms = float(np.sqrt(np.mean(part**2))) * e.share(j)
-            if isinstance(found, OdeIdentification):
+            if stack is None:
                 sigma = found.noise[channel.column] * e.share(j)
             readings = e.measured(j)[e.at(j, e.record.mask)]
             share = 100.0 * rms / float(np.ptp(readings))
@@ -447,10 +445,10 @@ def identification_file(
         parameters=parameters,
         rms_m=found.fit.rms,
         converged=found.fit.converged,
-        interrupted=stack.interrupted if stack else found.fit.interrupted,
+        interrupted=found.interrupted,
         records=tuple(records),
         warnings=found.warnings,
-        notes=stack.sentences if stack else (),
+        notes=found.sentences,
         advice=tuple(
             AdvisedRecord(a.sentence, a.parameters, a.repeats)
             for a in (stack.advice if stack else ())

@@ -8,11 +8,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import OdeDiagnosis
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import FORMAT as MODEL
 from psa_casadi.model.model_file import model_of
@@ -41,7 +40,7 @@ from psa_casadi.strict_json import decode, read_json
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 #: What `identify` and `diagnose` return.
-Result = OdeDiagnosis | Identification | OdeIdentification
+Result = OdeDiagnosis | Identification
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
@@ -93,7 +92,7 @@ def _read(
     given: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
 ) -> list[_Read]:
     content: Any
-    if isinstance(given, Identification | OdeIdentification):
+    if isinstance(given, Identification):
         path, source = Path(given.experiments[0].record.name), "identification"
         content = identification_file(given)
     elif isinstance(given, OdeDiagnosis):

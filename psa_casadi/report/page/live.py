@@ -15,7 +15,7 @@ from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
 from psa_casadi.export.web import begun_module
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.records.split import Experiment

@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.posterior.chains import column_of
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.posterior.task import Block
@@ -39,7 +39,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
-Compared = OdeDiagnosis | Identification | OdeIdentification
+Compared = OdeDiagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals
 
 #: What all pictures share.
@@ -89,7 +89,7 @@ def figure_of(result: Plotted) -> Figure:
     """Return the picture of a result."""
     if isinstance(result, Diagnosis):
         return diagnosis_figure(result)
-    if isinstance(result, Identification):
+    if isinstance(result, StackIdentification):
         series = series_of_fit(result)
         figure, grid, shown = _sheet(series, "measured", "model")
         _draw_residual(figure.add_subplot(grid[1, :]), shown)

@@ -10,8 +10,8 @@ from psa_casadi.diagnosis.misfit import Misfit, Spectrum
 from psa_casadi.diagnosis.result import Candidate, OdeDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.diagnosis.views import View
-from psa_casadi.identification.identify import Identification
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
+from psa_casadi.identification.result import Identification
 from psa_casadi.report.plots.panel import Panel, logarithmic
 from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from string import Formatter
 from typing import Any
 
-from psa_casadi.any_model.identify import OdeIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
@@ -263,7 +263,7 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
 }
 
 
-def _identification(found: OdeIdentification) -> str:
+def _identification(found: Identification) -> str:
     """Return the parameters with their standard errors, and what is left of the outputs."""
     model = found.model
     rows = [

@@ -7,14 +7,14 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.identify import OdeIdentification
-from psa_casadi.any_model.runs import noise_share, varied
 from psa_casadi.diagnosis.result import Candidate, Diagnosis, OdeDiagnosis
+from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, phrases
 
 FloatArray = npt.NDArray[np.float64]
@@ -137,14 +137,14 @@ def series_of(d: OdeDiagnosis) -> tuple[Series, ...]:
     return tuple(found)
 
 
-def series_of_fit(found: Identification | OdeIdentification) -> tuple[Series, ...]:
+def series_of_fit(found: Identification) -> tuple[Series, ...]:
     """Return the records of an identification with the fitted model.
 
     The noise of a displacement is that of the residual's fast differences: the level that weighted
     a record in the fit may be its whole residual.
     """
     rows: list[Series] = []
-    if isinstance(found, Identification):
+    if isinstance(found, StackIdentification):
         predictions = found.fit.predicted(found.experiments)
         for e, predicted in zip(found.experiments, predictions, strict=True):
             noise = high_frequency_noise((measured(e.record) - predicted)[e.known])

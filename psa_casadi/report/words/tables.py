@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, OdeDiagnosis
 from psa_casadi.effects import EFFECTS
-from psa_casadi.identification.identify import Identification
-from psa_casadi.identification.search import StartOutcome
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification, StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment
@@ -107,7 +107,7 @@ def parameter_table(
 
 
 def _status(model: Model, name: str, found: Identification | None) -> str:
-    if found is not None and name in found.read_off:
+    if isinstance(found, StackIdentification) and name in found.read_off:
         return "read off"
     if name not in model.provenance.free:
         return "current" if name in model.provenance.intervals else "not fitted"

@@ -4,14 +4,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis, OdeDiagnosis, OutputError
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import OF_BINARIES
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
@@ -139,7 +139,7 @@ def _rivals(d: OdeDiagnosis, cause: Cause) -> str:
 
 
 def identification_text(
-    found: Identification, *, origin: str = "measured", width: int = 100
+    found: StackIdentification, *, origin: str = "measured", width: int = 100
 ) -> str:
     """Return an identification: error, parameters with intervals, warnings, what is left open."""
     scale = scale_of(found.experiments, found.fit.rms)
@@ -156,20 +156,15 @@ def identification_text(
     return _around(head, parameter_table(found.model, found), tail, width)
 
 
-def fit_sentence(found: OdeIdentification) -> str:
-    """Say how far the model is from its records, and how many parameters these determine."""
+def fit_sentence(found: Identification) -> str:
+    """Say how far a model is from its records."""
     parts = []
     for name, rms in found.rms.items():
         unit = next(o.unit for o in found.model.structure.outputs if o.name == name) or "1"
         noise = found.noise[name]
         ratio = f" ({number(rms / noise, 2)} times its noise)" if noise > 0 else ""
         parts.append(f"{name} by {prefixed_scale(rms, unit).text(rms)}{ratio}")
-    count, open_ = len(found.errors), len(found.undetermined)
-    told = "all" if not open_ else f"{count - open_} of"
-    return (
-        f"The model misses {listing(parts)} rms. The records determine {told} {count} fitted"
-        f" parameter{'s' if count > 1 else ''}."
-    )
+    return f"The model misses {listing(parts)} rms."
 
 
 def effect_page(

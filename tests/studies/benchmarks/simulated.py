@@ -13,7 +13,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.records import multisine, sine, steps, triangle
+from psa_casadi.records import multisine, sine, triangle
 from psa_casadi.report.words.phrases import number
 from tests.studies.benchmarks.records import noisy
 from tests.studies.benchmarks.table import (
@@ -24,6 +24,7 @@ from tests.studies.benchmarks.table import (
     on_all_cores,
     share,
 )
+from tests.voltages import steps
 
 _SAMPLES, _RATE = 2000, 1000.0
 LINEAR = "0.1 um/V"
