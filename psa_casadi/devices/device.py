@@ -5,12 +5,12 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
-from psa_casadi.any_model.diagnose import diagnose as any_diagnose
-from psa_casadi.any_model.diagnose import identify as any_identify
 from psa_casadi.component import Component
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError, MachineError, PsaError
+from psa_casadi.faces import diagnose as any_diagnose
+from psa_casadi.faces import identify as any_identify
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.interruption import Work, interruptible_work

@@ -13,7 +13,7 @@ from psa_casadi.notes import Note, note
 from psa_casadi.records.read.reading import signals_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Hold, Signals, stairs
-from psa_casadi.records.split import Channel, Experiment, divided, whole
+from psa_casadi.records.split import Channel, Experiment, divided, whole, without_gaps
 from psa_casadi.records.suspects import suspects_of
 from psa_casadi.units import convert, parse_unit, si_unit
 
@@ -62,6 +62,7 @@ def experiments_of(
         )
     problems.raise_if_any()
     clean = [[_cleaned(model, s) for s in part] for part in parts]
+    clean = [[own for s in part for own in _cut(model, *s)] for part in clean]
     shadows = [[_shadow(model, s) for s, _ in part] for part in clean]
     split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
     records = cast("Sequence[Any]", [own for part in clean for own in part])
@@ -84,7 +85,15 @@ def experiments_of(
     return tuple(replace(e, channels=tuple(channels)) for e in found)
 
 
-def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note, ...]]:
+def _cut(
+    model: Model, s: Signals, said: tuple[Note | str, ...]
+) -> list[tuple[Signals, tuple[Note | str, ...]]]:
+    """Return the parts of signals between gaps that hide a motion of an input that is no stairs."""
+    parts, cut = without_gaps([s], model.input_names if s.hold == "linear" else ())
+    return [(p, () if k else (*said, *cut)) for k, p in enumerate(parts)]
+
+
+def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note | str, ...]]:
     """Return signals without the samples that an output's sensor has made, and what these are."""
     inputs = {n: s.columns[n] for n in model.input_names}
     columns, said = dict(s.columns), list[Note]()
@@ -103,7 +112,7 @@ def varied(model: Model, e: Experiment) -> str | None:
     return most if most is not None and spans[most] > 0 else None
 
 
-def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note, ...]:
+def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note | str, ...]:
     """Return which inputs look held between samples and are read as lines, which outputs lack.
 
     And what units were not stated, and which samples are masked.

@@ -225,7 +225,7 @@ def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Pro
             break
         progress("base fit with every record's own noise level")
         try:
-            best = refit(best, experiments, best.unknowns.names, sigma=levels)
+            best = refit(best, experiments, sigma=levels)
         except KeyboardInterrupt:
             return replace(best, interrupted=True, converged=False)
     return best

@@ -11,10 +11,11 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import (
-    refitted,
-    relevelled_all,
+    refit,
+    relevelled,
     reweighted,
     unlike,
+    weighted,
     with_noise,
 )
 from psa_casadi.identification.result import (
@@ -77,7 +78,7 @@ def identify_ode(
     )  # fmt: skip
     progress("fitting from several starts")
     best, runs, outcomes = search_starts(
-        sized(model, runs), runs, free_of(model, free), starts=starts
+        sized(model, runs), runs, free_of(model, free), starts=starts, progress=progress
     )
     found = determinacy(best, runs)
     result = Identification(
@@ -157,7 +158,12 @@ def fits_from(
 
 
 def search_starts(
-    model: Model, experiments: Sequence[Experiment], free: Sequence[str], *, starts: int
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    *,
+    starts: int,
+    progress: Progress = lambda _: None,
 ) -> tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]]:
     """Return the best fit from several starts, the experiments with their noise, and the starts.
 
@@ -170,7 +176,8 @@ def search_starts(
     drawn = [{n: _drawn(model.parameter(n), declared, rng) for n in free} for _ in range(1, starts)]
     begins = [("declared values", {}), *((f"random values {k}", v) for k, v in enumerate(drawn, 1))]
 
-    def quick(_: str, values: Mapping[str, float]) -> Fit:
+    def quick(name: str, values: Mapping[str, float]) -> Fit:
+        progress(f"fit from {name}")
         return fit(
             model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
             evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4,
@@ -183,13 +190,16 @@ def search_starts(
             " the units of its inputs, its values and their bounds."
         )
     cut = any(f.interrupted for _, f in found)
-    ended = [] if cut else [refitted(f, experiments, evaluations=100) for _, f in found[:_FOLLOWED]]
+    ended = [
+        refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)
+        for _, f in found[: 0 if cut else _FOLLOWED]
+    ]
     fits = dict(found) | {name: f for (name, _), f in zip(found, ended, strict=False)}
     best = min(fits.values(), key=lambda f: f.cost)
     outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begins)
     if cut:
         return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
-    best = relevelled_all(best, experiments)
+    best = relevelled(best, experiments, every=True)[0]
     again = with_noise(best, experiments)
     if unlike(again, experiments):
         best = reweighted(best, again)

@@ -592,9 +592,9 @@ def in_forces(
         if within or (name == "n" and np.isfinite(value)):
             kept[name] = float(np.clip(value, low, high))
         if not within:
-            limits = {"unit": parameter.unit, "low": low, "high": high}
             instead = kept.get(name, usual.values[name])
-            notes.append(note("out_of_range", name=name, value=value, instead=instead, **limits))
+            notes.append(note("out_of_range", name=name, value=value, instead=instead,
+                              unit=parameter.unit, low=low, high=high))  # fmt: skip
     found = tuple(name for name in start.parameter_names if name in kept)
     return usual.with_values(kept), found, notes
 

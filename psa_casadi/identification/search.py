@@ -140,7 +140,6 @@ def _search(
     starts = starting_points(model, linear, records)
     found = _quick_fits(model, experiments, [*core, *told], starts, progress, keep)
     keep(found[0][1])
-    free = found[0][1].unknowns.names
     sigma = residual_noise(found[0][1], experiments)
     polished: list[Fit] = []
     for name, quick in found:
@@ -152,7 +151,7 @@ def _search(
         if polished and not thorough and same_place(found[0][1], quick, experiments):
             continue
         progress(f"base fit, {name} to the end")
-        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, free, sigma)
+        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, sigma=sigma)
         polished.append(ended)
         keep(min(polished, key=lambda f: f.data_cost))
     best = min(polished, key=lambda f: f.data_cost)

@@ -8,10 +8,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from psa_casadi.any_model.result import FORMAT as OWN_DIAGNOSIS
-from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import OdeDiagnosis
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
@@ -26,23 +24,25 @@ from psa_casadi.population.finding import (
     replayed,
 )
 from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
-from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.report.documents.files import (
+    DIAGNOSES,
+    AnyDiagnosisFile,
     DeviceFile,
     DiagnosisFile,
     IdentificationFile,
     OwnModelFile,
     damage,
+    diagnosis_in,
     identification_file,
 )
+from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.strict_json import decode, read_json
 
 #: The file in a device's folder that says how its work ended.
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
-_DIAGNOSIS = "psa_casadi.diagnosis/1"
 #: What `identify` and `diagnose` return.
-Result = Diagnosis | OdeDiagnosis | Identification
+Result = OdeDiagnosis | Identification
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
@@ -97,24 +97,24 @@ def _read(
     if isinstance(given, Identification):
         path, source = Path(given.experiments[0].record.name), "identification"
         content = identification_file(given)
-    elif isinstance(given, Diagnosis | OdeDiagnosis):
+    elif isinstance(given, OdeDiagnosis):
         path = Path(given.experiments[0].record.name)
-        return [
-            (path, _with_model(_told(given.to_dict(), "diagnosis"), _model(given.model, traces)))
-        ]
+        content = given.to_dict()
+        finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))
+        return [(path, _with_model(finding, _model(given.model, traces)))]
     else:
         path = Path(given) / DEVICE_FILE if Path(given).is_dir() else Path(given)
         source = str(path)
         content = read_json(path, _ADVICE)
-    kind = content.get("format") if isinstance(content, dict) else None
+    diagnosis, kind = diagnosis_in(content, source)
+    if diagnosis is not None:
+        return [(path, _diagnosis(diagnosis))]
     if kind == DEVICE:
         told = decode(DeviceFile, content, source)
         if told.status != "done":
             why = " ".join(told.problems)
             raise InputError(f"{path}: the work on this device was {told.status}: {why}")
         return [(path, device_finding(path.parent, told, effects, traces=traces))]
-    if kind in (_DIAGNOSIS, OWN_DIAGNOSIS):
-        return [(path, _told(content, source))]
     if kind == IDENTIFICATION:
         return [(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
@@ -122,20 +122,26 @@ def _read(
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
 
 
-def _told(content: dict[str, Any], source: str) -> Finding:
-    """Return what a diagnosis of a stack or of a model of one's own tells."""
-    if content["format"] == _DIAGNOSIS:
-        return _diagnosis(decode(DiagnosisFile, content, source))
-    own = decode(OwnModelFile, content, source)
-    errors = [
-        HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit) for e in own.errors
-    ]
-    return replace(_any_diagnosis(own), errors=tuple(errors))
-
-
-def _any_diagnosis(d: DiagnosisFile | OwnModelFile) -> Finding:
+def _diagnosis(d: AnyDiagnosisFile) -> Finding:
     b = d.budget
     shares = [] if b is None else [*b.causes, *([b.unnamed] if b.unnamed else [])]
+    errors = []
+    if isinstance(d, DiagnosisFile):
+        base, extended = d.base_errors, d.extended_errors
+        errors = [
+            HeldOutErrors(
+                base.holdout_rms_m,
+                extended.holdout_rms_m,
+                d.noise_floor_rms_m,
+                base.holdout_nrmse_percent,
+                extended.holdout_nrmse_percent,
+            )
+        ]
+    elif isinstance(d, OwnModelFile):
+        errors = [
+            HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
+            for e in d.errors
+        ]
     return Finding(
         device="",
         kind="diagnosis",
@@ -144,28 +150,14 @@ def _any_diagnosis(d: DiagnosisFile | OwnModelFile) -> Finding:
         },
         records=tuple((r.name, r.sha256) for r in d.records),
         verdict=d.verdict,
+        doubt=d.doubt,
+        errors=tuple(errors),
         causes=tuple(
             NamedCause(c.effect, c.confidence, c.explained_share, c.cannot_be_told_from)
             for c in d.causes
         ),
         budget=tuple(BudgetShare(s.what, s.share, s.interval) for s in shares),
         notes=d.notes,
-    )
-
-
-def _diagnosis(d: DiagnosisFile) -> Finding:
-    return replace(
-        _any_diagnosis(d),
-        doubt=d.doubt,
-        errors=(
-            HeldOutErrors(
-                d.errors.base.holdout_rms_m,
-                d.errors.extended.holdout_rms_m,
-                d.errors.noise_floor_rms_m,
-                d.errors.base.holdout_nrmse_percent,
-                d.errors.extended.holdout_nrmse_percent,
-            ),
-        ),
     )
 
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
 from psa_casadi.export.web import begun_module
