@@ -1,14 +1,20 @@
 """`psa design experiment`: the next record to measure, for parameters or to tell effects apart."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading, StackName, names
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.errors import InputError
+
+#: Samples of a record where no number is given.
+_SAMPLES = 1000
 
 
 def experiment(
@@ -24,6 +30,7 @@ def experiment(
     parameter: list[str] | None = None,
     optimality: Literal["D", "E", "A"] = "D",
     family: Literal["any", "free", "triangles", "steps", "multisine"] = "any",
+    input_: list[str] | None = None,
     low: float | None = None,
     high: float | None = None,
     duration: float | None = None,
@@ -31,7 +38,7 @@ def experiment(
     rate: float | None = None,
     current: float | None = None,
     bandwidth: float | None = None,
-    noise: float | None = None,
+    noise: list[str] | None = None,
     correlation: float = 0.0,
     starts: int = 2,
     seed: int = 1,
@@ -39,6 +46,7 @@ def experiment(
     report: Path | None = None,
     still: bool = False,
     reading: Reading,
+    fitting: Fitting,
     given: Given,
 ) -> None:
     """Design the record to measure next: best for parameters, or to separate effects.
@@ -47,13 +55,16 @@ def experiment(
 
     Options:
         more: Further effects to separate.
+        model: MODEL.json, or a model of your own, whose inputs --input names.
         record: Record already measured (repeat for several); the rivals are fitted to it, and the
-            design has its voltages and length.
+            design has a stack's voltages and length of it.
         separate: Effect to separate from the others that are named.
         parameter: Parameter to determine (repeat for several); all that records of loops determine
             where none is named.
         optimality: Volume, worst direction or mean square of the intervals.
-        family: Family of voltages.
+        family: Family of inputs.
+        input_: Input of a model of your own that may move, NAME=LOW:HIGH, with its largest rate
+            NAME=LOW:HIGH:RATE, in SI units; repeat for several.
         low: Lowest voltage [V].
         high: Highest voltage [V].
         duration: Length of the record [s].
@@ -61,51 +72,157 @@ def experiment(
         rate: Largest rate [V/s].
         current: Largest current [A].
         bandwidth: Bandwidth [Hz].
-        noise: Noise of the sensor, rms [nm]; 0.1 % of the stroke.
+        noise: Noise of the sensor, rms [nm]; of a model of your own NAME=RMS for each output, in
+            its unit. By default 0.1 % of what the output moves.
         correlation: Correlation of the noise in neighbouring samples.
-        starts: Voltages that are improved, at most.
-        seed: Seed of the drawn voltages.
-        output: CSV with the voltage to apply.
+        starts: Inputs that are improved, at most.
+        seed: Seed of the drawn inputs.
+        output: CSV with the inputs to apply.
         report: HTML page to write.
     """
-    from psa_casadi.cli import design_experiment_runs as runs
+    from psa_casadi.design.experiment.experiment import columns_to_play
+    from psa_casadi.design.experiment.limits import KINDS
+    from psa_casadi.design.experiment.next_record import design_experiment
     from psa_casadi.design.experiment.search import Effort
     from psa_casadi.report.words.design_words import design_tables, sentences
 
     given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
-    effects = runs.effects_of(given, [*(separate or []), *(more or [])], parameter or [])
-    chosen = given.model_or_stack(model, stack)
-    records = given.records(record, reading) if record else []
-    if noise is not None and not noise > 0.0:
-        given.add(f"--noise is {noise:g} nm; give the positive rms of the sensor's noise.")
-    if not 0.0 <= correlation < 1.0:
-        given.add(f"--correlation is {correlation:g}; give a number from 0 to below 1.")
-    if starts < 1:
-        given.add(f"--starts is {starts}; give 1 or more.")
+    chosen = own_model(given, model, fitting)
     wanted = {
         "low": low, "high": high, "duration": duration, "samples": samples,
         "rate": rate, "current": current, "bandwidth": bandwidth,
     }  # fmt: skip
-    limits = None
-    if records or not record:
-        limits = given.attempt(lambda: runs.limits_given(records, chosen, wanted))
+    effects: Sequence[Any] = [*dict.fromkeys([*(separate or []), *(more or [])])]
+    records: Sequence[psa.Signals]
+    if chosen is not None:
+        stacks_own = ("low", "high", "current")
+        given.refuse({"--stack": stack, **{f"--{n}": wanted[n] for n in stacks_own}})
+        records = given.signals(chosen, record or [], reading)
+        own = {c.name: c for c in given.of_any_model()}
+        effects = [own.get(n, n) for n in effects]
+    else:
+        records = given.records(record, reading) if record else []
+        effects = _stacks_effects(given, effects)
+        chosen = given.model_or_stack(model, stack)
+    for wrong, sentence in (
+        (
+            len(effects) == 1,
+            "One effect alone cannot be separated from anything; name two effects or more.",
+        ),
+        (
+            effects and parameter,
+            "--separate and --parameter are both given; design one record for each.",
+        ),
+        (
+            not 0.0 <= correlation < 1.0,
+            f"--correlation is {correlation:g}; give a number from 0 to below 1.",
+        ),
+        (starts < 1, f"--starts is {starts}; give 1 or more."),
+    ):
+        if wrong:
+            given.add(sentence)
+    limits = given.attempt(lambda: _limits(chosen, records, input_ or [], wanted))
+    level = given.attempt(lambda: _noise(chosen, noise or []))
     given.check()
-    if chosen is None or limits is None:
+    if chosen is None or not limits:
         return
     with working("designing an experiment", given.quiet) as progress:
-        design, rivals = runs.designed(
-            chosen, effects, records, parameters=parameter or [], optimality=optimality,
-            limits=limits, noise=runs.noise_of(chosen, limits, noise, correlation),
-            family=family, effort=Effort(starts=starts, seed=seed), progress=progress,
+        design = design_experiment(
+            chosen, limits, records=records, separate=effects, parameters=parameter or [],
+            optimality=optimality, noise=level, correlation=correlation,
+            kinds=[k for k in KINDS if family in ("any", k)],
+            effort=Effort(starts=starts, seed=seed), progress=progress, **fitting.words,
         )  # fmt: skip
         if output is not None:
-            columns = {"time [s]": design.record.time, "voltage [V]": design.record.voltage}
-            psa.write_record(output, columns)
+            psa.write_record(output, columns_to_play(design))
         if report is not None:
-            runs.write_page(report, design, chosen, rivals, still)
-    for sentence in sentences(design, chosen.values.get("C_p")):
+            _write_page(report, design, chosen, still)
+    for sentence in sentences(design):
         show(sentence, given.quiet)
-    for shown in design_tables(design, chosen):
+    for shown in design_tables(design):
         show(f"\n{shown.title}\n", given.quiet)
         show_table(shown.table, given.quiet)
     tell_written(output, report, quiet=given.quiet)
+
+
+def _stacks_effects(given: Given, wanted: Sequence[str]) -> "list[psa.Component]":
+    """Return the effects of a stack to separate; all mistakes are noted."""
+    from psa_casadi.model.own_effects import known_effects
+
+    table = known_effects(given.own)
+    for name in [n for n in wanted if n not in table]:
+        given.add(f"There is no effect '{name}'; `psa effects` lists them.")
+    return [table[n] for n in wanted if n in table]
+
+
+def _limits(
+    model: "psa.Model | None",
+    records: "Sequence[Any]",
+    inputs: Sequence[str],
+    wanted: Mapping[str, float | None],
+) -> "dict[str, psa.design.Limits]":
+    """Return the limits: as given, else those of a stack's records, else its rated voltage."""
+    from psa_casadi.design.experiment.limits import Limits, limits_of
+    from psa_casadi.simulation.start import is_stack
+
+    if model is None:
+        return {}
+    said = {k: v for k, v in wanted.items() if v is not None}
+    if is_stack(model) and records:
+        return {"voltage": limits_of(records, **wanted)}
+    if "duration" not in said:
+        raise InputError("No length is given; add --duration SECONDS, or --record with records.")
+    samples = int(said.pop("samples", _SAMPLES))
+    if is_stack(model):
+        said = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **said}
+        if not said["high"]:
+            raise InputError("The model has no rated voltage; add --high VOLTS.")
+        return {"voltage": Limits(samples=samples, **said)}
+    found = {}
+    for text in inputs:
+        name, _, figures = text.partition("=")
+        try:
+            low, high, *steepest = (float(f) for f in figures.split(":"))
+        except ValueError:
+            raise InputError(
+                f"--input is '{text}'; give NAME=LOW:HIGH, such as {model.input_names[0]}=0:10."
+            ) from None
+        own = {**said, "rate": steepest[0]} if steepest else said
+        found[name] = Limits(low=low, high=high, samples=samples, **own)
+    if not found:
+        raise InputError(
+            f"No input may move; add --input NAME=LOW:HIGH, of {', '.join(model.input_names)}."
+        )
+    return found
+
+
+def _noise(model: "psa.Model | None", texts: Sequence[str]) -> dict[str, float] | float | None:
+    """Return the noise of every output as given: that of a stack in nm, else in its unit."""
+    found: dict[str, float] = {}
+    for text in texts:
+        name, _, figure = text.rpartition("=")
+        try:
+            found[name] = float(figure)
+        except ValueError:
+            raise InputError(f"--noise is '{text}'; give a number, or NAME=RMS.") from None
+        if not found[name] > 0.0:
+            raise InputError(f"--noise is {text}; give the positive rms of the sensor's noise.")
+    if "" in found:
+        from psa_casadi.simulation.start import is_stack
+
+        return found[""] * (1e-9 if model is None or is_stack(model) else 1.0)
+    return found or None
+
+
+def _write_page(path: Path, design: Any, model: "psa.Model", still: bool) -> None:
+    """Write the page of a design, with the stack that runs in it unless it is `still`."""
+    from psa_casadi.report.page.designs import write_experiment_page
+    from psa_casadi.report.page.live import live_design
+    from psa_casadi.simulation.simulate import simulate
+    from psa_casadi.simulation.start import is_stack
+
+    live = None
+    if is_stack(model) and not still:
+        time, voltage = design.record.time, design.record.columns["voltage"]
+        live = live_design(model, (time, voltage, simulate(model, time, voltage).displacement))
+    write_experiment_page(path, design, live)

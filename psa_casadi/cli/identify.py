@@ -1,6 +1,7 @@
 """`psa identify`: the parameters of a stack, with intervals."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -8,7 +9,7 @@ import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
-from psa_casadi.cli.own_model import Fitting, identified_own
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.cli.steps import IDENTIFY
 from psa_casadi.files import atomic_write
@@ -48,43 +49,41 @@ def identify(
         json: JSON file of parameters and records to write.
         report: HTML page of the fit to write.
     """
-    from psa_casadi.identification.identify import identify as run
-    from psa_casadi.identification.paper import identify_by_paper as by_paper
+    from psa_casadi.identification.identify import StackIdentification
+    from psa_casadi.identification.identify import identify as of_stack
+    from psa_casadi.identification.paper import identify_by_paper
     from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
-    if identified_own(
-        model, records, fitting, reading, given,
-        files={"--output": output, "--json": json, "--report": report},
-        others={
-            "--stack": stack, "--stiffness": stiffness,
-            "--hysteresis": hysteresis, "--method": method != "prediction-error",
-            "--profile": profile,
-        },
-    ):  # fmt: skip
-        return
-    if method == "paper" and profile:
-        given.add("--method paper has no likelihood; leave --profile or --method out.")
-    if method == "paper" and (model, stack) != (None, None):
-        given.add("--method paper starts from no model; leave --model, --stack or --method out.")
-    if method == "paper" and hysteresis not in (None, "bouc-wen"):
-        given.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
-    given.stiffness(stiffness)
+    own = own_model(given, model, fitting)
     outputs = {"--output": output, "--json": json, "--report": report}
     given.outputs(outputs, [*records, model])
-    measured = given.records(records, reading)
-    start = given.model_or_stack(model, stack, needed=False)
+    if own is not None:
+        of_stacks = {"--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis}
+        given.refuse({**of_stacks, "--method": method == "paper", "--profile": profile})
+        signals = given.signals(own, records, reading)
+        work: Callable[..., psa.Identification] = partial(
+            psa.identify, own, signals, **fitting.words
+        )
+    else:
+        given.stiffness(stiffness)
+        measured = given.records(records, reading)
+        start = given.model_or_stack(model, stack, needed=False)
+        if method == "paper":
+            _refuse_beside_paper(given, (model, stack), hysteresis, profile)
+            work = partial(identify_by_paper, measured, stiffness=stiffness)
+        else:
+            work = partial(
+                of_stack, measured, model=start, stiffness=stiffness, hysteresis=hysteresis
+            )
     given.check()
     with working("identifying", given.quiet, IDENTIFY) as progress:
-        if method == "paper":
-            found = by_paper(measured, stiffness=stiffness, progress=progress)
-        else:
-            found = run(
-                measured, model=start, stiffness=stiffness, hysteresis=hysteresis,
-                progress=progress,
-            )  # fmt: skip
+        found = work(progress=progress)
         profiles = _finish(found, outputs, profile or (), (origin, still), progress)
-    show(identification_text(found, origin=origin, width=width()), given.quiet)
+    text = repr(found)
+    if isinstance(found, StackIdentification):
+        text = identification_text(found, origin=origin, width=width())
+    show(text, given.quiet)
     for found_profile in profiles:
         show("\n" + "\n".join(profile_sentences(found_profile)), given.quiet)
     if left_out := [n for n in profile or () if n not in found.determinacy.names]:
@@ -94,6 +93,22 @@ def identify(
             given.quiet,
         )
     tell_written(*outputs.values(), quiet=given.quiet)
+
+
+def _refuse_beside_paper(
+    given: Given, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
+) -> None:
+    """Note the options that the paper's method does not take."""
+    for wrong, sentence in (
+        (profile, "has no likelihood; leave --profile or --method out."),
+        (starts != (None, None), "starts from no model; leave --model, --stack or --method out."),
+        (
+            hysteresis not in (None, "bouc-wen"),
+            "finds Bouc-Wen parameters; leave --hysteresis or --method out.",
+        ),
+    ):
+        if wrong:
+            given.add(f"--method paper {sentence}")
 
 
 def _finish(

@@ -99,6 +99,38 @@ class Given:
                     tell(f"Note: {note}")
         return found
 
+    def signals(
+        self, model: "psa.Model", paths: Sequence[Path], reading: Reading
+    ) -> "tuple[psa.Signals, ...]":
+        """Read records of a model of one's own, each in the units of its file."""
+        if not paths:
+            return ()
+        found = self.attempt(
+            lambda: psa.read_signals(
+                paths, inputs=model.input_names, outputs=model.output_names,
+                columns=reading.columns, sample_time=reading.sample_time,
+            )
+        )  # fmt: skip
+        for note in [n for s in found or () for n in s.notes if not self.quiet]:
+            tell(f"Note: {note}")
+        return found or ()
+
+    def refuse(self, others: Mapping[str, object]) -> None:
+        """Refuse the options that a model of one's own does not take, of those that are given."""
+        for option in [name for name, value in others.items() if value]:
+            self.add(f"{option} is not there for a model of your own; leave it out.")
+
+    def numbers(self, option: str, texts: Sequence[str] | None) -> dict[str, float]:
+        """Return the numbers of an option NAME=VALUE that may be repeated."""
+        found: dict[str, float] = {}
+        for text in texts or ():
+            name, _, figure = text.partition("=")
+            try:
+                found[name.strip()] = float(figure)
+            except ValueError:
+                self.add(f"{option} is '{text}'; give NAME=VALUE, such as {option} mass=0.3.")
+        return found
+
     def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> "ColumnMap | None":
         """Return what --columns says, nothing where it is left out; None where it is wrong.
 

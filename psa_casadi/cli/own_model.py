@@ -3,20 +3,16 @@
 import re
 import runpy
 import sys
-import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading
-from psa_casadi.cli.screen import show, tell, tell_written, width, working
-from psa_casadi.errors import InputError, Problems
-from psa_casadi.files import atomic_write
-from psa_casadi.strict_json import json_text
+from psa_casadi.errors import InputError
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
@@ -96,45 +92,8 @@ def _made(file: Path, name: str) -> psa.Model:
     return model
 
 
-def identified_own(
-    path: Path | None,
-    records: Sequence[Path],
-    fitting: Fitting,
-    reading: Reading,
-    given: Given,
-    *,
-    files: Mapping[str, Path | None],
-    others: Mapping[str, object],
-) -> bool:
-    """Fit a model of one's own, show its parameters: `files` are --output, --json, --report.
-
-    False where the path names none. `others` are options that must be empty.
-    """
-    model = own_model(given, path, fitting)
-    if model is None:
-        return False
-    from psa_casadi.report.documents.files import identification_file
-
-    _refuse(given, others)
-    given.outputs(files, list(records))
-    measured = _read(given, model, records, reading)
-    given.check()
-    with working("identifying", given.quiet):
-        found = psa.identify(model, measured, **fitting.words)
-    output, json, report = files.values()
-    if output is not None:
-        psa.save_model(found.model, output)
-    if json is not None:
-        atomic_write(json, json_text(identification_file(found)))
-    if report is not None:
-        psa.write_fit_report(found, report)
-    show(repr(found), given.quiet)
-    tell_written(output, json, report, quiet=given.quiet)
-    return True
-
-
-def diagnosed_own(
-    path: Path | None,
+def own_diagnosis(
+    model: psa.Model,
     records: Sequence[Path],
     held_out: Sequence[Path],
     fitting: Fitting,
@@ -142,111 +101,16 @@ def diagnosed_own(
     given: Given,
     *,
     leave_out: Sequence[str],
-    expect: str | None,
-    files: Mapping[str, Path | None],
     others: Mapping[str, object],
-) -> bool:
-    """Diagnose a model of one's own: `files` are --output, --json, --report and --junit.
+) -> Callable[..., psa.OdeDiagnosis]:
+    """Read the records of a model of one's own; return what diagnoses it.
 
-    False where the path names none. `others` are options that must be empty.
+    That takes `progress` and `watch`; `others` are options that must be empty.
     """
-    model = own_model(given, path, fitting)
-    if model is None:
-        return False
-    from psa_casadi.cli.diagnosis_files import expected, verdict_case
-    from psa_casadi.report.words.own_words import own_verdict_sentence
-
-    began, own = clock.perf_counter(), given.of_any_model()
-    _refuse(given, others)
-    given.outputs(files, [*records, *held_out])
-    measured, held = (_read(given, model, part, reading) for part in (records, held_out))
-    wanted, _ = expected(given, expect, None)
-    given.check()
-    with working("diagnosing", given.quiet) as progress:
-        d = psa.diagnose(
-            model, measured, holdout=held, leave_out=leave_out, effects=own, progress=progress,
-            **fitting.words,
-        )  # fmt: skip
-    output, json, report, junit = files.values()
-    if output is not None:
-        psa.save_model(d.model, output)
-    if json is not None:
-        atomic_write(json, d.to_json())
-    if report is not None:
-        psa.write_report(d, report)
-    show(psa.story(d, width=width()), given.quiet)
-    tell_written(output, json, report, quiet=given.quiet)
-    case = verdict_case(d.verdict, own_verdict_sentence(d), wanted)
-    judge("diagnose", ", ".join(p.name for p in records), [case], junit, began, tells=True)
-    return True
-
-
-def simulated_own(
-    path: Path | None,
-    input_: Path,
-    output: Path,
-    reading: Reading,
-    given: Given,
-    *,
-    others: Mapping[str, object],
-) -> bool:
-    """Simulate a model of one's own from its start values, and write its inputs and outputs.
-
-    False where the path names none. `others` are options that must be empty.
-    """
-    model = None if path is None else _model(given, path)
-    if model is None:
-        return False
-    import numpy as np
-
-    from psa_casadi.any_model.runs import in_units
-    from psa_casadi.units import convert
-
-    _refuse(given, others)
-    given.outputs({"--output": output}, [path, input_])
-    record = next(iter(_read(given, model, [input_], reading)), None)
-    problems = Problems()
-    samples = record and in_units(model, record, problems)
-    for sentence in problems.sentences():
-        given.add(sentence)
-    given.check()
-    if samples is None:
-        return True
-    s, time = model.structure, samples.time
-    with working("simulating", given.quiet):
-        u = np.reshape([samples.columns[i.name] for i in s.inputs], (-1, samples.n)).T
-        x0 = np.array([q.start for q in s.states])
-        found = psa.run(model, time - time[0], u, x0, hold=samples.hold)
-        written = {"time [s]": time}
-        shown: list[psa.Input | psa.Output] = [*s.inputs, *s.outputs]
-        for variable, values in zip(shown, (*u.T, *found.y.T), strict=True):
-            unit = variable.display_unit or variable.unit
-            written[f"{variable.name} [{unit}]"] = convert(values, variable.unit, unit)
-        psa.write_record(output, written)
-    show("start: the start values of the model", given.quiet)
-    show(f"{samples.n} samples over {samples.duration:.6g} s", given.quiet)
-    show(f"columns: {', '.join(written)}", given.quiet)
-    tell_written(output, quiet=given.quiet)
-    return True
-
-
-def _refuse(given: Given, others: Mapping[str, object]) -> None:
-    """Refuse the options that a model of one's own does not take."""
-    for option in [name for name, value in others.items() if value]:
-        given.add(f"{option} is not there for a model of your own; leave it out.")
-
-
-def _read(
-    given: Given, model: psa.Model, paths: Sequence[Path], reading: Reading
-) -> tuple[psa.Signals, ...]:
-    if not paths:
-        return ()
-    found = given.attempt(
-        lambda: psa.read_signals(
-            paths, inputs=model.input_names, outputs=model.output_names,
-            columns=reading.columns, sample_time=reading.sample_time,
-        )
+    own = given.of_any_model()
+    given.refuse(others)
+    measured, held = (given.signals(model, part, reading) for part in (records, held_out))
+    return partial(
+        psa.diagnose, model, measured, holdout=held, leave_out=leave_out, effects=own,
+        **fitting.words,
     )  # fmt: skip
-    for note in [n for s in found or () for n in s.notes if not given.quiet]:
-        tell(f"Note: {note}")
-    return found or ()

@@ -1,5 +1,7 @@
-"""`psa sample`: whole posteriors of a stack's parameters."""
+"""`psa sample`: whole posteriors of a model's parameters."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +10,7 @@ import typer
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Origin, Reading, StackName
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.files import atomic_path, atomic_write
 
@@ -18,7 +21,6 @@ def sample(
     model: Path | None = None,
     stack: StackName = None,
     output: Path | None = None,
-    free: list[str] | None = None,
     prior: list[str] | None = None,
     chains: Annotated[int, typer.Option(min=1)] = 4,
     draws: Annotated[int, typer.Option(min=4)] = 1000,
@@ -26,18 +28,21 @@ def sample(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     json: Path | None = None,
     figure: Path | None = None,
+    report: Path | None = None,
     reading: Reading,
+    fitting: Fitting,
     origin: Origin = "measured",
     given: Given,
 ) -> None:
-    """Draw the parameters of a stack from their posterior, given records (extra sample).
+    """Draw the parameters of a model from their posterior, given records (extra sample).
 
     The No-U-Turn sampler on exact gradients; priors are weak unless --prior says more.
 
     Options:
-        model: MODEL.json whose values the chains start near.
+        model: MODEL.json whose values the chains start near, or a model of your own.
         output: netCDF file of the draws to write, as ArviZ has it.
-        free: Parameter to sample; may be repeated. By default those that the model was fitted in.
+        free: Parameter to sample; may be repeated. By default those that the model was fitted in,
+            of a model of your own all that may be fitted.
         prior: Prior of a parameter, NAME=CENTRE:WIDTH in SI units, as k_L=7.3:0.1; the width is
             that of the logarithm where a parameter spans decades, else in ordinary changes. May be
             repeated.
@@ -47,6 +52,7 @@ def sample(
         seed: Seed of all that is random.
         json: JSON file of the figures to write.
         figure: Picture of prior and posterior to write, PNG.
+        report: HTML page to write.
     """
     from psa_casadi.report.documents.files import posterior_file
     from psa_casadi.report.plots.figures import DPI, posterior_figure
@@ -55,25 +61,24 @@ def sample(
 
     if (model, stack) == (None, None) and len(records) > 1 and records[0].suffix == ".json":
         model, *records = records  # as it was written before there was --model here
-    given.outputs({"--output": output, "--json": json, "--figure": figure}, [model, *records])
-    centres: dict[str, float] = {}
-    widths: dict[str, float] = {}
-    for text in prior or ():
-        name, _, figures = text.partition("=")
-        centre, _, spread = figures.partition(":")
-        try:
-            centres[name], widths[name] = float(centre), float(spread)
-        except ValueError:
-            given.add(f"--prior is '{text}'; give NAME=CENTRE:WIDTH, such as k_L=7.3:0.1.")
-    measured = given.records(records, reading)
-    start = given.model_or_stack(model, stack)
+    files = {"--output": output, "--json": json, "--figure": figure, "--report": report}
+    given.outputs(files, [model, *records])
+    centres, widths = _priors(given, prior or ())
+    start = own_model(given, model, replace(fitting, free=None))
+    measured: Sequence[psa.Record | psa.Signals]
+    if start is not None:
+        given.refuse({"--stack": stack})
+        measured = given.signals(start, records, reading)
+    else:
+        measured = given.records(records, reading)
+        start = given.model_or_stack(model, stack)
     given.check()
     if start is None:
         return
     with working("sampling", given.quiet) as progress:
         found = psa.sample(
-            start, measured, free=free, prior=centres, widths=widths, chains=chains, draws=draws,
-            tune=tune, seed=seed, progress=progress,
+            start, measured, prior=centres, widths=widths, chains=chains, draws=draws, tune=tune,
+            seed=seed, progress=progress, **fitting.words,
         )  # fmt: skip
         if output is not None:
             progress("writing the draws")
@@ -83,5 +88,21 @@ def sample(
         if figure is not None:
             with atomic_path(figure) as temporary:
                 posterior_figure(found).savefig(temporary, format="png", dpi=DPI)
+        if report is not None:
+            psa.report(found, report)
     show(posterior_text(found, origin=origin, width=width()), given.quiet)
-    tell_written(output, json, figure, quiet=given.quiet)
+    tell_written(*files.values(), quiet=given.quiet)
+
+
+def _priors(given: Given, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return centres and widths by the names of the parameters."""
+    centres: dict[str, float] = {}
+    widths: dict[str, float] = {}
+    for text in texts:
+        name, _, figures = text.partition("=")
+        centre, _, spread = figures.partition(":")
+        try:
+            centres[name], widths[name] = float(centre), float(spread)
+        except ValueError:
+            given.add(f"--prior is '{text}'; give NAME=CENTRE:WIDTH, such as k_L=7.3:0.1.")
+    return centres, widths

@@ -1,12 +1,19 @@
-"""`psa simulate`: what a model does with a voltage."""
+"""`psa simulate`: what a model does with its inputs."""
 
+from functools import partial
 from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading, StackName, Start
-from psa_casadi.cli.own_model import simulated_own
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, tell_written, working
+from psa_casadi.errors import Problems
+from psa_casadi.shown import with_units
+from psa_casadi.units import FloatArray, convert
 
 
 def simulate(
@@ -15,68 +22,136 @@ def simulate(
     output: Path,
     model: Path | None = None,
     stack: StackName = None,
+    value: list[str] | None = None,
+    start: list[str] | None = None,
+    hold: Literal["linear", "zero"] = "linear",
+    figure: Path | None = None,
     reading: Reading,
-    start: Start,
+    begin: Start,
     given: Given,
 ) -> None:
-    """Simulate a model on a measured or planned voltage; write every output with its unit.
+    """Simulate a model on measured or planned inputs; write every output with its unit.
 
     The stack starts settled at the first voltage, its hysteresis and creep relaxed, or as --history
-    leaves them. With --start-voltage, or a model file that has start values, it starts like an FMU
+    leaves them. With --start-voltage, or a model that has start values, it starts like an FMU
     exported with the same options. A model of your own, a file of that, FILE.py:FUNCTION or an FMU,
-    starts at its start values; its inputs are lines between samples.
+    starts at its start values.
 
     Options:
         input_: Record with time and voltage, and load_force if any; with the inputs of a model of
             your own by their names.
         output: CSV to write.
+        value: Parameter in place of the model's, NAME=VALUE in SI units; repeat for several.
+        start: Start of a state, NAME=VALUE in SI units; repeat for several.
+        hold: What the inputs do between samples.
+        figure: Picture of all inputs and outputs to write, PNG.
         start_voltage: Voltage [V] that holds the stack when it starts, as in `psa export fmu`; by
             default the first one of the record.
     """
-    from psa_casadi.units import convert
+    from psa_casadi.files import atomic_path
+    from psa_casadi.report.plots.figures import DPI
 
-    others = {
-        "--stack": stack, "--start-voltage": start.start_voltage is not None,
-        "--history": start.history,
-    }  # fmt: skip
-    if simulated_own(model, input_, output, reading, given, others=others):
+    given.outputs({"--output": output, "--figure": figure}, [model, input_])
+    chosen, record = _read(given, model, stack, input_, begin, reading)
+    turns = given.turns(begin.history)
+    values, starts = given.numbers("--value", value), given.numbers("--start", start)
+    if chosen is not None:
+        chosen = given.attempt(partial(_begun, chosen, values, starts))
+    given.check()
+    if chosen is None or record is None:
         return
-    given.outputs({"--output": output}, [model, input_])
+    with working("simulating", given.quiet):
+        inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
+        if isinstance(record, psa.Record):
+            outputs, told = _of_a_stack(chosen, inputs, record, turns, begin, hold)
+        else:
+            u = np.column_stack([np.empty((record.n, 0)), *inputs.values()])
+            x0 = np.array([q.start for q in chosen.structure.states])
+            y = psa.run(chosen, record.time - record.time[0], u, x0, hold=hold).y
+            outputs = dict(zip(chosen.output_names, y.T, strict=True))
+            told = "the start values of the model", ""
+        shown = _as_displayed(chosen, record.time, {**inputs, **outputs})
+        written = with_units({"time": record.time, **shown.columns}, {"time": "s", **shown.units})
+        psa.write_record(output, written)
+        if figure is not None:
+            with atomic_path(figure) as temporary:
+                shown.plot().savefig(temporary, format="png", dpi=DPI)
+    begins, took = told
+    show(f"start: {begins}", given.quiet)
+    show(f"{record.n} samples over {record.duration:.6g} s{took}", given.quiet)
+    show(f"columns: {', '.join(written)}", given.quiet)
+    tell_written(output, figure, quiet=given.quiet)
+
+
+def _read(
+    given: Given,
+    model: Path | None,
+    stack: str | None,
+    input_: Path,
+    begin: Start,
+    reading: Reading,
+) -> "tuple[psa.Model | None, psa.Record | psa.Signals | None]":
+    """Return the model and the record of its inputs, `Signals` where it is no stack's."""
+    from psa_casadi.identification.experiments import in_units
+
+    chosen = own_model(given, model, Fitting())
+    if chosen is not None:
+        own, problems = chosen, Problems()
+        voltage = begin.start_voltage is not None
+        given.refuse({"--stack": stack, "--start-voltage": voltage, "--history": begin.history})
+        read = next(iter(given.signals(own, [input_], reading)), None)
+        signals = read and in_units(own, read, problems)
+        for sentence in problems.sentences():
+            given.add(sentence)
+        return own, signals
     chosen = given.model_or_stack(model, stack)
     columns = given.columns(reading.columns, [input_])
-    record = (
-        columns
-        if columns is None
-        else given.attempt(
+    record = None
+    if columns is not None:
+        record = given.attempt(
             lambda: psa.read_record(
                 input_, need_displacement=False, columns=columns, sample_time=reading.sample_time
             )
         )
+    return (chosen if begin.start_voltage is None else given.started(chosen, begin)), record
+
+
+def _begun(model: "psa.Model", values: dict[str, float], starts: dict[str, float]) -> "psa.Model":
+    """Return a model with other parameters and starts. Raises InputError."""
+    for name in values:
+        model.parameter(name)
+    return model.with_values(values).with_starts(starts)
+
+
+def _of_a_stack(
+    model: "psa.Model",
+    inputs: dict[str, Any],
+    record: "psa.Record",
+    turns: tuple[float, ...],
+    begin: Start,
+    hold: str,
+) -> tuple[dict[str, FloatArray], tuple[str, str]]:
+    """Return the outputs of a stack, and in words where it begins and what it took."""
+    as_exported = begin.start_voltage is not None or (begin.history is None and model.starts_itself)
+    first, memory = float(record.voltage[0]), None
+    if begin.history is not None and not as_exported:
+        memory = psa.memory_after(model, turns, at=first, sweep=begin.sweep, rest=begin.rest)
+    found = psa.simulate(
+        model, record.time, memory=memory, as_exported=as_exported, hold=hold, **inputs
     )
-    if start.start_voltage is not None:
-        chosen = given.started(chosen, start)
-    turns = given.turns(start.history)
-    given.check()
-    if chosen is None or record is None:
-        return
-    as_exported = start.start_voltage is not None or (
-        start.history is None and chosen.starts_itself
-    )
-    with working("simulating", given.quiet):
-        first, memory = float(record.voltage[0]), None
-        if start.history is not None and not as_exported:
-            memory = psa.memory_after(chosen, turns, at=first, sweep=start.sweep, rest=start.rest)
-        found = psa.simulate_record(chosen, record, memory, as_exported=as_exported)
-        written = {"time [s]": found.time, "voltage [V]": found.voltage}
-        for declared in chosen.structure.outputs:
-            unit = declared.display_unit or declared.unit
-            values = convert(found.outputs[declared.name], declared.unit, unit)
-            written[f"{declared.name} [{unit}]"] = values
-        psa.write_record(output, written)
-    show(f"start: {start_sentence(chosen, record, start.history, as_exported)}", given.quiet)
-    show(f"{record.n} samples over {record.duration:.6g} s in {found.steps} steps", given.quiet)
-    show(f"columns: {', '.join(written)}", given.quiet)
-    tell_written(output, quiet=given.quiet)
+    begins = start_sentence(model, record, begin.history, as_exported)
+    return dict(found.outputs), (begins, f" in {found.steps} steps")
+
+
+def _as_displayed(
+    model: "psa.Model", time: FloatArray, columns: dict[str, FloatArray]
+) -> "psa.Signals":
+    """Return inputs and outputs in the units that they are displayed in."""
+    every: list[psa.Input | psa.Output] = [*model.structure.inputs, *model.structure.outputs]
+    there = [v for v in every if v.name in columns]
+    units = {v.name: v.display_unit or v.unit for v in there}
+    shown = {v.name: convert(columns[v.name], v.unit, units[v.name]) for v in there}
+    return psa.Signals(name=model.name, time=time, columns=shown, units=units)
 
 
 def start_sentence(

@@ -7,6 +7,7 @@ from psa_casadi.design.experiment.experiment import (
     usual_records,
 )
 from psa_casadi.design.experiment.limits import Limits
+from psa_casadi.design.experiment.next_record import design_experiment
 from psa_casadi.design.mechanism.mechanism import design_mechanism
 from psa_casadi.design.tracking.minimum_time import quickest_move
 from psa_casadi.design.tracking.targets import AmplifierLimits
@@ -15,6 +16,7 @@ from psa_casadi.design.tracking.tracking import track
 __all__ = [
     "AmplifierLimits",
     "Limits",
+    "design_experiment",
     "design_mechanism",
     "informative_experiment",
     "quickest_move",

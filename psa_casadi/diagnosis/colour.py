@@ -9,9 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.refitting import with_noise
 from psa_casadi.notes import Note, note
-from psa_casadi.records.noise import filtered, first_order_noise
+from psa_casadi.records.noise import filtered, first_order_noise, uncertain
 from psa_casadi.records.repeats import autoregression_of
+from psa_casadi.records.split import Experiment, noise_share
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -193,6 +196,28 @@ def noise_rms(residual: FloatArray, colour: Colour) -> float:
     return min(first_order_noise(residual)[0], colour.rms)
 
 
+def noise_left(fit: Fit, colour: Colour) -> list[float]:
+    """Return the noise in every output's residual, over the shares that weighted it."""
+    rows = zip(fit.channels, colour.each, strict=True)
+    return [noise_rms(o.residuals, own) for o, own in rows]
+
+
+def noise_told(
+    fit: Fit, colour: Colour, experiments: Sequence[Experiment]
+) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
+    """Return the experiments and every output's noise over them, in its unit, as a fit leaves it.
+
+    What a search has weighted by is from the base's residual, which holds more than noise.
+    """
+    told, levels = with_noise(fit, experiments), []
+    for o, own in zip(fit.channels, colour.each, strict=True):
+        j = o.number
+        rows = zip(o.records, o.parts, strict=True)
+        left = np.concatenate([p * (experiments[k].share(j) / told[k].share(j)) for k, p in rows])
+        levels.append(noise_rms(left, own) * noise_share(told, j))
+    return told, tuple(levels)
+
+
 def excess_power(residual: FloatArray, colour: Colour, floor: float | None = None) -> float:
     """Return the power [m^2] of a residual above its noise, negative where that is less.
 
@@ -206,18 +231,6 @@ def rms(values: FloatArray) -> float:
     """Root mean square of the values that exist; 0 without any."""
     valid = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(valid**2))) if valid.size else 0.0
-
-
-def uncertain(residual: FloatArray) -> float:
-    """Return the relative standard error of the noise's power from a residual's fast part.
-
-    About 2/sqrt(n) of white noise. The power of a first-order autoregression hangs on what its fast
-    part tells of the correlation r: 1.4 q/sqrt(n) with q = (1 + r)/(1 - r), within a fifth of what
-    60 draws each of r = 0.4 to 0.9 and n = 2,000 to 5,000 showed; at most 1.
-    """
-    r = first_order_noise(residual)[1] if residual.size else 0.0
-    factor = max(2.0, 1.4 * (1.0 + r) / (1.0 - r))
-    return float(min(1.0, factor / np.sqrt(max(residual.size, 1))))
 
 
 def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:

@@ -13,7 +13,7 @@ from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.refitting import relevelled_all
+from psa_casadi.identification.refitting import relevelled
 from psa_casadi.model.ranges import inside_ranges
 from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
@@ -97,7 +97,7 @@ class Pack:
 
     def ended(self, fit: Fit, experiments: Sequence[Experiment]) -> Fit:
         """Return a fit at its end, with the noise that it leaves of every output."""
-        return relevelled_all(fit, experiments)
+        return relevelled(fit, experiments, every=True)[0]
 
 
 @dataclass(frozen=True)

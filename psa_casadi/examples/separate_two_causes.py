@@ -11,7 +11,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from psa_casadi.design.experiment.experiment import Separated, resolving_experiment, usual_records
+from psa_casadi.design.experiment.experiment import (
+    Separated,
+    columns_to_play,
+    resolving_experiment,
+    usual_records,
+)
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
@@ -19,6 +24,7 @@ from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, write_record
+from psa_casadi.records.signals import Signals
 from psa_casadi.simulation.simulate import simulate
 
 EFFECT, RIVAL = "field_dependent_gain", "sensor_nonlinearity"
@@ -34,8 +40,7 @@ def main(folder: Path) -> dict[str, str]:
     effects = [EFFECTS[EFFECT], EFFECTS[RIVAL]]
     before = diagnose([first], effects=effects)
     design = resolving_experiment(before, limits=LIMITS, effort=Effort(draws=2, starts=1, steps=3))
-    time, voltage = design.record.time, design.record.voltage
-    write_record(folder / "voltage.csv", {"time [s]": time, "voltage [V]": voltage})
+    write_record(folder / "voltage.csv", columns_to_play(design))
     played = {n: measured(r, seed=2) for n, r in {**usual, "designed": design.record}.items()}
     after = {n: diagnose([first, r], effects=effects) for n, r in played.items()}
     _draw(folder / "separate_two_causes.png", design, played, after)
@@ -44,14 +49,13 @@ def main(folder: Path) -> dict[str, str]:
     }
 
 
-def measured(record: Record, seed: int) -> Record:
+def measured(record: Signals, seed: int) -> Record:
     """Return what the device's sensor shows when a voltage is played to it."""
+    voltage = record.columns["voltage"]
     model = stack_model("P-885.51").with_effect(EFFECTS[EFFECT], {"field_gain": GROWTH})
-    x = simulate(model, record.time, record.voltage).outputs["displacement"]
+    x = simulate(model, record.time, voltage).outputs["displacement"]
     noise = NOISE * np.random.default_rng(seed).standard_normal(record.n)
-    return Record(
-        name=record.name, time=record.time, voltage=record.voltage, displacement=x + noise
-    )
+    return Record(name=record.name, time=record.time, voltage=voltage, displacement=x + noise)
 
 
 def said(d: Diagnosis) -> str:

@@ -73,16 +73,17 @@ def determinacy(
     errors: FloatArray = np.sqrt(np.maximum(np.diag(of_values), 0.0))
     intervals, undetermined, on_bound = {}, [], []
     for k, name in enumerate(unknowns.names):
-        value, half = fit.model.values[name], _NORMAL_95 * errors[k]
+        value, half = fit.model.values[name], _NORMAL_95 * float(errors[k])
         parameter = fit.model.parameter(name)
-        if parameter.log:
+        log = parameter.log and value > 0.0
+        if log:
             factor = float(np.exp(min(half / value, 50.0)))
             intervals[name] = Interval(value / factor, value * factor)
         else:
             intervals[name] = Interval(value - half, value + half)
-        size = value if parameter.log else parameter.typical(fit.model.values)
+        size = value if log else parameter.typical(fit.model.values)
         edge = 1e-6 * abs(unknowns.scale[k])
-        vanished = parameter.log and value - unknowns.low[k] <= edge
+        vanished = log and value - unknowns.low[k] <= edge
         if name in not_unique or vanished or errors[k] > DETERMINED_WIDTH * abs(size):
             undetermined.append(name)
         elif min(value - unknowns.low[k], unknowns.high[k] - value) <= edge:

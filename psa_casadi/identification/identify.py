@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,8 @@ from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import Progress, record_rms, refit, relevelled
-from psa_casadi.identification.search import Search, StartOutcome, loads_as_curves, search_forms
+from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
+from psa_casadi.identification.search import loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
     doubtful_quantity,
     doubtful_sign,
@@ -40,13 +40,9 @@ from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
-from psa_casadi.shown import Reported, frame
+from psa_casadi.shown import made
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
-from psa_casadi.variables import Provenance
-from psa_casadi.version import __version__
 
-#: A record whose residual is this many times its own noise is missed by the model.
-_MISSED = 1.5
 #: Rounds of fitting with every record's own residual as its noise level.
 _LEVEL_ROUNDS = 2
 
@@ -58,52 +54,21 @@ INTERRUPTED = note("interrupted")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identification(Reported):
-    """An identified model with the fit behind it, what the data determine, and doubts.
+class StackIdentification(Identification):
+    """The identification of a stack.
 
-    `starts` tells what became of every start of the search; `notes` what was done to the records
-    (samples masked, averaged), which is no doubt. `warnings` and `sentences` are both in words.
-    `combinations` holds what is known of
-    parameters that trade off; `advice` the further records that would determine what is open.
-    `read_off` names parameters that were found without a fit (the paper's method). `interrupted`
-    says that a keyboard interrupt ended the search, or the advice after it.
+    `combinations` holds what is known of parameters that trade off; `advice` the further records
+    that would determine what is open. `read_off` names parameters that were found without a fit
+    (the paper's method).
     """
 
-    model: Model
-    fit: Fit
-    determinacy: Determinacy
-    experiments: tuple[Experiment, ...]
-    doubts: tuple[Note | str, ...]
-    starts: tuple[StartOutcome, ...] = ()
-    notes: tuple[Note | str, ...] = ()
     combinations: tuple[Combination, ...] = ()
     advice: tuple[Advice, ...] = ()
     read_off: tuple[str, ...] = ()
-    interrupted: bool = False
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is to be doubted, in words."""
-        return texts(self.doubts)
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What was done to the records and found in them, in words."""
-        return texts(self.notes)
-
-    def to_frame(self) -> Any:
-        """Return the parameters as a pandas DataFrame: value, 95 % interval, unit, meaning."""
-        parameters = self.model.structure.parameters
-        intervals = [self.model.provenance.intervals.get(p.name) for p in parameters]
-        columns = {
-            "parameter": [p.name for p in parameters],
-            "value": [self.model.values[p.name] for p in parameters],
-            "low": [float("nan") if i is None else i.low for i in intervals],
-            "high": [float("nan") if i is None else i.high for i in intervals],
-            "unit": [p.unit for p in parameters],
-            "meaning": [p.description for p in parameters],
-        }
-        return frame(columns)
+    def __repr__(self) -> str:
+        """Return the result in one line."""
+        return str(made("line", self))
 
 
 @interruptible_work()
@@ -115,7 +80,7 @@ def identify(
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
     progress: Progress = lambda _: None,
-) -> Identification:
+) -> StackIdentification:
     """Fit the base model, or `model`, to all samples of all records.
 
     `records` are those of one device: a record, the path of a file, a data frame or a mapping of
@@ -179,7 +144,7 @@ def identify(
             advised = advice(best, experiments, determined, force_scale_given=given)
         except KeyboardInterrupt:
             current_work().wrap_up()
-    return Identification(
+    return StackIdentification(
         model=with_provenance(
             best.model,
             determined,
@@ -193,7 +158,8 @@ def identify(
         experiments=experiments,
         doubts=(
             *(s for doubt in _DOUBTS if (s := doubt(fitted))),
-            *_of_fit(best, determined, found, experiments),
+            *doubts_of(best, determined, found.starts, found.not_unique),
+            *_missed(best, experiments),
         ),
         starts=found.starts,
         notes=(
@@ -222,33 +188,29 @@ def with_provenance(
     current = capacitance_of(records)
     fits = current is not None and current.source == "current" and current.is_that_of(c_p)
     told = {"C_p": current.interval} if current is not None and fits else {}
-    provenance = Provenance(
-        identified_from=tuple((r.name, r.sha256) for r in records),
-        package_version=__version__,
-        free=found.names,
-        intervals={**told, **found.intervals},
-        force_scale="given" if stiffness_given else "assumed",
-        interrupted=interrupted,
-        notes=(
-            *((str(INTERRUPTED),) if interrupted else ()),
-            *(() if stiffness_given else (str(FORCE_NOTE),)),
-            *((current.sentence(c_p),) if current is not None else ()),
+    return replace(
+        with_told(
+            model, records, found.names, {**told, **found.intervals},
+            force_scale="given" if stiffness_given else "assumed",
+            interrupted=interrupted,
+            notes=(
+                *((str(INTERRUPTED),) if interrupted else ()),
+                *(() if stiffness_given else (str(FORCE_NOTE),)),
+                *((current.sentence(c_p),) if current is not None else ()),
+            ),
         ),
-    )
-    return replace(model, provenance=provenance, evidence=evidence)
+        evidence=evidence,
+    )  # fmt: skip
 
 
 def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
     """Return the model of the best fit so far, marked as that of a search that was interrupted."""
-    found = Provenance(
-        identified_from=tuple((r.name, r.sha256) for r in records),
-        package_version=__version__,
-        free=best.unknowns.names,
+    return with_told(
+        best.model, records, best.unknowns.names, {},
         force_scale="given" if stiffness_given else "assumed",
         notes=(str(INTERRUPTED), *(() if stiffness_given else (str(FORCE_NOTE),))),
         interrupted=True,
-    )
-    return replace(best.model, provenance=found, evidence=None)
+    )  # fmt: skip
 
 
 def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
@@ -263,34 +225,19 @@ def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Pro
             break
         progress("base fit with every record's own noise level")
         try:
-            best = refit(best, experiments, best.unknowns.names, sigma=levels)
+            best = refit(best, experiments, sigma=levels)
         except KeyboardInterrupt:
             return replace(best, interrupted=True, converged=False)
     return best
 
 
-def _of_fit(
-    best: Fit, found: Determinacy, searched: Search, experiments: Sequence[Experiment]
-) -> list[Note]:
-    """Return what of a fit is to be doubted: its end, its minimum, bounds, what it misses."""
+def _missed(best: Fit, experiments: Sequence[Experiment]) -> list[Note]:
+    """Return the records that a fit misses by more than their noise."""
     notes = []
-    if best.interrupted:
-        notes.append(INTERRUPTED)
-    elif not best.converged:
-        notes.append(note("cut_off"))
-    followed = [s for s in searched.starts if s.agrees is not None]
-    if searched.not_unique:
-        notes.append(note("not_unique", names=searched.not_unique))
-    elif sum(bool(s.agrees) for s in followed) == 1:
-        notes.append(note("one_start", starts=len(searched.starts)))
-    notes += [note("on_bound", name=name) for name in found.on_bound]
-    alone = [n for n in found.undetermined if n not in searched.not_unique]
-    if alone:
-        notes.append(note("undetermined", names=alone))
     for e, residual in zip(experiments, best.residuals_of(experiments), strict=True):
         if len(residual) < 8:
             continue
         rms, noise = float(np.sqrt(np.mean(residual**2))), high_frequency_noise(residual)
-        if noise > 0 and rms > _MISSED * noise:
+        if noise > 0 and rms > MISSED * noise:
             notes.append(note("missed", record=e.record.name, times=rms / noise))
     return notes

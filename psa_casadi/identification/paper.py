@@ -23,7 +23,7 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.identify import Identification, with_provenance
+from psa_casadi.identification.identify import StackIdentification, with_provenance
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
@@ -591,9 +591,9 @@ def in_forces(
         if within or (name == "n" and np.isfinite(value)):
             kept[name] = float(np.clip(value, low, high))
         if not within:
-            limits = {"unit": parameter.unit, "low": low, "high": high}
             instead = kept.get(name, usual.values[name])
-            notes.append(note("out_of_range", name=name, value=value, instead=instead, **limits))
+            notes.append(note("out_of_range", name=name, value=value, instead=instead,
+                              unit=parameter.unit, low=low, high=high))  # fmt: skip
     found = tuple(name for name in start.parameter_names if name in kept)
     return usual.with_values(kept), found, notes
 
@@ -648,7 +648,7 @@ def identify_by_paper(
     *,
     stiffness: float | None = None,
     progress: Callable[[str], None] = lambda _: None,
-) -> Identification:
+) -> StackIdentification:
     """Return the paper's identification with its residuals on all records, as `identify` does.
 
     Nothing is fitted but each record's memory and offset; so there are no intervals. The warnings
@@ -671,7 +671,7 @@ def identify_by_paper(
     model = with_provenance(best.model, nothing, records, stiffness is not None)
     notes = (*model.provenance.notes, str(note("paper", names=found)))
     provenance = replace(model.provenance, notes=notes)
-    return Identification(
+    return StackIdentification(
         model=replace(model, provenance=provenance),
         fit=best,
         determinacy=nothing,

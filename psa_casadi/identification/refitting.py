@@ -24,7 +24,7 @@ from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured, predict
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.model.compose import Model
-from psa_casadi.records.noise import high_frequency_noise
+from psa_casadi.records.noise import first_order_noise, high_frequency_noise, uncertain
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
@@ -64,9 +64,9 @@ POLISH = 100
 #: The stepper's loosest tolerance, and its tolerance over the noise's share of the range, in quick
 #: fits. Its error is some six times the tolerance, of the range.
 _QUICK_RTOL, _OF_NOISE = 1e-4, 0.02
-#: Rounds of fits with a further column's residual as its noise level; logarithms of levels that are
-#: the same differ by less.
-_LEVEL_ROUNDS, _SAME_LEVEL = 2, 0.02
+#: Rounds of fits with a further channel's residual as its noise level, and with every one's;
+#: logarithms of levels that are the same differ by less.
+_LEVEL_ROUNDS, _ALL_ROUNDS, _SAME_LEVEL = 2, 4, 0.02
 #: Fits whose costs differ by less, in units of the log-likelihood's double, are equally good.
 _EQUAL = 3.84
 #: ... or by less than this share of what the model's own error adds to the cost.
@@ -119,14 +119,17 @@ def residual_noise(previous: Fit, experiments: Sequence[Experiment]) -> list[flo
 def refit(
     previous: Fit,
     experiments: Sequence[Experiment],
-    free: Sequence[str],
+    free: Sequence[str] | None = None,
     *,
     sigma: Sequence[float] | None = None,
     least: float = np.inf,
+    evaluations: int = POLISH,
+    tolerance: float = 1e-5,
 ) -> Fit:
-    """Continue a fit from where it stands, with the noise level its residuals suggest.
+    """Continue a fit from where it stands, of the same parameters unless others are `free`.
 
-    It may end early where the rms will stay above `least` [m].
+    Without `sigma` the noise levels are those that its residuals suggest. It may end early where
+    the rms will stay above `least`, in the unit of the first output.
     """
     levels = sigma or residual_noise(previous, experiments)
     parts = zip(previous.residuals_of(experiments), levels, strict=True)
@@ -134,47 +137,35 @@ def refit(
     return fit(
         previous.model,
         experiments,
-        free,
+        previous.unknowns.names if free is None else free,
         sigma=levels,
         start_states=previous.starts(),
-        evaluations=POLISH,
+        evaluations=evaluations,
+        tolerance=tolerance,
         goal=now * (least / max(previous.rms, 1e-300)) ** 2,
     )
 
 
-def relevelled(best: Fit, experiments: Sequence[Experiment]) -> tuple[Fit, tuple[Experiment, ...]]:
-    """Fit again with what the fit leaves of every further column as that column's noise level.
+def relevelled(
+    best: Fit, experiments: Sequence[Experiment], *, every: bool = False
+) -> tuple[Fit, tuple[Experiment, ...]]:
+    """Fit again with what the fit leaves of every further channel as its noise level.
 
-    As it is without such columns, and where a fit was interrupted.
+    And of the first one where it is asked of `every` channel, until the levels stay the same. As it
+    is where there is no such channel, and where a fit was interrupted.
     """
-    now = tuple(experiments)
-    for _ in range(_LEVEL_ROUNDS if best.further else 0):
-        if best.interrupted:
+    now, rounds = tuple(experiments), _ALL_ROUNDS if every else _LEVEL_ROUNDS
+    for _ in range(rounds if best.further else int(every)):
+        told = best.channels if every else best.further
+        levels = [f.relevelled() for f in told]
+        pairs = zip(told, levels, strict=True)
+        same = all(abs(float(np.log(f.level / q.level))) < _SAME_LEVEL for f, q in pairs)
+        if best.interrupted or same:
             break
-        levels = [f.relevelled() for f in best.further]
-        pairs = zip(best.further, levels, strict=True)
-        if all(abs(float(np.log(f.level / q.level))) < _SAME_LEVEL for f, q in pairs):
-            break
-        now = tuple(e.beside(levels) for e in now)
-        best = refit_or_keep(best, now, best.unknowns.names, best.sigma)
+        now = tuple(e.beside(levels[every:]) for e in now)
+        sigma = [max(levels[0].level, 1e-300)] * len(now) if every else best.sigma
+        best = refit_or_keep(best, now, sigma=sigma, tolerance=1e-6 if every else 1e-5)
     return best, now
-
-
-def relevelled_all(best: Fit, experiments: Sequence[Experiment], rounds: int = 4) -> Fit:
-    """Fit again with every channel's residual as its noise level, until that stays the same."""
-    for _ in range(rounds if best.further else 1):
-        first = best.channels[0].relevelled().level
-        levels = [f.relevelled() for f in best.further]
-        before = [best.sigma[0], *(f.level for f in best.further)]
-        change = np.log(np.array([first, *(c.level for c in levels)]) / np.array(before))
-        if best.interrupted or np.max(np.abs(change)) < _SAME_LEVEL:
-            break
-        best = fit(
-            best.model, [e.beside(levels) for e in experiments], best.unknowns.names,
-            sigma=[max(first, 1e-300)] * len(experiments), start_states=best.starts(),
-            evaluations=POLISH, tolerance=1e-6,
-        )  # fmt: skip
-    return best
 
 
 def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]:
@@ -182,12 +173,59 @@ def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]
     return [e.beside(f.channel for f in before.further) for e in experiments]
 
 
+#: Noise is estimated from so many samples or more, and differs from so many standard errors on.
+_TELLING, _SURE = 32, 3.0
+
+
+def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+    """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
+
+    Of every output, over the usual one of all experiments (the geometric mean by samples). A share
+    that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
+    """
+    shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
+    whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
+    shown = fit.shown(experiments) if whole else []
+    for o in fit.channels:
+        j = o.number
+        rows = ((k, experiments[k], shown[k][:, j]) for k in whole)
+        begun = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
+        fitted = zip(o.records, o.parts, strict=True)
+        found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
+        if len(found) < 2:
+            continue
+        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in found]
+        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in found])
+        for (k, part), own in zip(found, over, strict=True):
+            if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
+                shares[k][j] *= float(np.exp(own))
+    return tuple(replace(e, noise=tuple(own)) for e, own in zip(experiments, shares, strict=True))
+
+
+def unlike(experiments: Sequence[Experiment], others: Sequence[Experiment]) -> bool:
+    """Whether the shares of the noise differ."""
+    channels = range(len(experiments[0].channels))
+    pairs = zip(experiments, others, strict=True)
+    return any(a.share(j) != b.share(j) for a, b in pairs for j in channels)
+
+
+def reweighted(best: Fit, experiments: Sequence[Experiment]) -> Fit:
+    """Fit again with other shares of the noise."""
+    again = refit(best, weighted(best, experiments), sigma=best.sigma, tolerance=1e-6)
+    return relevelled(again, experiments, every=True)[0]
+
+
 def refit_or_keep(
-    previous: Fit, experiments: Sequence[Experiment], free: Sequence[str], sigma: Sequence[float]
+    previous: Fit,
+    experiments: Sequence[Experiment],
+    free: Sequence[str] | None = None,
+    *,
+    sigma: Sequence[float],
+    tolerance: float = 1e-5,
 ) -> Fit:
     """Return the `refit`, or the previous fit where that leads to what cannot be simulated."""
     try:
-        return refit(previous, experiments, free, sigma=sigma)
+        return refit(previous, experiments, free, sigma=sigma, tolerance=tolerance)
     except PsaError:
         return previous
 
@@ -281,7 +319,8 @@ def without_blur(best: Fit, experiments: Sequence[Experiment]) -> Fit:
     k = names.index("k_P")
     if np.sqrt(covariance_of(best, experiments)[k, k]) < _SHARP:
         return best
-    return refit_or_keep(best, experiments, [n for n in names if n != "k_P"], best.sigma)
+    free = [n for n in names if n != "k_P"]
+    return refit_or_keep(best, experiments, free, sigma=best.sigma)
 
 
 def exchanged(

@@ -9,7 +9,7 @@ Where the displacement's sensor bends, that model is bent with it, and the load 
 curve over what the same model predicts that is fitted to the load itself.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +20,7 @@ from psa_casadi.components.stack import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.force_start import retuned
+from psa_casadi.identification.multistart import fits_from
 from psa_casadi.identification.refitting import (
     Progress,
     differing,
@@ -34,6 +35,7 @@ from psa_casadi.identification.refitting import (
     with_fast,
     without_blur,
 )
+from psa_casadi.identification.result import StartOutcome
 from psa_casadi.identification.start.ordinary import FORMS
 from psa_casadi.identification.start.starting_points import (
     LinearCandidate,
@@ -63,20 +65,6 @@ _NEAR = 1.5
 _MISSED, _FOLLOWED = 2.0, 4
 #: A start whose quick fit comes this close to the best one's cost is followed to the end.
 _CLOSE = 1.02
-
-
-@dataclass(frozen=True)
-class StartOutcome:
-    """One start of the search: its name, the cost and rms [m] it led to, and what became of it.
-
-    `agrees` is True where it led to the same minimum as the best, False where it led elsewhere,
-    None where the quick fit was so much worse that it was not followed to the end.
-    """
-
-    name: str
-    cost: float
-    rms: float
-    agrees: bool | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +140,6 @@ def _search(
     starts = starting_points(model, linear, records)
     found = _quick_fits(model, experiments, [*core, *told], starts, progress, keep)
     keep(found[0][1])
-    free = found[0][1].unknowns.names
     sigma = residual_noise(found[0][1], experiments)
     polished: list[Fit] = []
     for name, quick in found:
@@ -164,7 +151,7 @@ def _search(
         if polished and not thorough and same_place(found[0][1], quick, experiments):
             continue
         progress(f"base fit, {name} to the end")
-        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, free, sigma)
+        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, sigma=sigma)
         polished.append(ended)
         keep(min(polished, key=lambda f: f.data_cost))
     best = min(polished, key=lambda f: f.data_cost)
@@ -216,24 +203,15 @@ def _quick_fits(
     """Fit from every start with few evaluations; return those that could be simulated."""
     sigma = noise_levels(experiments)
     quickly: dict[str, Any] = {"sigma": sigma, "rtol": quick_rtol(sigma, experiments)}
-    found: list[tuple[str, Fit]] = []
     rounds: tuple[int, ...] = (_QUICK,) if len(starts) <= _FINALISTS else (_FIRST, _QUICK - _FIRST)
-    for name, start in starts:
+
+    def begun(name: str, start: Mapping[str, float]) -> Fit:
         progress(f"base fit from {name}")
-        try:
-            quick = fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
-        except PsaError:
-            continue
-        except KeyboardInterrupt:
-            if not found:
-                raise
-            found = [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
-            break
-        found.append((name, quick))
-        keep(min((f for _, f in found), key=lambda f: f.data_cost))
-        if quick.interrupted:
-            break
-    found.sort(key=lambda pair: pair[1].data_cost)
+        return fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
+
+    found = sorted(fits_from(starts, begun), key=lambda pair: pair[1].data_cost)
+    for _, best in found[:1]:
+        keep(best)
     widest = max(e.record.range_m for e in fitted(experiments))
     # a loop that diverges is left there, unless all do
     found = [pair for pair in found if pair[1].rms < widest] or found

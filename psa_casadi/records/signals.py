@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -100,6 +100,13 @@ class Signals(Plotted):
     def column(self, name: str) -> FloatArray | None:
         """Return the samples (n,) of a column by its name, None where it was not recorded."""
         return self.columns.get(name)
+
+    def slice(self, start: int, stop: int) -> "Signals":
+        """Return the samples `start <= k < stop`, eight at least; `sha256` is kept."""
+        part = slice(start, stop)
+        columns = {n: values[part] for n, values in self.columns.items()}
+        name = f"{self.name}[{start}:{stop}]"
+        return replace(self, name=name, time=self.time[part], columns=columns)
 
     @property
     def shown(self) -> str:

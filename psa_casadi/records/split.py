@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ from psa_casadi.notes import Note
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.repeats import held
+from psa_casadi.records.signals import Signals
 from psa_casadi.records.suspects import HIDDEN
 
 #: Turns by less than this share of the span are no reversals here; sizes of rises and falls are
@@ -94,15 +95,21 @@ def counts(
 _LONG = 10.0
 
 
-def without_gaps(records: Iterable[Record]) -> tuple[list[Record], list[str]]:
-    """Return the records, cut into parts where a gap hides what the voltage did; and what was cut.
+_Given = TypeVar("_Given", Record, Signals)
+
+
+def without_gaps(
+    records: Iterable[_Given], inputs: Sequence[str] = ("voltage",)
+) -> tuple[list[_Given], list[str]]:
+    """Return the records, cut into parts where a gap hides what an input did; and what was cut.
 
     A part begins as a record does, with a state that nobody knows: what the stack remembers of a
     gap is not what a straight line of the voltage would have left.
     """
-    parts, said = [], []
+    parts: list[_Given] = []
+    said = []
     for record in records:
-        at = gaps(record)
+        at: tuple[int, ...] = gaps(record, inputs)
         if not at:
             parts.append(record)
             continue
@@ -112,28 +119,32 @@ def without_gaps(records: Iterable[Record]) -> tuple[list[Record], list[str]]:
             f"{record.time[k + 1] - record.time[k]:.4g} s from {record.time[k]:.6g} s on"
             for k in at
         )
+        what = f"the {inputs[0]}" if len(inputs) == 1 else "an input"
         said.append(
-            f"{record.name}: no sample for {places}, while the voltage moves: what it did there is"
+            f"{record.name}: no sample for {places}, while {what} moves: what it did there is"
             f" not known, so that the {len(at) + 1} parts count as records of their own."
         )
     return parts, said
 
 
-def gaps(record: Record) -> tuple[int, ...]:
-    """Return the samples after which there is a gap that hides a motion of the voltage.
+def gaps(record: Record | Signals, inputs: Sequence[str] = ("voltage",)) -> tuple[int, ...]:
+    """Return the samples after which there is a gap that hides a motion of an input.
 
-    It is many times as long as the intervals before and after it, and a voltage that went on as it
+    It is many times as long as the intervals before and after it, and an input that went on as it
     did before, or as it does after it, would have missed its other end by more than a share of its
     range. Both parts have samples enough for a record.
     """
-    step, change = np.diff(record.time), np.diff(record.voltage)
+    step = np.diff(record.time)
     inner = np.arange(1, step.size - 1)
     around = np.maximum(step[:-2], step[2:])
-    missed = [
-        np.abs(change[inner] - step[inner] * change[side] / step[side])
-        for side in (inner - 1, inner + 1)
-    ]
-    hidden = np.maximum(*missed) > HIDDEN * np.ptp(record.voltage)
+    hidden = np.zeros(inner.size, dtype=np.bool_)
+    for values in [c for n in inputs if (c := record.column(n)) is not None]:
+        change = np.diff(values)
+        missed = [
+            np.abs(change[inner] - step[inner] * change[side] / step[side])
+            for side in (inner - 1, inner + 1)
+        ]
+        hidden |= np.maximum(*missed) > HIDDEN * np.ptp(values)
     found: list[int] = []
     for k in inner[(step[inner] > _LONG * around) & hidden].tolist():
         begin = found[-1] + 1 if found else 0
@@ -196,7 +207,7 @@ class Experiment:
     channels: tuple[Channel, ...] = (DISPLACEMENT,)
     noise: tuple[float, ...] | None = None
     known_start: bool = False
-    remarks: tuple[Note, ...] = ()
+    remarks: tuple[Note | str, ...] = ()
 
     @property
     def further(self) -> tuple[Channel, ...]:
@@ -242,6 +253,29 @@ class Experiment:
             self.measured(channel)
         )
         return found
+
+
+def noise_share(experiments: Sequence[Experiment], channel: int) -> float:
+    """Return the rms of a channel's `noise` over the samples that judge, else over the fitted."""
+    counts = [int(c.sum()) for c in counted(experiments, channel)]
+    squares = [e.share(channel) ** 2 for e in experiments]
+    return float(np.sqrt(np.average(squares, weights=counts)))
+
+
+def missed_rms(
+    experiments: Sequence[Experiment], shown: Sequence[FloatArray], channel: int
+) -> float:
+    """Return the rms of measured minus predicted of a channel, in its unit, over these samples."""
+    rows = zip(experiments, shown, counted(experiments, channel), strict=True)
+    errors = np.concatenate([(e.measured(channel) - y[:, channel])[c] for e, y, c in rows])
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def counted(experiments: Sequence[Experiment], channel: int) -> list[BoolArray]:
+    """Return the samples of a channel that judge, the fitted ones where none does."""
+    judged = [e.at(channel, e.held_out) for e in experiments]
+    some = any(j.any() for j in judged)
+    return judged if some else [e.at(channel) for e in experiments]
 
 
 def whole(record: Record) -> Experiment:

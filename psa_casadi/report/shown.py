@@ -8,16 +8,15 @@ from collections.abc import Callable, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psa_casadi.any_model.identify import OdeIdentification
-from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.diagnosis.result import Diagnosis
-from psa_casadi.identification.identify import Identification
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Population
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import Signals
-from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
+from psa_casadi.report.documents.files import AnyDiagnosisFile, DiagnosisFile
 from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
 from psa_casadi.report.page.results import write_fit_report, write_posterior, write_report
@@ -29,19 +28,11 @@ from psa_casadi.simulation.simulate import Trajectory
 
 _WORDS: dict[type, Callable[..., str]] = {
     Diagnosis: story,
-    Identification: identification_text,
+    StackIdentification: identification_text,
     Posterior: posterior_text,
 }
-Told = DiagnosisFile | OwnModelFile
-Reported = (
-    Diagnosis
-    | OdeDiagnosis
-    | Identification
-    | OdeIdentification
-    | Posterior
-    | Population
-    | Sequence[Finding]
-)
+Told = AnyDiagnosisFile
+Reported = OdeDiagnosis | Identification | Posterior | Population | Sequence[Finding]
 
 
 def report(result: Reported, path: str | os.PathLike[str], *, still: bool = False) -> None:
@@ -53,9 +44,9 @@ def report(result: Reported, path: str | os.PathLike[str], *, still: bool = Fals
     Raises:
         InputError: `path` cannot be written to.
     """
-    if isinstance(result, Diagnosis | OdeDiagnosis):
+    if isinstance(result, OdeDiagnosis):
         write_report(result, path, still=still)
-    elif isinstance(result, Identification | OdeIdentification):
+    elif isinstance(result, Identification):
         write_fit_report(result, path, still=still)
     elif isinstance(result, Posterior):
         write_posterior(result, path)
@@ -76,24 +67,17 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
 
 def line(result: Plotted | Told) -> str:
     """Return a result in one line."""
-    if isinstance(result, OdeIdentification | Signals):
-        return repr(result).partition("\n")[0]
-    if isinstance(result, OwnModelFile | OdeDiagnosis):
-        return f"<Diagnosis of an own model {result.verdict}{_causes(result)}>"
-    if isinstance(result, Diagnosis | DiagnosisFile):
-        before, after = (
-            e.holdout_nrmse_percent for e in (result.base_errors, result.extended_errors)
-        )
-        first = f"{number(before, 2)} -> " if before != after else ""
-        errors = f"{first}{number(after, 2)} % of range rms"
-        return f"<Diagnosis {result.verdict}{_causes(result)}; held-out error {errors}>"
-    if isinstance(result, Identification):
+    if isinstance(result, OdeDiagnosis | AnyDiagnosisFile):
+        return _diagnosis(result)
+    if isinstance(result, StackIdentification):
         count = len(result.experiments)
         span = max(e.record.range_m for e in result.experiments)
         rest = number(100.0 * result.fit.rms / span, 2)
         records = f"{count} record{'' if count == 1 else 's'}"
         free = len(result.determinacy.names)
         return f"<Identification: {free} parameters from {records}; residual {rest} % of range rms>"
+    if isinstance(result, Identification | Signals):
+        return repr(result).partition("\n")[0]
     if isinstance(result, Posterior):
         names = ", ".join(f.name for f in result.figures)
         return f"<Posterior of {names}: {result.chains} chains of {result.draws} draws>"
@@ -102,16 +86,22 @@ def line(result: Plotted | Told) -> str:
     return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
 
 
-def _causes(d: Diagnosis | OdeDiagnosis | Told) -> str:
-    causes = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
-    return f": {causes}" if causes else ""
+def _diagnosis(d: OdeDiagnosis | Told) -> str:
+    named = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
+    causes = f": {named}" if named else ""
+    if not isinstance(d, Diagnosis | DiagnosisFile):
+        return f"<Diagnosis of an own model {d.verdict}{causes}>"
+    before, after = (e.holdout_nrmse_percent for e in (d.base_errors, d.extended_errors))
+    first = f"{number(before, 2)} -> " if before != after else ""
+    errors = f"{first}{number(after, 2)} % of range rms"
+    return f"<Diagnosis {d.verdict}{causes}; held-out error {errors}>"
 
 
 def cell(result: Plotted | Model | Told) -> str:
     """Return a result as a notebook shows it: its words, and its picture or table."""
     if isinstance(result, Model):
         return filled("cell.html", lines=[repr(result)], table=parameter_table(result))
-    if isinstance(result, DiagnosisFile | OwnModelFile):
+    if isinstance(result, AnyDiagnosisFile):
         return filled("cell.html", lines=[line(result), result.remaining.where, *result.notes])
     buffer = io.BytesIO()
     plot(result).savefig(buffer, format="png", dpi=60)

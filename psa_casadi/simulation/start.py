@@ -27,11 +27,11 @@ _CHUNK = 1024
 
 @dataclass(frozen=True)
 class Start:
-    """Initial state (nx,) and its derivatives with respect to parameters and memory deviations."""
+    """Initial state (nx,), its derivatives by parameters (nx, np) and by deviations (nx, m)."""
 
     x: FloatArray
     by_parameter: FloatArray
-    by_memory: FloatArray
+    by_start: FloatArray
 
 
 def memory_names(structure: Structure) -> tuple[str, ...]:
@@ -66,16 +66,7 @@ def start_on(
     return start_state(model, list(u[0]), rates, memory, float(t[0]))
 
 
-@dataclass(frozen=True)
-class Begun:
-    """Initial state (nx,), its derivatives by parameters (nx, np) and by deviations (nx, m)."""
-
-    x: FloatArray
-    by_parameter: FloatArray
-    by_start: FloatArray
-
-
-def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, float]) -> Begun:
+def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, float]) -> Start:
     """Return the start for samples u (n, nu) at times t (n,) [s], and deviations of some states.
 
     A stack begins where the first inputs and their rates put it (`start_on`); any other model at
@@ -84,7 +75,7 @@ def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, f
     names = model.state_names
     if not is_stack(model):
         found = _declared(model, u[0], deviations)
-        return Begun(
+        return Start(
             found.x, found.by_parameter, found.by_start[:, [*map(names.index, deviations)]]
         )
     memories = memory_names(model.structure)
@@ -92,11 +83,11 @@ def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, f
     x, moved = start.x.copy(), np.zeros((len(names), len(deviations)))
     for column, (name, deviation) in enumerate(deviations.items()):
         if name in memories:
-            moved[:, column] = start.by_memory[:, memories.index(name)]
+            moved[:, column] = start.by_start[:, memories.index(name)]
         else:
             x[names.index(name)] += deviation
             moved[names.index(name), column] = 1.0
-    return Begun(x, start.by_parameter, moved)
+    return Start(x, start.by_parameter, moved)
 
 
 def is_stack(model: Model) -> bool:
@@ -111,7 +102,7 @@ def resting_states(structure: Structure) -> tuple[str, ...]:
     return tuple(s.name for c in effects for s in c.states if not s.memory)
 
 
-def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float]) -> Begun:
+def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float]) -> Start:
     """Return the start at the declared values and deviations, with derivatives by all states.
 
     x_0 = declared start + deviation; filters of effects start where they would rest:
@@ -124,7 +115,7 @@ def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float])
     names = resting_states(s)
     resting = [k for k, q in enumerate(s.states) if q.name in names]
     if not resting:
-        return Begun(x, by_p, by_x)
+        return Start(x, by_p, by_x)
     rest = _rest(s)
     for _ in range(_FILTER_STEPS):
         rates, slopes, _ = (np.array(a) for a in rest(0.0, x, inputs, p))
@@ -140,7 +131,7 @@ def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float])
     by_p[resting] = -own @ by_parameter
     by_x[np.ix_(resting, others)] = -own @ slopes[:, others]
     by_x[np.ix_(resting, resting)] = 0.0
-    return Begun(x, by_p, by_x)
+    return Start(x, by_p, by_x)
 
 
 @cache

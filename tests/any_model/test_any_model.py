@@ -16,12 +16,13 @@ from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.runs import runs_of
-from psa_casadi.any_model.sizes import Sizes, sizes_of
+from psa_casadi.diagnosis.result import DiagnosisInterrupted
+from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Signals
-from psa_casadi.report.words.own_words import own_verdict_sentence
+from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import record_inputs
+from psa_casadi.simulation.sizes import Sizes, sizes_of
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor, oscillator, pair, tanks
 from tests.report.browser import DARK, find_browser
@@ -97,7 +98,7 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert f"extended model {rms:.2f} µm" in page.text
     rival = replace(d.causes[0], confidence=0.6, cannot_be_told_from=("stop_of_x",))
     said = "(the rate of v, confidence 60 %: more likely than not; or stop of x)"
-    assert said in own_verdict_sentence(replace(d, causes=(rival,)))
+    assert said in verdict_sentence(replace(d, causes=(rival,)))
     assert re.search(r"hysteresis_of_x_in_v_n 0\.99\d+ 0\.99\d+ to 1\.0\d+ 1 fit", page.text)
     assert page.loaded == []
     assert page.targets <= page.names
@@ -165,7 +166,7 @@ def test_an_oscillator_is_sampled_and_compared(
     (mu,) = names["drawn"].figures
     assert abs(mu.mean - 1.0) < 4.0 * mu.sd < 0.05
     page = Page((tmp_path / "both.html").read_text("utf-8"))
-    assert "Beyond noise, mu differs (1 parameters compared)." in page.text
+    assert "Beyond noise, mu differs (1 parameter compared)." in page.text
 
 
 @pytest.mark.slow
@@ -191,7 +192,7 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     )
     assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
     assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
-    assert f"it removes {share.text} of the held-out error" in " ".join(repr(d).split())
+    assert f"friction in speed removes {share.text}." in " ".join(repr(d).split())
     _run(effect, names)
     assert [c.effect for c in names["worn_result"].causes] == ["brush_drop"]
     _run(posterior, names)
@@ -225,11 +226,27 @@ def test_a_cause_that_no_effect_has_is_unexplained() -> None:
     valid("own_model", d.to_json())
 
 
+@pytest.mark.parametrize(
+    ("word", "effects"), [("screening", []), ("judging", ["friction_in_speed"])]
+)
+def test_an_interrupt_keeps_the_best_model_so_far(word: str, effects: list[str]) -> None:
+    def stop(told: str) -> None:
+        if told.startswith(word):
+            raise KeyboardInterrupt
+
+    with pytest.raises(DiagnosisInterrupted) as ended:
+        psa.diagnose(motor(), plants.motor(1), starts=1, progress=stop)
+    found = ended.value.model
+    assert [c.name for c in found.effects] == effects
+    assert found.provenance.interrupted
+    assert found.values["R"] == pytest.approx(1.2, rel=0.05)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [oscillator, tanks, pair])
 def test_ports_and_effects_of_gain_0_leave_a_model_as_it_is(make: Callable[[], psa.Model]) -> None:
     model = make()
-    runs = runs_of(model, [_quiet(model)], judged=False)
+    runs = experiments_of(model, [_quiet(model)], judged=False)
     table = effects_of(model, sizes_of(model, runs))
     assert len({e.name for e in table}) == len(table)
     opened, every = with_ports(model), extended(model, table)

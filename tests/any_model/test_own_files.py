@@ -14,7 +14,7 @@ import pytest
 from scipy.io import savemat
 
 import psa_casadi as psa
-from psa_casadi.any_model.runs import given_to, runs_of
+from psa_casadi.identification.experiments import experiments_of, given_to
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -94,7 +94,7 @@ def _matlab(path: Path) -> Path:
 
 def _run(given: Any) -> Experiment:
     model = _pump()
-    (run,) = runs_of(model, given_to(model, given, None), judged=False)
+    (run,) = experiments_of(model, given_to(model, given, None), judged=False)
     return run
 
 
@@ -142,6 +142,7 @@ def test_tables_and_signals_are_read_in_the_units_of_the_model() -> None:
     _assert_is_the_record(signals)
     _assert_is_the_record(signals.to_frame())
     assert signals.plot(output="flow").axes[0].get_ylabel() == "flow [l/min]"
+    assert len(signals.plot().axes) == len(signals.columns)
 
 
 def test_the_same_record_in_other_units_is_the_same_identification(tmp_path: Path) -> None:
@@ -172,7 +173,7 @@ def test_a_stacks_record_drives_any_model_and_signals_a_stack() -> None:
         values={"k": 1.0},
     )
     record = psa.Record(name="r", time=T, voltage=10.0 * VALVE, strain=1e-6 * SPEED)
-    (run,) = runs_of(model, given_to(model, record, "zero"), judged=False)
+    (run,) = experiments_of(model, given_to(model, record, "zero"), judged=False)
     np.testing.assert_allclose(_columns(run, model.input_names)[:, 0], 1e-2 * VALVE, rtol=1e-12)
     np.testing.assert_allclose(_columns(run, model.output_names)[:, 0], SPEED, rtol=1e-12)
     assert (run.record.hold, run.record.sha256) == ("zero", record.sha256)
@@ -263,10 +264,10 @@ def _spoilt(record: psa.Signals, outputs: tuple[str, ...], seed: int) -> dict[st
 def test_one_reading_in_a_hundred_that_is_far_off_is_masked_in_its_output_alone() -> None:
     record = plants.cylinder(30)[0]
     model = cylinder(dead_zone=0.6)
-    (clean,) = runs_of(model, [record], judged=False)
+    (clean,) = experiments_of(model, [record], judged=False)
     assert np.isfinite(_columns(clean, model.output_names)).all()
     given = _spoilt(record, ("pressure",), 1)
-    (run,) = runs_of(model, given_to(model, given, None), judged=False)
+    (run,) = experiments_of(model, given_to(model, given, None), judged=False)
     off = given["pressure"] != record.columns["pressure"]
     lost = np.isnan(_columns(run, model.output_names))
     assert not lost[:, 0].any()
@@ -292,7 +293,7 @@ def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_told() -> None:
     y[700:760] = y[700]
     top = float(np.quantile(y, 0.9))
     given = {"time": record.time, **record.columns, "w": np.minimum(y, top)}
-    (run,) = runs_of(motor(), given_to(motor(), given, None), judged=False)
+    (run,) = experiments_of(motor(), given_to(motor(), given, None), judged=False)
     lost = np.isnan(_columns(run, motor().output_names)[:, 0])
     assert np.mean(lost[y >= top]) > 0.99
     assert lost[701:760].all()

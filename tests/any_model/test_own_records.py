@@ -72,3 +72,19 @@ def test_columns_in_another_unit_are_told() -> None:
     found = psa.identify(motor(), {"time": record.time, **columns}, starts=1)
     assert any("of its own movement: see that its column" in w for w in found.warnings)
     assert "No record has a column 'i'; that output is not compared." in found.warnings
+
+
+def test_what_an_input_did_in_a_gap_is_not_guessed() -> None:
+    whole = plants.motor(2, friction=0.0)
+    kept = np.r_[0:1200, 1500:3000]
+    columns = {n: values[kept] for n, values in whole.columns.items()}
+    record = replace(whole, time=whole.time[kept], columns=columns, sha256="")
+    found = psa.identify(motor(), record, starts=1)
+    assert [e.record.name for e in found.experiments] == ["drive[0:1200]", "drive[1200:2700]"]
+    assert any(
+        "no sample for 0.301 s from 1.199 s on, while the voltage" in w for w in found.warnings
+    )
+    for name, value in {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}.items():
+        assert abs(found.model.values[name] - value) < 4.0 * found.errors[name]
+    held = psa.identify(motor(), replace(record, hold="zero"), starts=1)
+    assert len(held.experiments) == 1

@@ -8,14 +8,13 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.export.importer import masters
@@ -26,6 +25,7 @@ from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.units import FloatArray
+from tests.contract.helpers import command
 from tests.report.report_cases import diagnosis
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
@@ -134,7 +134,7 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Re
 
 
 @pytest.mark.parametrize(
-    ("command", "word", "told"),
+    ("name", "word", "told"),
     [
         ("diagnose", "screening", "there is no verdict; the best fit so far is the base model"),
         ("diagnose", "writing", "the diagnosis was finished before. Kept: {m}, {j}. Not"),
@@ -144,24 +144,24 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Re
     ],
 )
 def test_a_command_says_what_it_kept(
-    command: str, word: str, told: str, record: psa.Record, tmp_path: Path,
+    name: str, word: str, told: str, record: psa.Record, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     for home in ("diagnose", "identify"):
-        module = sys.modules[f"psa_casadi.cli.{home}"]
+        module = import_module(f"psa_casadi.cli.{home}")
         monkeypatch.setattr(module, "working", lambda *given: nullcontext(at(word)))
     if word == "writing":
         finished = diagnosis("cause_named")
-        module = sys.modules["psa_casadi.diagnosis.diagnose"]
+        module = import_module("psa_casadi.diagnosis.diagnose")
         monkeypatch.setattr(module, "diagnose", lambda *given, **options: finished)
     psa.write_record(tmp_path / "r.csv", record)
     m, j, r = (tmp_path / n for n in ("m.json", "d.json", "r.html"))
-    given = [command, str(tmp_path / "r.csv"), "-o", str(m), "--report", str(r), "--still"]
-    if command == "diagnose":
-        given += ["--json", str(j)]
-    ended = CliRunner().invoke(app, given)
-    assert ended.exit_code == 130
-    assert f"Interrupted: {told.format(m=m, j=j, r=r)}" in ended.stderr
+    given: list[str | Path] = [name, tmp_path / "r.csv", "-o", m, "--report", r, "--still"]
+    if name == "diagnose":
+        given += ["--json", j]
+    ended = command(*given)
+    assert ended.code == 130
+    assert f"Interrupted: {told.format(m=m, j=j, r=r)}" in ended.err
     assert m.exists() == ("Kept" in told or "best fit" in told)
     assert not r.exists()
     if m.exists():
@@ -186,22 +186,22 @@ def test_a_designed_voltage_is_kept_without_its_check(
     psa.write_record(tmp_path / "path.csv", path)
     voltage = tmp_path / "v.csv"
     given = ["design", "input", "--fast", "--stack", "P-885.51", "-o", str(voltage)]
-    ended = CliRunner().invoke(app, [*given, "--target", str(tmp_path / "path.csv")])
-    assert ended.exit_code == 130
-    assert f"the voltage was designed before. Kept: {voltage}." in ended.stderr
+    ended = command(*given, "--target", tmp_path / "path.csv")
+    assert ended.code == 130
+    assert f"the voltage was designed before. Kept: {voltage}." in ended.err
     assert voltage.exists()
 
 
 def test_files_that_stand_are_named_however_late_the_interrupt(
     record: psa.Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.modules["psa_casadi.cli.simulate"], "tell_written", cut)
+    monkeypatch.setattr(import_module("psa_casadi.cli.simulate"), "tell_written", cut)
     psa.write_record(tmp_path / "r.csv", record)
     out = tmp_path / "out.csv"
     given = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]
-    ended = CliRunner().invoke(app, given)
-    assert ended.exit_code == 130
-    assert f"Interrupted: written before: {out}." in ended.stderr
+    ended = command(*given)
+    assert ended.code == 130
+    assert f"Interrupted: written before: {out}." in ended.err
 
 
 @slow

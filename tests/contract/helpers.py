@@ -11,6 +11,7 @@ from contextvars import copy_context
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,8 @@ def _own_process(argv: list[str]) -> Iterator[None]:
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
     sys.argv = argv
     try:
-        yield
+        with patch.object(os, "_exit", sys.exit):  # as a command that was interrupted ends
+            yield
     finally:
         sys.argv, tempfile.tempdir = before, folder
         for number, handler in handlers.items():

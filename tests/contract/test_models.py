@@ -364,6 +364,27 @@ def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
     expected = 0.1 * decay + time / 2.5 - (1.0 - decay) / 2.5**2
     np.testing.assert_allclose(columns["place [mm]"], 1e3 * expected, rtol=1e-5)
     np.testing.assert_allclose(columns["force [N]"], time, rtol=1e-12)
+    plan = ("simulate", "--model", tmp_path / "m.json", "--input", ramp, "-o", tmp_path / "x.csv")
+    done(
+        *plan,
+        "--hold",
+        "zero",
+        "--start",
+        "x=0.3",
+        "--value",
+        "k=5",
+        "--figure",
+        tmp_path / "p.png",
+    )
+    held = [0.3]
+    for u in time[:-1]:  # x' = u - 5 x with u constant over 0.01 s
+        held.append(held[-1] * np.exp(-0.05) + u / 5.0 * (1.0 - np.exp(-0.05)))
+    places = table(tmp_path / "x.csv")["place [mm]"]
+    np.testing.assert_allclose(places, 1e3 * np.array(held), rtol=1e-5)
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    told = refused(*plan, "--start", "y=1", folder=tmp_path)
+    assert "no state or input 'y' to start from" in told
+    assert "give NAME=VALUE" in refused(*plan, "--value", "k", folder=tmp_path)
     for words in (("web", "-o", tmp_path / "w.html"), ("export", "ssp", "-o", tmp_path / "w.ssp")):
         told = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
         assert "A model of your own is for `psa identify`," in told

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.colour import (
-    Colour,
-    colour_of,
-    left_correlation,
-    omnibus,
-    uncertain,
-)
-from psa_casadi.records.noise import first_order_noise
+from psa_casadi.diagnosis.colour import Colour, colour_of, left_correlation, omnibus
+from psa_casadi.records.noise import first_order_noise, uncertain
 from psa_casadi.units import FloatArray
 from tests.studies.plants.noise import coloured
 from tests.tiers import slow_but

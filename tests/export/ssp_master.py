@@ -7,9 +7,13 @@ inputs held (an error of first order in the step) or, with `rates`, as straight 
 are the rates of the outputs that they come from (second order). No step is repeated.
 """
 
+import ctypes
+import importlib.metadata
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from graphlib import TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
 
@@ -168,3 +172,40 @@ def _refuse_growth(archive: SspArchive, port: Port, value: float) -> None:
 def points(step: float, end: float) -> FloatArray:
     """Return the communication points k step from 0 up to the end, shape (n,)."""
     return np.asarray(step * np.arange(round(end / step) + 1), dtype=float)
+
+
+_KICK, _COUNT, _TOLERANCE = 1.0, 1500, 1e-7
+#: Share of the first roughness below which a coupling has settled.
+_SETTLED = 1e-4
+
+
+def settles(archive: SspArchive, step: float, values: Mapping[str, float], *, slopes: bool) -> bool:
+    """Return whether the force on the stack settles after a jump of the command.
+
+    It does where its roughness falls, or is as small as what the parts' tolerances leave.
+    """
+    times = points(step, _COUNT * step)
+    kick = Signals(("command",), times[:1], np.array([[_KICK]]), held=True)
+    how: Any = {"rates": slopes, "values": values, "tolerance": _TOLERANCE}
+    try:
+        found = couple(archive, times, kick, ["flexure.reaction_force"], **how)[:, 0]
+    except FmuError:
+        return False
+    rough, third = np.abs(np.diff(found, 2)), _COUNT // 3
+    early, later, last = rough[:third].max(), rough[third:-third].max(), rough[-third:].max()
+    return bool(last < max(later, _SETTLED * early))
+
+
+def load_ecos() -> Any | None:
+    """Return the module ecospy, with the TBB library that it needs loaded; None if one lacks."""
+    if sys.platform != "linux":
+        return None
+    try:
+        files = importlib.metadata.files("tbb") or []
+        libraries = [f for f in files if Path(str(f)).name == "libtbb.so.12"]
+        if not libraries:
+            return None
+        ctypes.CDLL(str(libraries[0].locate()), mode=ctypes.RTLD_GLOBAL)
+        return import_module("ecospy")
+    except (importlib.metadata.PackageNotFoundError, ImportError, OSError):
+        return None

@@ -13,7 +13,6 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.export.check.agreement import has_reference
 from psa_casadi.export.check.check import as_exported
 from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values
@@ -22,20 +21,18 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.reference import simulate
+from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import simulated
+from tests.export.ssp_master import load_ecos
 from tests.export.ssp_systems import END, RATE, monolithic
-from tests.studies.benchmarks.coupling import load_ecos
 from tests.tiers import slow_but
 
 STACK = "P-885.51"
-#: The two versions are two faces of one core: each kind of model in one of them, one in both. Other
-#: stacks are checked in `tests/contract` and played in `test_fmu_accuracy`.
-CHECKED = (
-    (STACK, 3), ("flexure", 3), (STACK, 2), ("single_mass", 2), ("slow_creep", 2),
-    ("every_effect", 3),
-)  # fmt: skip
+#: The two versions are two faces of one core: each kind of model in one of them. A stack is checked
+#: in both by `tests/contract`; others are played in `test_fmu_accuracy`.
+CHECKED = ((STACK, 3), ("flexure", 3), ("single_mass", 2), ("every_effect", 3))
 
 
 @pytest.mark.parametrize(("name", "fmi"), slow_but(CHECKED[:1], CHECKED))
@@ -52,7 +49,7 @@ def test_check_passes(name: str, fmi: int) -> None:
     assert all(r.remark.endswith(f"against the {against}") for r in steps)
 
 
-@pytest.mark.parametrize("name", dict(CHECKED))
+@pytest.mark.parametrize("name", [name for name, _ in CHECKED])
 def test_nominal_values_of_parameters_are_within_their_bounds(name: str) -> None:
     for v in variable_table(model_named(name)):
         if v.kind == "parameter" and v.bounds and v.bounds[1] > 0.0:

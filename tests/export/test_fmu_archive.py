@@ -117,7 +117,7 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.usefixtures("without_binary")
 @pytest.mark.parametrize(
-    "name", slow_but([STACK, "flexure"], [*psa.STACKS, "flexure", "single_mass", "every_effect"])
+    "name", slow_but([STACK, "flexure"], [STACK, "PTBS200", "flexure", "single_mass"])
 )
 def test_archives_are_valid(name: str, tmp_path: Path) -> None:
     """What is checked are the description and the list of sources."""

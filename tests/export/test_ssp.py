@@ -26,7 +26,7 @@ from psa_casadi.export.ssp import (
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.system import System
 from tests.export.fmu_models import assert_valid, model_named
-from tests.export.ssp_master import SspArchive, couple, points
+from tests.export.ssp_master import SspArchive, couple, points, settles
 from tests.export.ssp_systems import (
     END,
     RATE,
@@ -36,7 +36,6 @@ from tests.export.ssp_systems import (
     monolithic,
     pushed_stage,
 )
-from tests.studies.benchmarks.coupling import settles
 from tests.tiers import slow, slow_but
 
 #: Each archive is exported once: with pytest-xdist by one process.

@@ -99,13 +99,13 @@ def test_start_derivatives_are_differences_of_starts() -> None:
         exact = start.by_parameter[:, k] * model.parameter(name).typical(model.values)
         assert np.all(np.abs(found - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
     names = ("f_H", "z_c1", "z_c2", "z_c3")
-    assert start.by_memory.shape == (len(start.x), len(names))
+    assert start.by_start.shape == (len(start.x), len(names))
     for k, name in enumerate(names):
         size = model.state_nominals()[model.state_names.index(name)]
         moved = [{**memory, name: memory.get(name, 0.0) + h * size} for h in (1e-5, -1e-5)]
         ends = [start_state(model, inputs, rates, m).x for m in moved]
         found = (ends[0] - ends[1]) / 2e-5
-        exact = start.by_memory[:, k] * size
+        exact = start.by_start[:, k] * size
         assert np.all(np.abs(found - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
 
 

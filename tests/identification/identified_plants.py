@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from psa_casadi.components import BASE
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import predict_record
-from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, read_record
@@ -32,7 +32,7 @@ def plant(seed: int) -> tuple[Truth, Record]:
 
 
 @cache
-def identified(seed: int) -> Identification:
+def identified(seed: int) -> StackIdentification:
     return identify([plant(seed)[1]])
 
 

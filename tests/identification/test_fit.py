@@ -243,7 +243,7 @@ def test_a_fit_without_samples_is_refused() -> None:
     with pytest.raises(InputError, match="No sample with a displacement is left to fit"):
         fit(model_with(), [Experiment(record, none, none)], ["k_L"], sigma=[SIGMA])
     bare = replace(record, displacement=None)
-    with pytest.raises(InputError, match="has no displacement"):
+    with pytest.raises(InputError, match="No sample with a displacement is left to fit"):
         fit(compose(BASE), [Experiment(bare, ~none, none)], ["k_L"], sigma=[SIGMA])
 
 

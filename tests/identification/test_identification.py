@@ -140,4 +140,4 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     found = identified(2)
     first = found.fit
     monkeypatch.setattr(refitting, "fit", fails)
-    assert refit_or_keep(first, found.experiments, first.unknowns.names, first.sigma) is first
+    assert refit_or_keep(first, found.experiments, sigma=first.sigma) is first

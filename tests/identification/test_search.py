@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from psa_casadi.identification.fitting import fit as fitting
-from psa_casadi.identification.identify import Identification, identify
+from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.identification.refitting import exchanges
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
@@ -86,7 +86,7 @@ def loops() -> list[Record]:
 
 
 @pytest.fixture(scope="module")
-def found() -> Identification:
+def found() -> StackIdentification:
     return identify(loops())
 
 
@@ -101,7 +101,7 @@ def test_every_record_has_its_own_noise_level() -> None:
     assert found.fit.sigma == pytest.approx((first, second), rel=0.1)
 
 
-def test_what_loops_leave_open_is_told_in_words(found: Identification) -> None:
+def test_what_loops_leave_open_is_told_in_words(found: StackIdentification) -> None:
     assert found.fit.converged
     lags = {"tau", "R_s", "c_P", "c_B"}
     assert lags & set(found.determinacy.undetermined)
@@ -137,7 +137,7 @@ def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch)
     assert threading.active_count() < 20
 
 
-def test_drop_outs_and_outliers_do_not_move_the_fit(found: Identification) -> None:
+def test_drop_outs_and_outliers_do_not_move_the_fit(found: StackIdentification) -> None:
     spoiled = []
     for k, r in enumerate(loops()):
         y = np.array(r.displacement)

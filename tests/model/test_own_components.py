@@ -13,10 +13,10 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
-from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.ports import ports_of, with_ports
+from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.variables import nominal_value
 from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, tanks
 from tests.export.fmu_models import model_named

@@ -1,5 +1,6 @@
 """Posteriors of a model of one's own: several records and outputs, truths that are known."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ import psa_casadi as psa
 from psa_casadi.posterior.task import Task, own_task_of
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
+from tests.contract.helpers import done, refused
 from tests.report.html_page import Page
 
 TRUTH = {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}
@@ -37,6 +39,7 @@ def test_every_output_of_every_record_has_a_noise_level_of_its_own() -> None:
     assert [(b.record, task().channel(b).column) for b in blocks] == [(0, "w"), (1, "w"), (0, "i")]
     assert [b.count for b in blocks] == [600.0, 600.0, 599.0]  # the zero of i is integrated out
     np.testing.assert_allclose([b.level for b in blocks], [0.3, 1.2, 0.005], rtol=0.1)
+    assert task().density.size == 4 + 2 * 2  # parameters, both states of both records: no offset
 
 
 def test_the_gradient_is_that_of_the_density() -> None:
@@ -51,7 +54,7 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
     """The records tell so much that the posterior is nearly normal."""
     arviz = pytest.importorskip("arviz")
     held = []
-    for seed in (1, 3, 5):
+    for seed in (1, 3):
         found = psa.sample(
             motor(), records(seed), starts=1, chains=2, draws=250, tune=200, seed=seed
         )
@@ -63,7 +66,7 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
             assert abs(f.mean - TRUTH[f.name]) < 4.0 * f.sd
             assert f.sd == pytest.approx(fitted.errors[f.name], rel=0.2)
         assert not found.divergences
-    assert sum(held) >= 8  # of 12 that hold it with 90 %: fewer in 0.4 % of all data
+    assert sum(held) >= 5  # of 8 that hold it with 90 %: fewer in 0.5 % of all data
     found.save(tmp_path / "posterior.nc")
     tree = arviz.from_netcdf(tmp_path / "posterior.nc")
     shown = tree.posterior_predictive.i_1.to_numpy()[0]
@@ -94,3 +97,19 @@ def test_what_a_model_of_ones_own_does_not_take_is_refused() -> None:
     empty = replace(records(1)[0], columns={"voltage": records(1)[0].columns["voltage"]}, sha256="")
     with pytest.raises(psa.InputError, match="no output of the model 'motor'"):
         psa.sample(motor(), empty)
+
+
+def test_the_command_samples_a_model_of_ones_own(tmp_path: Path) -> None:
+    pytest.importorskip("nutpie")
+    psa.save_model(motor(), tmp_path / "motor.json")
+    records(1)[0].to_frame().to_csv(tmp_path / "run.csv", index=False)
+    files = [tmp_path / name for name in ("draws.nc", "figures.json", "p.html")]
+    done(
+        "sample", tmp_path / "run.csv", "--model", tmp_path / "motor.json", "--free", "R", "--free",
+        "k", "--zeros", "i", "--known-start", "--chains", "1", "--draws", "4", "--tune", "4",
+        "-o", files[0], "--json", files[1], "--report", files[2],
+    )  # fmt: skip
+    assert list(json.loads(files[1].read_text("utf-8"))["parameters"]) == ["R", "k"]
+    assert all(file.stat().st_size for file in files)
+    told = refused("sample", tmp_path / "run.csv", "--known-start", "--free", "R")
+    assert "--known-start is said of a model of your own; add --model" in told

@@ -16,24 +16,25 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.held_out import Budget, Errors, Share
+from psa_casadi.diagnosis.held_out import Errors, Share, StackBudget
 from psa_casadi.diagnosis.result import BlindSpot, Cause, Estimate
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
+from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.report.words.text import identification_text
 from tests.report.html_page import figures, numbers, written
 from tests.report.report_cases import VERDICTS, diagnosis, identification, with_periodic
 
 FOLDER = Path(__file__).parent / "told"
-Result = psa.Diagnosis | psa.Identification
+Result = psa.Diagnosis | StackIdentification
 
 
-def shares(*each: float, together: float = 0.97) -> Budget:
+def shares(*each: float, together: float = 0.97) -> StackBudget:
     """Return an error budget of slow creep, hysteresis memory and hum, in this order."""
     names = ("slow_creep", "hysteresis_memory", "mains_hum")
     rows = tuple(Share(n, s, (s - 0.05, s + 0.05)) for n, s in zip(names, each, strict=False))
     whole = Share("together", together, (0.92, 1.0)) if len(rows) > 1 else rows[0]
-    return Budget(4e-8, 5e-9, whole, rows, None, 7e-9, 0.04)
+    return StackBudget(whole, rows, None, 4e-8, 5e-9, 7e-9, 0.04)
 
 
 def with_memory() -> psa.Diagnosis:
@@ -61,7 +62,7 @@ def rival(*names: str) -> psa.Diagnosis:
     return replace(d, causes=(replace(d.causes[0], cannot_be_told_from=names),))
 
 
-def graded() -> psa.Identification:
+def graded() -> StackIdentification:
     """Return a fit whose parameters are known well, weakly, not at all, and only in pairs."""
     found = identification()
     errors = {n: 0.01 * found.model.values[n] for n in ("k_L", "tau", "R_s", "c_P")}
@@ -77,7 +78,7 @@ def graded() -> psa.Identification:
     return replace(found, determinacy=known)
 
 
-def not_fitted() -> psa.Identification:
+def not_fitted() -> StackIdentification:
     found = identification()
     none = replace(
         found.determinacy, names=(), intervals={}, standard_errors={}, undetermined=(), on_bound=(),
@@ -89,7 +90,8 @@ def not_fitted() -> psa.Identification:
 def wide(d: psa.Diagnosis) -> psa.Diagnosis:
     """Return a diagnosis whose base errs by micrometres."""
     return replace(
-        d, base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
+        d, errors=(replace(d.errors[0], base=2.5e-6, extended=5e-8),),
+        base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
         extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
     )  # fmt: skip
 
@@ -174,7 +176,7 @@ def _shown(trace: dict[str, Any]) -> str:
 
 def told(result: Result) -> list[str]:
     """Return the lines of a result's story and page, which loads nothing, and its curves."""
-    if isinstance(result, psa.Identification):
+    if isinstance(result, StackIdentification):
         lines = identification_text(result).splitlines()
     else:
         lines = [repr(result), *psa.story(result, origin="synthetic").splitlines()]

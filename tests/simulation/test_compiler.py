@@ -198,6 +198,8 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "gone": lambda p: p.unlink(),
     "a folder with a file": replaced_by(full_folder),
     "a link to another library": replaced_by(lambda p: p.symlink_to(library(7))),
+    "a link to nothing": replaced_by(lambda p: p.symlink_to("nowhere")),
+    "a link to itself": replaced_by(lambda p: p.symlink_to(p.name)),
     "a pipe": replaced_by(os.mkfifo),
     "others may write": lambda p: p.chmod(0o666),
     "no checksum": lambda p: checksum(p).unlink(),

@@ -14,11 +14,11 @@ from psa_casadi.any_model.effects.attached import (
     size_of,
 )
 from psa_casadi.any_model.effects.of_signals import ANGLE, bent, beyond, level_of, signal_effects
-from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, state_unit
 from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import rate_unit
 from psa_casadi.variables import Parameter, State
 

@@ -19,10 +19,10 @@ from psa_casadi.any_model.effects.attached import (
     scale_of,
     size_of,
 )
-from psa_casadi.any_model.sizes import Sizes
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.model.ports import Port, true_output
 from psa_casadi.shapes import ANGLES, pade_section, softplus
+from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.variables import Parameter, State
 
 #: Width of the rounded corner of a saturation or a dead zone, over the signal's size: usual, and

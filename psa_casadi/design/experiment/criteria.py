@@ -1,16 +1,18 @@
 """Rivals, and what a design maximises: their separation, or what is known of parameters.
 
-What a design maximises: its value for a voltage, and a function with the same gradient there.
+What a design maximises: its value for inputs, and a function with the same gradient there.
 
-The value involves a re-fit or a covariance, whose derivative by the voltage would need second
-derivatives of the trajectories. At one voltage everything but the trajectories can be held: by the
+The value involves a re-fit or a covariance, whose derivative by the inputs would need second
+derivatives of the trajectories. At one record everything but the trajectories can be held: by the
 envelope theorem the derivative of a minimum is that of the function at the minimising point, and
 the derivative of a function of the information matrix is linear in that of the sensitivities.
 
 Models that a designed record shall tell apart or sharpen: values, unknowns, what is known.
 
 A rival's unknowns are coordinates delta around its values: its free parameters, and for the new
-record the initial states that no voltage tells, in nominal sizes, and the sensor's offset in um.
+record the initial states that no input tells, in nominal sizes, and the offsets of sensors. Of a
+stack the states are its memories, and the one sensor has an offset; any other model begins at
+declared or at unknown states.
 What the records at hand say of the parameters is an information matrix, their own initial states
 and offsets eliminated: H = H_pp - H_pn H_nn^-1 H_np, with the weak priors of the fits.
 
@@ -30,8 +32,8 @@ Optimality for parameters: the covariance that a record and the data at hand wou
 
     Phi = known + J^T W J,   C = (Phi^-1) of the chosen coordinates
 
-J (n, size) holds the exact derivatives of the predicted displacement by parameters, initial states
-and the offset; W whitens the noise. D minimises ln det C, A the trace, E the largest eigenvalue;
+J (m n, size) holds the exact derivatives of the predicted m outputs by parameters, initial states
+and offsets; W whitens the noise. D minimises ln det C, A the trace, E the largest eigenvalue;
 each is told as minus the logarithm of a mean standard error, so that a difference d of two values
 means intervals narrower by the factor exp(d). Gradient: d phi(C) = -tr(Psi dPhi), with
 Psi = Phi^-1 E (d phi/d C) E^T Phi^-1 and E the choice of coordinates. Source: Fedorov and Leonov,
@@ -39,45 +41,48 @@ Optimal Design for Nonlinear Response Models, 2013, chapters 2 and 10.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import permutations
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.fit import Fit, unknowns_around
 from psa_casadi.identification.fitting.levenberg_marquardt import minimise
-from psa_casadi.identification.fitting.prediction import predict_record
+from psa_casadi.identification.fitting.prediction import OUTPUT, trace_record
 from psa_casadi.identification.fitting.unknowns import (
     Unknowns,
+    coordinates_of,
     memory_priors,
     memory_sizes,
     unknowns_of,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.signals import Hold, Signals
+from psa_casadi.records.split import Channel, whole
 from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.start import memory_names
+from psa_casadi.simulation.simulate import Traced, Way
+from psa_casadi.simulation.start import is_stack
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A criterion at one voltage: its value, and a function of the voltage with its gradient."""
+    """A criterion at one record: its value, and a function of the inputs with its gradient."""
 
     value: float
-    frozen: Callable[[Record], float]
+    frozen: Callable[[Signals], float]
 
 
 class Criterion(Protocol):
     """What is maximised."""
 
-    def at(self, record: Record) -> Point:
+    def at(self, record: Signals) -> Point:
         """Return value and frozen function at a planned record; raises PsaError."""
         ...
 
@@ -89,11 +94,12 @@ _FARTHEST = 1.0
 #: Tolerance of trajectories: far below what a step of the gradient changes.
 RTOL = 1e-6
 _OFFSET = 1e-6
+_NOTHING = Channel("", "", (), offset=False)
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Noise of the sensor: `rms` [m], and the `correlation` of neighbouring samples, 0 if white."""
+    """Noise of a sensor: its `rms`, a stack's in m, and the `correlation` of neighbours."""
 
     rms: float
     correlation: float = 0.0
@@ -119,7 +125,9 @@ class Rival:
 
     `known` (k, k) is the information of the records at hand and the priors; `evidence` is ln of the
     Bayes factor over the base that those records give. `less` (k,) is the way from `theta` to what
-    the rival is taken for where it is the truth.
+    the rival is taken for where it is the truth. A new record shows the `outputs`, those of `zeros`
+    with an offset; it begins where an ordinary one does, or at the declared states,
+    and between samples its inputs are as `hold` says.
     """
 
     name: str
@@ -129,6 +137,10 @@ class Rival:
     known: FloatArray
     evidence: float = 0.0
     less: FloatArray | None = None
+    outputs: tuple[str, ...] = (OUTPUT,)
+    zeros: tuple[str, ...] = (OUTPUT,)
+    known_start: bool = False
+    hold: Hold = "linear"
 
     @property
     def truth(self) -> FloatArray:
@@ -137,19 +149,45 @@ class Rival:
         low, high = self.bounds()
         return np.clip(np.append(own, np.zeros(self.size - len(own))), low, high)
 
+    @cached_property
+    def starts(self) -> Mapping[str, tuple[float, float]]:
+        """Size and prior width of every initial state that a new record leaves open."""
+        if is_stack(self.model):
+            memories = zip(memory_sizes(self.model).items(), memory_priors(self.model), strict=True)
+            return {name: (size, prior) for (name, size), prior in memories}
+        planned: Any = Signals(name="planned", time=np.arange(8.0), columns={})
+        new = replace(whole(planned), known_start=self.known_start, channels=(_NOTHING,))
+        found = unknowns_around(self.model, (), [new], [1.0], placed=self.model)
+        return {
+            name: (float(size), float(prior))
+            for name, size, prior in zip(
+                found.started[0], found.start_scale[0], found.prior, strict=False
+            )
+        }
+
+    @cached_property
+    def _offsets(self) -> FloatArray:
+        """Return what the coordinates of the offsets add to the outputs, (outputs, zeros)."""
+        sizes = dict(zip(self.model.output_names, self.model.output_nominals(), strict=True))
+        found = np.zeros((len(self.outputs), len(self.zeros)))
+        for column, name in enumerate(self.zeros):
+            size = _OFFSET if is_stack(self.model) else sizes[name]
+            found[self.outputs.index(name), column] = size
+        return found
+
     @property
     def size(self) -> int:
-        """Number of coordinates for a new record: parameters, initial states, offset."""
-        return len(self.theta) + len(memory_names(self.model.structure)) + 1
+        """Number of coordinates for a new record: parameters, initial states, offsets."""
+        return len(self.theta) + len(self.starts) + len(self.zeros)
 
     @property
     def information(self) -> FloatArray:
-        """Return what is known of all coordinates, (size, size); nothing of the offset."""
-        count, states = len(self.theta), len(memory_names(self.model.structure))
+        """Return what is known of all coordinates, (size, size); nothing of the offsets."""
+        count, states = len(self.theta), len(self.starts)
         full = np.zeros((self.size, self.size))
         full[:count, :count] = self.known
         where = np.arange(count, count + states)
-        full[where, where] = 1.0 / np.square(memory_priors(self.model))
+        full[where, where] = [1.0 / prior**2 for _, prior in self.starts.values()]
         return full
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -162,42 +200,58 @@ class Rival:
         """Return the model and the deviations of its initial states at delta (size,)."""
         count = len(self.theta)
         values = self.unknowns.values(self.theta + delta[:count])
-        sizes = memory_sizes(self.model)
-        start = dict(zip(sizes, (np.array(list(sizes.values())) * delta[count:-1]).tolist(),
-                         strict=True))  # fmt: skip
+        rows = zip(self.starts.items(), delta[count:].tolist(), strict=False)
+        start = {name: size * moved for (name, (size, _)), moved in rows}
         return self.model.with_values(values), start
 
-    def predict(self, record: Record, delta: FloatArray) -> FloatArray:
-        """Return the displacement (n,) [m] that the rival predicts at delta."""
-        model, start = self.moved(delta)
-        y, *_ = predict_record(model, record, start, (), stop=record.n, rtol=RTOL)
-        shown: FloatArray = y + _OFFSET * delta[-1]
-        return shown
+    def predict(self, record: Signals, delta: FloatArray) -> FloatArray:
+        """Return the outputs (n, m) that the rival predicts at delta."""
+        return self._traced(record, delta, ()).y
 
-    def sensitivities(self, record: Record, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the displacement (n,) [m] and its exact derivative by delta (n, size) [m]."""
+    def sensitivities(self, record: Signals, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (n, m) and their exact derivatives by delta (n, m, size)."""
+        found, count = self._traced(record, delta, self.unknowns.names), len(self.theta)
+        slopes = self.unknowns.slopes(self.theta + delta[:count])
+        by_parameter = found.sensitivity[:, :, :count] @ slopes
+        by_start = found.sensitivity[:, :, count:] * [size for size, _ in self.starts.values()]
+        offsets = np.broadcast_to(self._offsets, (record.n, *self._offsets.shape))
+        return found.y, np.concatenate([by_parameter, by_start, offsets], axis=2)
+
+    def _traced(self, record: Signals, delta: FloatArray, wanted: Sequence[str]) -> Traced:
+        """Return outputs with their offsets, and derivatives by `wanted` and the starts."""
         model, start = self.moved(delta)
-        y, by_parameter, by_start = predict_record(
-            model, record, start, self.unknowns.names, stop=record.n, rtol=RTOL
+        planned: Any = record if self.hold == record.hold else replace(record, hold=self.hold)
+        found = trace_record(
+            model, planned, start, wanted, stop=record.n, way=Way(RTOL, RTOL), outputs=self.outputs
         )
-        slopes = self.unknowns.slopes(self.theta + delta[: len(self.theta)])
-        sizes = np.array(list(memory_sizes(model).values()))
-        columns = [by_parameter @ slopes, by_start * sizes, np.full((record.n, 1), _OFFSET)]
-        return y + _OFFSET * delta[-1], np.hstack(columns)
+        return replace(found, y=found.y + self._offsets @ delta[self.size - len(self.zeros) :])
 
 
-def rival_of_fit(name: str, fit: Fit, colour: Colour, evidence: float = 0.0) -> Rival:
+def whitened(noise: Sequence[Colour], shown: FloatArray) -> FloatArray:
+    """Return outputs (n, m), or their derivatives (n, m, k), over their noise: (m n,), (m n, k)."""
+    parts = [own.whiten(shown[:, j]) / own.level for j, own in enumerate(noise)]
+    white: FloatArray = np.concatenate(parts)
+    return white
+
+
+def rival_of_fit(
+    name: str, fit: Fit, noise: Sequence[Colour], evidence: float = 0.0, **words: Any
+) -> Rival:
     """Return a fitted model as a rival; what it was fitted to is what is known of it.
 
-    `colour` is the noise of the fit's samples.
+    `noise` is that of the fit's samples, of every channel without factors; `words` are other fields
+    of a rival.
     """
-    count = len(fit.unknowns.names)
-    white = colour.whiten(fit.jacobian) / colour.level
-    full = white.T @ white + np.diag(1.0 / fit.unknowns.prior**2)
+    count, full = len(fit.unknowns.names), np.diag(1.0 / fit.unknowns.prior**2)
+    channels = [c for c in fit.channels if not c.channel.factors]
+    for channel, own in zip(channels, noise, strict=True):
+        white = own.whiten(channel.jacobian) / own.level
+        full = full + white.T @ white
     inner, cross = full[count:, count:], full[:count, count:]
     known = full[:count, :count] - cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T
     less = _less(name, fit, known)
-    return Rival(name, fit.model, fit.unknowns, fit.theta[:count].copy(), known, evidence, less)
+    theta = fit.theta[:count].copy()
+    return Rival(name, fit.model, fit.unknowns, theta, known, evidence, less, **words)
 
 
 def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
@@ -219,19 +273,32 @@ def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
     return less * min(1.0, _FARTHEST / max(farthest, 1e-300))
 
 
-def rival_of_model(name: str, model: Model, free: Sequence[str]) -> Rival:
-    """Return a model of which only the order of magnitude of its free parameters is known."""
-    unknowns = unknowns_of(model, free, [], [], _OFFSET)
+def rival_of_model(name: str, model: Model, free: Sequence[str], **words: Any) -> Rival:
+    """Return a model of which only the order of magnitude of its free parameters is known.
+
+    `words` are other fields of a rival.
+    """
+    if is_stack(model):
+        unknowns = unknowns_of(model, free, [], [], _OFFSET)
+    else:
+        unknowns = coordinates_of(model, free, [], 0.0, 1.0)
     theta = unknowns.coordinates(model.values)
-    return Rival(name, model, unknowns, theta, np.diag(1.0 / unknowns.prior[: len(theta)] ** 2))
+    known = np.diag(1.0 / unknowns.prior[: len(theta)] ** 2)
+    return Rival(name, model, unknowns, theta, known, **words)
 
 
-def noise_of_fit(fit: Fit, experiments: Sequence[Experiment]) -> tuple[SensorNoise, Colour]:
-    """Return the noise that a fit's residuals show: rms and correlation, and as their colour."""
-    colour = colour_of(fit.residuals, [int(e.used.sum()) for e in experiments])
-    first = colour.autoregression[0]
-    correlation = float(first[0]) if first.size else 0.0
-    return SensorNoise(fit.rms, correlation), colour
+def noise_of_fit(fit: Fit) -> tuple[tuple[SensorNoise, ...], tuple[Colour, ...]]:
+    """Return the noise that a fit leaves in every channel without factors: rms and correlation.
+
+    And as the colour of the channel's samples.
+    """
+    channels = [c for c in fit.channels if not c.channel.factors]
+    colours = tuple(colour_of(c.residuals, c.lengths) for c in channels)
+    found = []
+    for channel, colour in zip(channels, colours, strict=True):
+        first = colour.autoregression[0]
+        found.append(SensorNoise(channel.rms, float(first[0]) if first.size else 0.0))
+    return tuple(found), colours
 
 
 #: Evaluations of a re-fit at most, while voltages are compared and in the end; when it has settled.
@@ -252,27 +319,27 @@ class _Refit:
 
 @dataclass(frozen=True, eq=False)
 class Separation:
-    """The criterion for rivals under a noise on the record's grid.
+    """The criterion for rivals under the noise of every output on the record's grid.
 
-    A re-fit is cut off after so many `evaluations` while voltages are compared.
+    A re-fit is cut off after so many `evaluations` while inputs are compared.
     """
 
     rivals: tuple[Rival, ...]
-    noise: Colour
+    noise: Sequence[Colour]
     evaluations: int = QUICK
 
     def __post_init__(self) -> None:
         if len(self.rivals) < 2:
             raise InputError("One effect cannot be separated from itself; name two or more.")
 
-    def at(self, record: Record) -> Point:
-        """Return the value and a function of the voltage with its gradient."""
+    def at(self, record: Signals) -> Point:
+        """Return the value and a function of the inputs with its gradient."""
         found = self._refits(record, self.evaluations)
         inverse = {pair: 1.0 / max(r.distance, LEAST) for pair, r in found.items()}
         total = sum(inverse.values())
         value = overall([r.distance for r in found.values()])
 
-        def frozen(other: Record) -> float:
+        def frozen(other: Signals) -> float:
             plain = [r.predict(other, r.truth) for r in self.rivals]
             moved = 0.0
             for (a, b), r in found.items():
@@ -283,18 +350,18 @@ class Separation:
 
         return Point(value, frozen)
 
-    def distances(self, record: Record) -> Mapping[tuple[str, str], float]:
+    def distances(self, record: Signals) -> Mapping[tuple[str, str], float]:
         """Return T of every true rival and other one, by their names, fitted to the end."""
         names = [r.name for r in self.rivals]
         found = self._refits(record, FINAL)
         return {(names[a], names[b]): r.distance for (a, b), r in found.items()}
 
-    def distance(self, truth: Rival, other: Rival, record: Record) -> float:
+    def distance(self, truth: Rival, other: Rival, record: Signals) -> float:
         """Return T of one pair, fitted to the end."""
         target = truth.predict(record, truth.truth)
         return self._refit(target, other, record, FINAL).distance
 
-    def _refits(self, record: Record, steps: int) -> dict[tuple[int, int], _Refit]:
+    def _refits(self, record: Signals, steps: int) -> dict[tuple[int, int], _Refit]:
         plain = side_by_side(lambda r: r.predict(record, r.truth), self.rivals)
         pairs = list(permutations(range(len(self.rivals)), 2))
         found = side_by_side(
@@ -302,8 +369,8 @@ class Separation:
         )
         return dict(zip(pairs, found, strict=True))
 
-    def _refit(self, target: FloatArray, rival: Rival, record: Record, evaluations: int) -> _Refit:
-        """Fit a rival again to a target (n,) [m], held by what is known of it."""
+    def _refit(self, target: FloatArray, rival: Rival, record: Signals, evaluations: int) -> _Refit:
+        """Fit a rival again to a target (n, m), held by what is known of it."""
         values, vectors = np.linalg.eigh(rival.information)
         root = np.sqrt(np.clip(values, 0.0, None))[:, None] * vectors.T  # R^T R = information
 
@@ -321,14 +388,13 @@ class Separation:
         )
         if found is None:
             raise SimulationError(
-                f"The model with {rival.name} cannot follow a planned voltage; its values are far"
+                f"The model with {rival.name} cannot follow a planned input; its values are far"
                 " from physical ones."
             )
-        return _Refit(found.cost, found.theta, -found.residual[: record.n])
+        return _Refit(found.cost, found.theta, -found.residual[: target.size])
 
-    def _white(self, signal: FloatArray) -> FloatArray:
-        white: FloatArray = self.noise.whiten(signal) / self.noise.level
-        return white
+    def _white(self, shown: FloatArray) -> FloatArray:
+        return whitened(self.noise, shown)
 
 
 def overall(distances: Collection[float]) -> float:
@@ -342,12 +408,12 @@ OPTIMALITIES: tuple[Optimality, ...] = get_args(Optimality)
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """The criterion for the parameters `names` of a model under a noise on the record's grid."""
+    """The criterion for the parameters `names` of a model under its outputs' noise."""
 
     rival: Rival
     names: tuple[str, ...]
     optimality: Optimality
-    noise: Colour
+    noise: Sequence[Colour]
 
     def __post_init__(self) -> None:
         unknown = [n for n in self.names if n not in self.rival.unknowns.names]
@@ -364,12 +430,11 @@ class Information:
     def _chosen(self) -> list[int]:
         return [self.rival.unknowns.names.index(n) for n in self.names]
 
-    def _white(self, record: Record) -> FloatArray:
+    def _white(self, record: Signals) -> FloatArray:
         _, jacobian = self.rival.sensitivities(record, np.zeros(self.rival.size))
-        white: FloatArray = self.noise.whiten(jacobian) / self.noise.level
-        return white
+        return whitened(self.noise, jacobian)
 
-    def covariance(self, record: Record | None) -> FloatArray:
+    def covariance(self, record: Signals | None) -> FloatArray:
         """Return C of the chosen coordinates (k, k), with a record or with the data at hand."""
         information = self.rival.information
         if record is not None:
@@ -377,8 +442,8 @@ class Information:
             information = information + white.T @ white
         return _inverse(information)[np.ix_(self._chosen, self._chosen)]
 
-    def at(self, record: Record) -> Point:
-        """Return the value and a function of the voltage with its gradient."""
+    def at(self, record: Signals) -> Point:
+        """Return the value and a function of the inputs with its gradient."""
         chosen, white = self._chosen, self._white(record)
         inverse = _inverse(self.rival.information + white.T @ white)
         value, slope = _value(inverse[np.ix_(chosen, chosen)], self.optimality)
@@ -386,7 +451,7 @@ class Information:
         weights = 2.0 * white @ (sides @ slope @ sides.T)
         return Point(value, lambda other: float(np.sum(weights * self._white(other))))
 
-    def standard_errors(self, record: Record | None) -> Mapping[str, float]:
+    def standard_errors(self, record: Signals | None) -> Mapping[str, float]:
         """Return the standard error of every chosen parameter, in its own unit."""
         slopes = np.abs(np.diag(self.rival.unknowns.slopes(self.rival.theta)))
         own = np.sqrt(np.diag(self.covariance(record)))

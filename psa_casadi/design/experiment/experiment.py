@@ -3,6 +3,7 @@
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 import scipy
@@ -21,16 +22,21 @@ from psa_casadi.design.experiment.criteria import (
     rival_of_model,
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
-from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Progress, coarse, search
+from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, Progress, coarse, search
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.errors import InputError, Problems, PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import note
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
+from psa_casadi.records.signals import Signals
+from psa_casadi.shown import with_units
+from psa_casadi.simulation.start import is_stack
+from psa_casadi.units import FloatArray
 
 #: How often a record may be played until it tells, and the probability that is asked for.
 PLAYS, ASKED = (1, 2, 3, 5), 0.9
@@ -50,21 +56,36 @@ class Pair:
     usual: Mapping[str, float]
 
 
+class Designed(Protocol):
+    """What all designed records have."""
+
+    @property
+    def record(self) -> Signals:
+        """The planned record: inputs and no outputs."""
+
+
+def columns_to_play(design: Designed) -> dict[str, FloatArray]:
+    """Return time and inputs with their units, as `write_record` takes them."""
+    record = design.record
+    return with_units({"time": record.time, **record.columns}, {"time": "s", **record.units})
+
+
 @dataclass(frozen=True, eq=False)
 class Separated:
     """A record that tells effects apart.
 
-    `record` is the voltage to play (no displacement), of the family `kind` ("sine" or "triangle"
-    where no designed one was better); `chance` is for each
+    `record` has the inputs to play and no outputs, of the family `kind` ("sine" or "triangle" where
+    no designed one was better); `limits` are those of every input; `chance` is for each
     effect the probability that a diagnosis of the data at hand with the record names it alone if it
     is the cause, as the rivals' fits predict it; `usual_chance` the same with sine and triangle.
     `plays` is how often the record must be played, each time from rest, until every chance is at
     least 90 %; None where `PLAYS[-1]` times are not enough.
     """
 
-    record: Record
+    record: Signals
     kind: str
-    limits: Limits
+    limits: Mapping[str, Limits]
+    rivals: tuple[Rival, ...]
     pairs: tuple[Pair, ...]
     chance: Mapping[str, float]
     usual_chance: Mapping[str, Mapping[str, float]]
@@ -92,9 +113,10 @@ class Informative:
     criterion is smaller than with a usual voltage of the same length and amplitude.
     """
 
-    record: Record
+    record: Signals
     kind: str
-    limits: Limits
+    limits: Mapping[str, Limits]
+    rivals: tuple[Rival, ...]
     optimality: Optimality
     intervals: Mapping[str, tuple[float, float]]
     before: Mapping[str, tuple[float, float]]
@@ -127,7 +149,7 @@ def naming_probability(
     return min(chances, default=1.0)
 
 
-def tells(criterion: Separation, base: Rival | None, record: Record) -> bool:
+def tells(criterion: Separation, base: Rival | None, record: Signals) -> bool:
     """Whether a record names every rival for sure, even with a fraction of its distances."""
     try:
         less = {pair: t / _MARGIN for pair, t in criterion.distances(record).items()}
@@ -137,7 +159,7 @@ def tells(criterion: Separation, base: Rival | None, record: Record) -> bool:
 
 
 def plays_of(
-    criterion: Separation, base: Rival | None, record: Record, chance: Mapping[str, float]
+    criterion: Separation, base: Rival | None, record: Signals, chance: Mapping[str, float]
 ) -> int | None:
     """Return how often a record must be played until it tells; None if `PLAYS[-1]` do not.
 
@@ -145,8 +167,8 @@ def plays_of(
     """
     for plays in PLAYS:
         if plays > 1:
-            colour = replace(criterion.noise, level=criterion.noise.level / np.sqrt(plays))
-            often = replace(criterion, noise=colour)
+            quieter = [replace(c, level=c.level / np.sqrt(plays)) for c in criterion.noise]
+            often = replace(criterion, noise=quieter)
             chance = chances_of(often, often.distances(record), base, record)
         if min(chance.values()) >= ASKED:
             return plays
@@ -157,7 +179,7 @@ def chances_of(
     criterion: Separation,
     distances: Mapping[tuple[str, str], float],
     base: Rival | None,
-    record: Record,
+    record: Signals,
 ) -> dict[str, float]:
     """Return the probability of every rival that it is named if it is the cause.
 
@@ -173,6 +195,8 @@ def chances_of(
 
 #: Periods of the usual sine and triangle that a design is compared with.
 USUAL_PERIODS = 10
+#: Ratio of the frequencies of two inputs: the golden one, of which no small multiples meet.
+_APART = 1.618
 #: Gain of an effect that no record tells, over its ordinary size.
 ORDINARY = 2.5
 #: Samples of the grid on which the result is judged, at most.
@@ -182,55 +206,132 @@ _SURE = 1.959964
 _RIVALS = 5
 
 
+def record_for(model: Model) -> Make:
+    """Return what makes planned records of a model: `Record` of a stack, else `Signals`."""
+    units = {i.name: i.unit for i in model.structure.inputs}
+
+    def make(name: str, time: FloatArray, columns: Mapping[str, FloatArray]) -> Signals:
+        if is_stack(model):
+            return _of_stacks(name, time, columns)
+        return Signals(name=name, time=time, columns=columns, units=units)
+
+    return make
+
+
+def _of_stacks(name: str, time: FloatArray, columns: Mapping[str, FloatArray]) -> Record:
+    return Record(name=name, time=time, voltage=columns["voltage"])
+
+
 def usual_records(limits: Limits, steepest: float) -> dict[str, Record]:
     """Return a sine and a triangle of the limits' length and range, slower if the rate asks."""
-    time, first = limits.grid(), rest_of(limits)
-    room = limits.duration - first
-    fastest = steepest / (np.pi * limits.span)
-    frequency = min(USUAL_PERIODS / room, limits.band, fastest)
-    moving = time[time >= first] - first
-    shapes = {
-        "sine": sine(moving, limits.low, limits.high, frequency),
-        "triangle": triangle(moving, limits.low, limits.high, frequency),
-    }
-    rest = np.full(len(time) - len(moving), limits.low)
-    return {
-        n: Record(name=n, time=time, voltage=np.concatenate([rest, v])) for n, v in shapes.items()
-    }
+    waves = usual_inputs({"voltage": replace(limits, rate=steepest)})
+    return {n: _of_stacks(n, limits.grid(), columns) for n, columns in waves.items()}
+
+
+def usual_inputs(limits: Mapping[str, Limits]) -> dict[str, dict[str, FloatArray]]:
+    """Return a sine and a triangle for every input, from its rest on, by the inputs' names.
+
+    Those of a second input and further ones are slower, so that they can be told apart.
+    """
+    found: dict[str, dict[str, FloatArray]] = {"sine": {}, "triangle": {}}
+    for k, (name, own) in enumerate(limits.items()):
+        time, first, share = own.grid(), rest_of(own), own.rest_share
+        fastest = own.rate / (np.pi * own.span)
+        frequency = min(USUAL_PERIODS / (own.duration - first), own.band, fastest) / _APART**k
+        moving = time[time >= first] - first
+        rest = np.full(len(time) - len(moving), own.low + share * own.span)
+        for shape, wave, phase in (
+            ("sine", sine, np.arccos(1.0 - 2.0 * share) / (2.0 * np.pi)),
+            ("triangle", triangle, 0.5 * share),
+        ):
+            wound = wave(moving + phase / frequency, own.low, own.high, frequency)
+            found[shape][name] = np.concatenate([rest, wound])
+    return found
+
+
+Limited = Limits | Mapping[str, Limits]
+Noisy = SensorNoise | Sequence[SensorNoise]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a search may do: limits of every input, noise of every output, the usual records."""
+
+    limits: Mapping[str, Limits]
+    noise: tuple[SensorNoise, ...]
+    make: Make
+    usual: Mapping[str, Signals]
+
+    @property
+    def whole(self) -> Limits:
+        """Limits of which duration and samples count."""
+        return next(iter(self.limits.values()))
+
+    def colours(self, most: int) -> tuple[Colour, ...]:
+        """Return the noise of every output on a grid of at most so many samples."""
+        return tuple(n.on_grid(self.whole, min(self.whole.samples, most)) for n in self.noise)
+
+    def coarse(self, record: Signals) -> Signals:
+        """Return a record on the grid on which the result is judged."""
+        return coarse(record, min(self.whole.samples, _FINE), self.make)
+
+
+def _plan(model: Model, limits: Limited, noise: Noisy) -> _Plan:
+    """Return the plan of a design; the current into a stack limits the rate of its voltage.
+
+    Raises InputError where inputs and limits do not fit.
+    """
+    every = {"voltage": limits} if isinstance(limits, Limits) else limits
+    problems = Problems()
+    for name in every:
+        if name not in model.input_names:
+            problems.add(
+                f"There are limits of '{name}', which is no input of '{model.name}'; it has"
+                f" {model.input_names}."
+            )
+    lengths = {(own.duration, own.samples) for own in every.values()}
+    if len(lengths) != 1:
+        problems.add("Give limits of an input or more, all with one duration and one `samples`.")
+    problems.raise_if_any()
+    capacitance = model.values.get("C_p") if is_stack(model) else None
+    steep = {n: replace(own, rate=own.steepest(capacitance)) for n, own in every.items()}
+    make, waves = record_for(model), usual_inputs(steep)
+    time = next(iter(every.values())).grid()
+    usual = {n: make(n, time, columns) for n, columns in waves.items()}
+    return _Plan(steep, (noise,) if isinstance(noise, SensorNoise) else (*noise,), make, usual)
 
 
 def separating_experiment(
     rivals: Sequence[Rival],
-    noise: SensorNoise,
-    limits: Limits,
+    noise: Noisy,
+    limits: Limited,
     *,
     base: Rival | None = None,
     kinds: Sequence[Kind] = KINDS,
     effort: Effort | None = None,
     progress: Progress = lambda _: None,
 ) -> Separated:
-    """Return the voltage that best separates rivals, each fitted again to the others.
+    """Return the inputs that best separate rivals, each fitted again to the others.
 
-    `base` is the model without any of them, which scales the evidence that a diagnosis asks for.
-    Raises SimulationError, and InputError also where all rivals bend the same curve and the record
-    is too slow to show a resonance.
+    `limits` are those of every input by name (a stack's voltage may stand alone), `noise` is that
+    of every output in the rivals' order; `base` is the model without any of them, which scales the
+    evidence that a diagnosis asks for. Raises SimulationError, and InputError also where all rivals
+    bend the same curve and the record is too slow to show a resonance.
     """
     begin = clock.perf_counter()
+    plan = _plan(rivals[0].model, limits, noise)
     curves = {c.curve for r in rivals for c in r.model.components if c.name == r.name}
-    if _slow(limits) and len(rivals) > 1 and len(curves) == 1 and None not in curves:
+    if _slow(plan.whole) and len(rivals) > 1 and len(curves) == 1 and None not in curves:
         raise InputError(str(note("same_curve", effects=tuple(r.name for r in rivals))))
-    steepest = limits.steepest(rivals[0].model.values.get("C_p"))
-    samples = min(limits.samples, GRID)
-    coarser = Separation(tuple(rivals), noise.on_grid(limits, samples))
-    usual = usual_records(limits, steepest)
+    coarser = Separation(tuple(rivals), plan.colours(GRID))
+    usual = plan.usual
     best = search(
-        coarser, limits, steepest, usual=tuple(usual.values()), kinds=kinds, effort=effort,
+        coarser, plan.limits, plan.make, usual=tuple(usual.values()), kinds=kinds, effort=effort,
         enough=lambda record: tells(coarser, base, record), progress=progress,
     )  # fmt: skip
     progress("comparing with a sine and a triangle")
-    samples = min(limits.samples, _FINE)
-    criterion = Separation(tuple(rivals), noise.on_grid(limits, samples))
-    records = {n: coarse(r, samples) for n, r in {"designed": best.record, **usual}.items()}
+    criterion = Separation(tuple(rivals), plan.colours(_FINE))
+    records = {n: plan.coarse(r) for n, r in {"designed": best.record, **usual}.items()}
     found = {n: criterion.distances(r) for n, r in records.items()}
     chosen = max(found, key=lambda n: overall(found[n].values()))
     if chosen != "designed":
@@ -239,7 +340,8 @@ def separating_experiment(
     return Separated(
         record=usual.get(chosen, best.record),
         kind=chosen if chosen in usual else best.kind,
-        limits=limits,
+        limits=plan.limits,
+        rivals=tuple(rivals),
         pairs=tuple(
             Pair(a, b, 0.5 * t, {n: 0.5 * found[n][a, b] for n in usual})
             for (a, b), t in found["designed"].items()
@@ -254,8 +356,8 @@ def separating_experiment(
 
 def informative_experiment(
     rival: Rival,
-    noise: SensorNoise,
-    limits: Limits,
+    noise: Noisy,
+    limits: Limited,
     *,
     names: Sequence[str] = (),
     optimality: Optimality = "D",
@@ -263,32 +365,32 @@ def informative_experiment(
     effort: Effort | None = None,
     progress: Progress = lambda _: None,
 ) -> Informative:
-    """Return the voltage that best determines the named parameters, all free ones by default.
+    """Return the inputs that best determine the named parameters, all free ones by default.
+
+    `limits` and `noise` are those of `separating_experiment`.
 
     Raises InputError and SimulationError.
     """
     begin = clock.perf_counter()
-    steepest = limits.steepest(rival.model.values.get("C_p"))
-    samples = min(limits.samples, GRID)
+    plan = _plan(rival.model, limits, noise)
     wanted = tuple(names) or rival.unknowns.names
-    criterion = Information(rival, wanted, optimality, noise.on_grid(limits, samples))
-    plain = usual_records(limits, steepest)
+    criterion = Information(rival, wanted, optimality, plan.colours(GRID))
     best = search(
-        criterion, limits, steepest,
-        usual=tuple(plain.values()), kinds=kinds, effort=effort, progress=progress,
+        criterion, plan.limits, plan.make, usual=tuple(plan.usual.values()), kinds=kinds,
+        effort=effort, progress=progress,
     )  # fmt: skip
     progress("comparing with a sine and a triangle")
-    samples = min(limits.samples, _FINE)
-    criterion = Information(rival, wanted, optimality, noise.on_grid(limits, samples))
-    designed = coarse(best.record, samples)
+    criterion = Information(rival, wanted, optimality, plan.colours(_FINE))
+    designed = plan.coarse(best.record)
     value = criterion.at(designed).value
     usual = {
-        n: float(np.exp(value - criterion.at(coarse(r, samples)).value)) for n, r in plain.items()
+        n: float(np.exp(value - criterion.at(plan.coarse(r)).value)) for n, r in plan.usual.items()
     }
     return Informative(
         record=best.record,
         kind=best.kind,
-        limits=limits,
+        limits=plan.limits,
+        rivals=(rival,),
         optimality=optimality,
         intervals=_intervals(rival, criterion.standard_errors(designed)),
         before=_intervals(rival, criterion.standard_errors(None)),
@@ -322,19 +424,19 @@ def resolving_experiment(
         told = d.contenders  # a new record that shows resonances may tell
     told = tuple(sorted(told, key=lambda c: -c.evidence)[:_RIVALS])
     best = min(d.contenders, key=lambda c: c.fit.rms).fit
-    noise, colour = noise_of_fit(best, d.experiments)
-    rivals = [rival_of_fit(c.effect, c.fit, colour, c.evidence) for c in told]
-    base = rival_of_fit("base", d.base_fit, colour)
+    noise, colours = noise_of_fit(best)
+    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence) for c in told]
+    base = rival_of_fit("base", d.base_fit, colours)
     chosen = limits or limits_of([e.record for e in d.experiments])
     return separating_experiment(
         rivals, noise, chosen, base=base, effort=effort or BRIEF, progress=progress
     )
 
 
-def rival_of_effect(model: Model, effect: Component, free: Sequence[str]) -> Rival:
+def rival_of_effect(model: Model, effect: Component, free: Sequence[str], **words: Any) -> Rival:
     """Return a model with an effect as a rival: at the gain it has, else at an ordinary one.
 
-    `free` are the base's parameters that a fit would search.
+    `free` are the base's parameters that a fit would search, `words` other fields of a rival.
     """
     extended = model.with_effect(effect)
     gain = extended.parameter(effect.gain or "")
@@ -342,7 +444,7 @@ def rival_of_effect(model: Model, effect: Component, free: Sequence[str]) -> Riv
         size = ORDINARY * gain.typical(extended.values)
         extended = extended.with_values({gain.name: float(np.clip(size, *gain.bounds))})
     own = [n for n in effect.fitted if n not in free]
-    return rival_of_model(effect.name, extended, [*free, *own])
+    return rival_of_model(effect.name, extended, [*free, *own], **words)
 
 
 def _slow(limits: Limits) -> bool:

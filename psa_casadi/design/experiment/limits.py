@@ -1,12 +1,13 @@
-"""What a designed voltage may be, and families of voltages to choose from.
+"""What a designed input may be, and families of waveforms to choose from.
 
-Families of voltages to choose from: free-form, triangles, steps, multisines.
+Families of waveforms to choose from: free-form, triangles, steps, multisines.
 
 Each waveform is a function of a vector p within bounds; the optimiser changes p. All begin with a
-rest at the lowest voltage and are linear between samples.
+rest, a stack's at the lowest voltage, and are linear between samples. Where a model has several
+inputs, each has a waveform of the same family, and p holds the vectors of all.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -26,13 +27,14 @@ _FEWEST = 50
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a designed record.
+    """Limits of one input of a designed record, a stack's voltage [V] or any other in its unit.
 
-    Voltages between `low` and `high` [V]; `samples` samples over `duration` [s]; changes of at most
-    `rate` [V/s], and at most what a `current` [A] into the stack's capacitance allows,
+    Values between `low` and `high`; `samples` samples over `duration` [s]; changes of at most
+    `rate` [1/s], and at most what a `current` [A] into a stack's capacitance allows,
     C_p |dv/dt| <= current; no full cycle shorter than 1/`bandwidth` [1/Hz], so that tones stay
-    below it and voltages turn no sooner than after half of that. `bandwidth` None stands for a
-    twentieth of the sampling rate. Raises InputError with all that is wrong.
+    below it and the input turns no sooner than after half of that. `bandwidth` None stands for a
+    twentieth of the sampling rate. The record begins at `rest`, None stands for `low`. Raises
+    InputError with all that is wrong.
     """
 
     low: float
@@ -42,13 +44,14 @@ class Limits:
     rate: float = float("inf")
     current: float = float("inf")
     bandwidth: float | None = None
+    rest: float | None = None
 
     def __post_init__(self) -> None:
         problems = Problems()
         if not self.low < self.high:
             problems.add(
-                f"The voltage range {self.low:g} V to {self.high:g} V is empty; give the lowest"
-                " voltage below the highest."
+                f"The range {self.low:g} to {self.high:g} is empty; give the lowest value below the"
+                " highest."
             )
         if not 0.0 < self.duration < float("inf"):
             problems.add(f"The duration is {self.duration:g} s; give a positive number of seconds.")
@@ -57,7 +60,7 @@ class Limits:
                 f"{self.samples} samples hold no experiment; give {_FEWEST} or more, a thousand are"
                 " usual."
             )
-        largest = {"rate [V/s]": self.rate, "current [A]": self.current}
+        largest = {"rate [1/s]": self.rate, "current [A]": self.current}
         for name, value in {**largest, "bandwidth [Hz]": self.bandwidth}.items():
             if value is not None and not value > 0.0:
                 problems.add(f"The largest {name} is {value:g}; give a positive one, or none.")
@@ -81,12 +84,18 @@ class Limits:
 
     @property
     def span(self) -> float:
-        """Width of the voltage range [V]."""
+        """Width of the range."""
         return self.high - self.low
 
     @property
+    def rest_share(self) -> float:
+        """Where the record begins within the range: 0 at `low`, 1 at `high`."""
+        rest = self.low if self.rest is None else self.rest
+        return float(np.clip((rest - self.low) / self.span, 0.0, 1.0))
+
+    @property
     def shortest(self) -> float:
-        """Shortest time between two turns of the voltage [s]: half a cycle."""
+        """Shortest time between two turns [s]: half a cycle."""
         return 0.5 / self.band
 
     def steepest(self, capacitance: float | None) -> float:
@@ -115,23 +124,6 @@ def limits_of(records: Sequence[Record], **changes: float | None) -> Limits:
     return Limits(**own | {"samples": int(own["samples"])})
 
 
-def excess(record: Record, limits: Limits, capacitance: float | None) -> tuple[str, ...]:
-    """Return a sentence for every limit of voltage, rate or current that a record exceeds."""
-    slope = float(np.max(np.abs(np.diff(record.voltage) / np.diff(record.time))))
-    found = []
-    margin = 1e-9 * limits.span
-    if record.voltage.min() < limits.low - margin or record.voltage.max() > limits.high + margin:
-        found.append(
-            f"voltages from {record.voltage.min():g} V to {record.voltage.max():g} V leave the"
-            f" range {limits.low:g} V to {limits.high:g} V"
-        )
-    if slope > limits.steepest(capacitance) * (1.0 + 1e-6):
-        found.append(
-            f"a rate of {slope:g} V/s is above the largest, {limits.steepest(capacitance):g} V/s"
-        )
-    return tuple(found)
-
-
 Kind = Literal["free", "triangles", "steps", "multisine"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -144,19 +136,49 @@ _FASTEST_RAMP = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Waveform:
-    """One voltage of a family and how it may change.
+    """One input of a family and how it may change.
 
-    `start` (k,) lies between `lower` and `upper`; `voltage(p, time)` [V] is the voltage at instants
-    [s]; `slack(p)` is not negative, up to rounding, where rates and times between turns are
-    allowed.
+    `start` (k,) lies between `lower` and `upper`; `values(p, time)` (n,) are those at instants [s];
+    `slack(p)` is not negative, up to rounding, where rates and times between turns are allowed.
     """
 
     kind: Kind
     start: FloatArray
     lower: FloatArray
     upper: FloatArray
-    voltage: Callable[[FloatArray, FloatArray], FloatArray]
+    values: Callable[[FloatArray, FloatArray], FloatArray]
     slack: Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Waveforms of all inputs, of one family: the coordinates of one after those of another."""
+
+    kind: Kind
+    waves: Mapping[str, Waveform]
+
+    @property
+    def start(self) -> FloatArray:
+        """Where the search begins (k,)."""
+        return np.concatenate([w.start for w in self.waves.values()])
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest coordinates (k,)."""
+        waves = self.waves.values()
+        return np.concatenate([w.lower for w in waves]), np.concatenate([w.upper for w in waves])
+
+    def columns(self, p: FloatArray, time: FloatArray) -> dict[str, FloatArray]:
+        """Return the inputs (n,) at instants [s] by name."""
+        return {n: w.values(own, time) for (n, w), own in self._parts(p)}
+
+    def slack(self, p: FloatArray) -> FloatArray:
+        """Return the slack of all waveforms."""
+        return np.concatenate([w.slack(own) for (_, w), own in self._parts(p)])
+
+    def _parts(self, p: FloatArray) -> Iterator[tuple[tuple[str, Waveform], FloatArray]]:
+        ends = np.cumsum([len(w.start) for w in self.waves.values()])
+        return zip(self.waves.items(), np.split(p, ends[:-1]), strict=True)
 
 
 def draw(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
@@ -168,8 +190,8 @@ def draw(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) 
         raise InputError(f"There is no family '{kind}'; there are {', '.join(KINDS)}.")
     if steepest * limits.duration < 0.05 * limits.span:
         raise InputError(
-            f"At most {steepest:g} V/s for {limits.duration:g} s moves the voltage by less than 5 %"
-            f" of its range of {limits.span:g} V; lengthen the record, or allow more rate or"
+            f"At most {steepest:g} a second for {limits.duration:g} s moves the input by less than"
+            f" 5 % of its range of {limits.span:g}; lengthen the record, or allow more rate or"
             " current."
         )
     if kind == "multisine":
@@ -197,9 +219,11 @@ def _durations(shares: FloatArray, limits: Limits) -> FloatArray:
     return filled
 
 
-def _reachable(levels: FloatArray, durations: FloatArray, per_second: float) -> FloatArray:
-    """Return levels whose changes the rate allows, from 0, each moved as little as needed."""
-    found, now = np.empty_like(levels), 0.0
+def _reachable(
+    levels: FloatArray, durations: FloatArray, per_second: float, now: float
+) -> FloatArray:
+    """Return levels whose changes the rate allows, from `now`, each moved as little as needed."""
+    found = np.empty_like(levels)
     for k, (level, duration) in enumerate(zip(levels, durations, strict=True)):
         now += float(np.clip(level - now, -0.999 * per_second * duration,
                              0.999 * per_second * duration))  # fmt: skip
@@ -214,7 +238,7 @@ def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator
     more; of triangles and steps the durations change too.
     """
     count = _count(limits, {"free": CORNERS, "triangles": TURNS, "steps": LEVELS}[kind])
-    per_second, first = steepest / limits.span, rest_of(limits)
+    per_second, first, rest = steepest / limits.span, rest_of(limits), limits.rest_share
     limited = bool(np.isfinite(per_second))
     ramp = max(limits.duration / limits.samples, 1.0 / per_second if limited else 0.0)
     shares = rng.uniform(0.0, _SPREAD, count)
@@ -226,24 +250,24 @@ def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator
     def moving(durations: FloatArray) -> FloatArray:
         return np.minimum(durations, ramp) if kind == "steps" else durations
 
-    def voltage(p: FloatArray, time: FloatArray) -> FloatArray:
+    def values(p: FloatArray, time: FloatArray) -> FloatArray:
         levels, durations = p[:count], durations_of(p)
         ends = first + np.cumsum(durations)
         if kind == "steps":
             begins = ends - durations
             tops = begins + moving(durations)
             nodes = np.concatenate([[0.0], np.column_stack([begins, tops]).ravel(), ends[-1:]])
-            before = np.concatenate([[0.0], levels[:-1]])
+            before = np.concatenate([[rest], levels[:-1]])
             heights = np.column_stack([before, levels]).ravel()
-            heights = np.concatenate([[0.0], heights, levels[-1:]])
+            heights = np.concatenate([[rest], heights, levels[-1:]])
         else:
             nodes = np.concatenate([[0.0, first], ends])
-            heights = np.concatenate([[0.0, 0.0], levels])
+            heights = np.concatenate([[rest, rest], levels])
         inside: FloatArray = limits.low + limits.span * np.interp(time, nodes, heights)
         return inside
 
     def slack(p: FloatArray) -> FloatArray:
-        change = np.diff(p[:count], prepend=0.0)
+        change = np.diff(p[:count], prepend=rest)
         room = per_second * moving(durations_of(p))
         return np.concatenate([room - change, room + change])
 
@@ -253,53 +277,54 @@ def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator
         if rng.integers(2):  # loops in the lower half of the range, then in the upper one
             levels = 0.5 * levels + np.where(2 * np.arange(count) < count, 0.0, 0.5)
     if limited or kind == "free":
-        levels = _reachable(levels, moving(drawn), per_second)
+        levels = _reachable(levels, moving(drawn), per_second, rest)
     start, low, high = levels, np.zeros(count), np.ones(count)
     if kind != "free":
         start, low = np.append(levels, shares), np.append(low, np.full(count, -_SPREAD))
         high = np.append(high, np.full(count, 2.0 * _SPREAD))
-    return Waveform(kind, start, low, high, voltage, slack if limited else _nothing)
+    return Waveform(kind, start, low, high, values, slack if limited else _nothing)
 
 
 def _multisine(limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
     """Cosines and sines at lines of 1/T, closer together at low frequencies.
 
-    The sum is scaled to the voltage range, shrunk towards the lowest voltage where its rate would
-    be too large, and grows from rest over the first tenth.
+    The sum is scaled to the range, shrunk towards the rest where its rate would be too large, and
+    grows from rest over the first tenth.
     """
     period = limits.duration - rest_of(limits)
     highest = max(1, int(limits.band * period))
     lines = np.unique(np.round(np.geomspace(1.0, highest, LINES)))
     first, grow = rest_of(limits), 0.1 * period
-    fine = limits.grid()
+    fine, rest = limits.grid(), limits.rest_share
 
     def raw(p: FloatArray, time: FloatArray) -> FloatArray:
         angle = 2.0 * np.pi * np.outer(np.maximum(time - first, 0.0) / period, lines)
         waves: FloatArray = np.cos(angle) @ p[: len(lines)] + np.sin(angle) @ p[len(lines) :]
         return waves
 
-    def voltage(p: FloatArray, time: FloatArray) -> FloatArray:
-        shape = _risen(raw(p, fine), raw(p, fine), fine, first, grow)
+    def values(p: FloatArray, time: FloatArray) -> FloatArray:
+        shape = _risen(raw(p, fine), raw(p, fine), fine, first, grow, rest)
         slope = float(np.max(np.abs(np.diff(shape)))) / (fine[1] - fine[0]) * limits.span
         share = min(1.0, steepest / max(slope, _FASTEST_RAMP))
-        wave = _risen(raw(p, time), raw(p, fine), time, first, grow)
-        inside: FloatArray = limits.low + limits.span * share * np.clip(wave, 0.0, 1.0)
+        wave = np.clip(_risen(raw(p, time), raw(p, fine), time, first, grow, rest), 0.0, 1.0)
+        inside: FloatArray = limits.low + limits.span * (rest + share * (wave - rest))
         return inside
 
     amplitude = lines**-0.6
     phase = rng.uniform(0.0, 2.0 * np.pi, len(lines))
     start = np.concatenate([amplitude * np.cos(phase), amplitude * np.sin(phase)])
     edge = np.full(len(start), 2.0)
-    return Waveform("multisine", start, -edge, edge, voltage, _nothing)
+    return Waveform("multisine", start, -edge, edge, values, _nothing)
 
 
 def _risen(
-    wave: FloatArray, whole: FloatArray, time: FloatArray, first: float, grow: float
+    wave: FloatArray, whole: FloatArray, time: FloatArray, first: float, grow: float, rest: float
 ) -> FloatArray:
-    """Scale a wave to 0 to 1 by its extremes over the `whole` record and let it grow from 0."""
+    """Scale a wave to 0 to 1 by its extremes over the `whole` record; let it grow from the rest."""
     low, high = float(np.min(whole)), float(np.max(whole))
     risen: FloatArray = (wave - low) / max(high - low, 1e-12)
-    return risen * np.clip((time - first) / grow, 0.0, 1.0)
+    grown: FloatArray = rest + (risen - rest) * np.clip((time - first) / grow, 0.0, 1.0)
+    return grown
 
 
 def _nothing(p: FloatArray) -> FloatArray:

@@ -235,18 +235,27 @@ def fit_contenders(
     experiments = tuple(whole(as_read(r)) for r in records)
     start = chosen_start(records, model, None)[0].without(e.name for e in effects)
     base = fit_base(start, experiments, progress=progress)
-    plain = hypothesis((), base, experiments, final=True)
+    task = Task(experiments, tuple(effects), STACK, progress=progress)
+    return base, fitted_rivals(base, task), experiments
+
+
+def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
+    """Fit each effect of a task beside the base, without a verdict.
+
+    Raises InputError where an effect cannot be fitted.
+    """
+    plain = hypothesis((), base, task.experiments, final=True)
     if plain is None:
         raise InputError(["The fitted base cannot be simulated over the whole of these records."])
-    task = Task(experiments, tuple(effects), STACK, progress=progress)
     seen = examine(plain, task)
-    progress("fitting the rivals")
+    task.progress("fitting the rivals")
     step = Step(seen, evidence=seen.estimated())
-    chosen = contenders(step, experiments, task.limits, [e.name for e in effects])
-    lost = {e.name for e in effects} - {c.effect for c in chosen}
+    names = [e.name for e in task.table]
+    chosen = contenders(step, task.experiments, task.limits, names)
+    lost = {*names} - {c.effect for c in chosen}
     if lost:
         raise InputError(
             f"{', '.join(sorted(lost))} could not be fitted to these records, so there is nothing"
             " to tell apart; leave the records out to design from ordinary sizes."
         )
-    return base, chosen, experiments
+    return chosen

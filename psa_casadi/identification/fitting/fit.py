@@ -47,7 +47,6 @@ from psa_casadi.identification.fitting.unknowns import (
     Unknowns,
     coordinates_of,
     memory_prior,
-    static_compliance,
     unknowns_of,
 )
 from psa_casadi.interruption import current_work
@@ -90,7 +89,7 @@ def beginnings(
             continue
         first, last = unknowns.first(k), unknowns.first(k + 1)
         found[first:last] = 0.0
-        told = _told(unknowns, theta, experiments, k) if is_stack(model) else {}
+        told = _told(unknowns, theta, experiments, k) if unknowns.first_voltage else {}
         shared = {c: told[c] for c in told if unknowns.started[k][c - first] not in own}
         found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
         sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
@@ -110,7 +109,7 @@ def _told(
     """
     first = unknowns.first(k)
     size = max(float(np.ptp(e.record.voltage)) for e in experiments)
-    begins = [float(e.record.voltage[0]) for e in experiments]
+    begins = unknowns.first_voltage
     alike = [
         j
         for j, other in enumerate(experiments)
@@ -528,14 +527,16 @@ def fit(
     does not stop in a curved valley (`minimise`). Raises InputError when no sample can be used,
     SimulationError when the start cannot be simulated or its numbers overflow.
     """
-    if is_stack(model):
-        for e in experiments:
-            measured(e.record)
     if not any(e.at(k).any() for e in experiments for k, _ in enumerate(e.channels)):
-        raise InputError(["No sample with a displacement is left to fit; give more data."])
+        column = experiments[0].channels[0].column
+        raise InputError([f"No sample with a {column} is left to fit; give more data."])
     placed = model.with_values(start or {})
     unknowns = unknowns_around(model, free, experiments, sigma, placed=placed)
-    theta = _starting_point(model, experiments, unknowns, start or {}, start_states)
+    theta = np.zeros(unknowns.size)
+    theta[: len(free)] = unknowns.coordinates(placed.values)
+    for r, e in enumerate(experiments):
+        if e.used.any():  # the offset's coordinate is linear: `minimise` puts it where it is best
+            unknowns.place(theta, r, start_states[r] if start_states else {}, 0.0)
     minimum, way, told = accurate_minimum(
         model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
         rtol=rtol, goal=goal, radius=radius, patient=patient,
@@ -602,25 +603,3 @@ def unknowns_around(
     first = [float(e.record.voltage[0]) for e in experiments]
     unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))
     return unknowns.without([k for k, e in enumerate(experiments) if not e.used.any()])
-
-
-def _starting_point(
-    model: Model,
-    experiments: Sequence[Experiment],
-    unknowns: Unknowns,
-    start: Mapping[str, float],
-    start_states: Sequence[Mapping[str, float]] | None,
-) -> FloatArray:
-    values, stack = {**model.values, **start}, is_stack(model)
-    theta = np.zeros(unknowns.size)
-    theta[: len(unknowns.names)] = unknowns.coordinates(values)
-    for r, experiment in enumerate(experiments):
-        if not experiment.used.any():
-            continue
-        offset, given = 0.0, start_states[r] if start_states else {}
-        if stack:
-            y, v = measured(experiment.record)[experiment.used], experiment.record.voltage
-            slope = values["G"] * values["k_L"] * static_compliance(values)
-            offset = float(np.mean(y) - slope * np.mean(v[experiment.used]))
-        unknowns.place(theta, r, given, offset)
-    return theta

@@ -291,7 +291,7 @@ def coordinates_of(
         low=np.array([p.bounds[0] for p in parameters]),
         high=np.array([p.bounds[1] for p in parameters]),
         start_scale=tuple(np.array([size for size, _ in s.values()]) for s in starts),
-        first_voltage=(0.0,) * len(starts),
+        first_voltage=(),
         compliance=0.0,
         offset_scale=offset_scale,
         prior=np.concatenate([np.where(log, LOG_PRIOR, LINEAR_PRIOR), *own]),

@@ -15,13 +15,19 @@ from psa_casadi.design.tracking.tracking import TrackedInput
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model
-from psa_casadi.records.record import Record
+from psa_casadi.records.signals import Signals
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours, design_words
-from psa_casadi.report.words.phrases import length_scale, number, plain
+from psa_casadi.report.words.phrases import (
+    in_brackets,
+    length_scale,
+    number,
+    plain,
+    prefixed_scale,
+)
 from psa_casadi.report.words.series import FloatArray
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
@@ -146,39 +152,49 @@ def _curve(
 def write_experiment_page(
     path: str | os.PathLike[str],
     design: Separated | Informative,
-    model: Model,
-    responses: Mapping[str, FloatArray],
     live: LiveModel | None = None,
 ) -> None:
-    """Write the page of a designed experiment; `responses` are what each rival predicts [m].
+    """Write the page of a designed experiment, with what each of its rivals predicts.
 
     `live` is the model that runs in the page on the designed voltage. Raises InputError where the
     page cannot be written.
     """
     several, record = isinstance(design, Separated), design.record
-    applied = Panel("time [s]", "voltage [V]", 320)
-    applied.line(record.time, record.voltage, colour=colours.MEASURED)
+    figures = []
+    for name, values in record.columns.items():
+        applied = Panel("time [s]", in_brackets(name, record.units[name]), 320)
+        applied.line(record.time, values, colour=colours.MEASURED)
+        figures.append(Picture(f"The {name} to apply", applied))
+    predicted = {r.name: r.predict(record, r.truth) for r in design.rivals}
+    units = {o.name: o.unit for r in design.rivals for o in r.model.structure.outputs}
+    for k, name in enumerate(design.rivals[0].outputs):
+        own = {n: y[:, k] for n, y in predicted.items()}
+        figures.append(_responses(record, own, name, units[name]))
     write_design_page(
         path,
         title="Experiment that separates effects" if several else "Experiment for the parameters",
-        summary=design_words.sentences(design, model.values.get("C_p")),
-        tables=design_words.design_tables(design, model),
-        figures=(Picture("The voltage to apply", applied), _responses(record, responses)),
-        badges=(f"{record.n} samples", f"{number(design.limits.duration)} s"),
+        summary=design_words.sentences(design),
+        tables=design_words.design_tables(design),
+        figures=figures,
+        badges=(f"{record.n} samples", f"{number(record.n * record.sample_time)} s"),
         live=live,
     )
 
 
-def _responses(record: Record, responses: Mapping[str, FloatArray]) -> Picture:
-    """Return the plot of predicted displacements, less their mean where there are several."""
+def _responses(
+    record: Signals, responses: Mapping[str, FloatArray], output: str, unit: str
+) -> Picture:
+    """Return the plot of a predicted output, less the rivals' mean where there are several."""
     several = len(responses) > 1
     middle = np.mean(list(responses.values()), axis=0) if several else np.zeros(record.n)
     shown = {n: y - middle for n, y in responses.items()}
-    scale = length_scale(max(float(np.max(np.abs(y))) for y in shown.values()))
-    plot = Panel("time [s]", f"displacement [{scale.unit}]", 340)
-    for (name, y), colour in zip(shown.items(), _COLOURS * len(shown), strict=False):
-        plot.line(record.time, scale.factor * y, plain(name), colour)
-    caption = "Where the predictions part" if several else "Predicted displacement"
+    largest = max(float(np.max(np.abs(y))) for y in shown.values())
+    scale = length_scale(largest) if unit == "m" else prefixed_scale(largest, unit)
+    name = output.removeprefix("measured_")
+    plot = Panel("time [s]", in_brackets(name, scale.unit), 340)
+    for (rival, y), colour in zip(shown.items(), _COLOURS * len(shown), strict=False):
+        plot.line(record.time, scale.factor * y, plain(rival), colour)
+    caption = f"Where the predictions of {name} part" if several else f"Predicted {name}"
     note = (
         "Each rival's prediction less the mean of all, before it is fitted again; the design"
         " maximises what such a fit leaves."

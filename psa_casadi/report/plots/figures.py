@@ -10,14 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from psa_casadi.any_model.identify import OdeIdentification
-from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.posterior.chains import column_of
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.posterior.task import Block
@@ -27,7 +26,6 @@ from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
 from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.misfit_words import AXES
-from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.series import (
     FloatArray,
     Series,
@@ -41,7 +39,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
-Compared = Diagnosis | Identification | OdeDiagnosis | OdeIdentification
+Compared = OdeDiagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals
 
 #: What all pictures share.
@@ -58,6 +56,8 @@ _STILL_ROOM = {
 #: Samples of a record, bars of effects for which there is room, parameters and their bins.
 _MOST_POINTS, _MOST_BARS, _MOST_PARAMETERS, _BINS = 8000, 9, 12, 40
 _COLUMNS = 4
+#: Outputs or columns of a record in one picture.
+_MOST_ROWS = 8
 #: A legend above the plot, beside its title, and one over the curves.
 _ABOVE = {
     "fontsize": FONT - 1.5, "ncols": 4, "loc": "lower right", "bbox_to_anchor": (1.0, 0.98),
@@ -70,7 +70,7 @@ _OVER = {
 
 
 def save_figure(
-    diagnosis: Diagnosis,
+    diagnosis: OdeDiagnosis,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -91,7 +91,7 @@ def figure_of(result: Plotted) -> Figure:
     """Return the picture of a result."""
     if isinstance(result, Diagnosis):
         return diagnosis_figure(result)
-    if isinstance(result, Identification):
+    if isinstance(result, StackIdentification):
         series = series_of_fit(result)
         figure, grid, shown = _sheet(series, "measured", "model")
         _draw_residual(figure.add_subplot(grid[1, :]), shown)
@@ -101,11 +101,14 @@ def figure_of(result: Plotted) -> Figure:
     if isinstance(result, Posterior):
         return posterior_figure(result)
     if isinstance(result, Signals):
-        return one_output(result, None, None)
-    return record_figure(most_telling(_series(result)))
+        return columns_figure(result)
+    series = _series(result)
+    worst = most_telling(series)
+    same = [s for s in series if s.record == worst.record]
+    return outputs_figure(same) if len(same) > 1 else record_figure(worst)
 
 
-def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
+def diagnosis_figure(diagnosis: OdeDiagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
     verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
     figure, grid, shown = _sheet(series_of(diagnosis), origin, "base model", verdict)
@@ -129,6 +132,30 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     if s.against:
         draw(figure.add_subplot(grid[0, 2]), records.loop_plot(s, origin, shown), "Loop")
     _draw_residual(figure.add_subplot(grid[1, :]), s, origin)
+    return figure
+
+
+def outputs_figure(outputs: Sequence[Series], *, origin: str = "measured") -> Figure:
+    """Return the picture of several outputs of one record: measured against model, residual."""
+    outputs = outputs[:_MOST_ROWS]
+    figure = sheet((12.0, 2.6 * len(outputs)), 80)
+    grid = figure.subplots(len(outputs), 2, width_ratios=(1.6, 1.0), squeeze=False)
+    for s, (left, right) in zip(outputs, grid, strict=True):
+        shown = records.samples(s, _MOST_POINTS)
+        draw(left, records.measured_plot(s, origin, shown), s.title, legend=_ABOVE)
+        left.margins(x=0.01)
+        draw(right, records.residual_plot(s, shown), f"Residual of {s.title}")
+        right.margins(x=0.01)
+    figure.suptitle(f"{origin} record: {outputs[0].record}", fontsize=FONT)
+    return figure
+
+
+def columns_figure(record: Signals) -> Figure:
+    """Return the picture of all columns of a record over time, the one to show first."""
+    names = [record.shown, *(n for n in record.columns if n != record.shown)][:_MOST_ROWS]
+    figure = sheet((9.0, max(4.5, 2.2 * len(names))), 100)
+    for name, axes in zip(names, np.ravel(figure.subplots(len(names), 1)), strict=True):
+        _curve(axes, record.time, record.columns[name], name, record.units.get(name, ""))
     return figure
 
 
@@ -182,7 +209,7 @@ def _draw_residual(axes: Axes, s: Series, origin: str = "measured") -> None:
     axes.set_ylim(-1.1 * largest, 1.45 * largest)
 
 
-def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
+def narrow_figure(diagnosis: OdeDiagnosis, *, origin: str = "measured") -> Figure:
     """Return two panels: the residual over a stretch of time, and the held-out errors as bars.
 
     At half its 720 x 880 points, the width of a phone, letters are still large enough.
@@ -205,16 +232,17 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     above.legend(fontsize=font - 0.5, loc="upper left", ncols=2, columnspacing=0.9,
                  handlelength=1.2, framealpha=0.0)  # fmt: skip
     below.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
-    rows = [("base model", colours.BASE, diagnosis.base_errors.holdout_rms_m)]
+    e = next(e for e in diagnosis.errors if e.output == s.quantity)
+    rows = [("base model", colours.BASE, e.base)]
     if phrases.added(diagnosis):
-        rows.append(("extended", colours.EXTENDED, diagnosis.extended_errors.holdout_rms_m))
-    rows.append(("noise", colours.NOISE, diagnosis.noise_floor_rms_m))
+        rows.append(("extended", colours.EXTENDED, e.extended))
+    rows.append(("noise", colours.NOISE, e.noise))
     largest = max(rms for *_, rms in rows)
-    scale = phrases.scale_of(diagnosis.experiments, largest)
+    scale = phrases.prefixed_scale(largest, e.unit)
     for k, (_, colour, rms) in enumerate(rows):
         below.barh(k, rms, color=colour, height=0.7)
         below.annotate(f" {scale.text(rms)}", (rms, k), va="center", fontsize=font)
-    below.axvline(diagnosis.noise_floor_rms_m, color="black", linestyle="--", linewidth=1.0)
+    below.axvline(e.noise, color="black", linestyle="--", linewidth=1.0)
     below.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=font)
     below.set(xlim=(0.0, 1.3 * largest), xticks=[])
     below.invert_yaxis()
@@ -260,11 +288,7 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
-    if isinstance(result, Diagnosis):
-        return series_of(result)
-    if isinstance(result, Identification):
-        return series_of_fit(result)
-    return own_series(result) if isinstance(result, OdeDiagnosis) else own_fit_series(result)
+    return series_of(result) if isinstance(result, OdeDiagnosis) else series_of_fit(result)
 
 
 def _chosen(output: str | None, there: Collection[str], usual: str) -> str:

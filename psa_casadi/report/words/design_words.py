@@ -7,7 +7,6 @@ import numpy as np
 from psa_casadi.design.experiment.experiment import ASKED, PLAYS, Informative, Separated
 from psa_casadi.design.mechanism.mechanism import MechanismDesign
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
-from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import (
     interval_text,
     listing,
@@ -18,15 +17,16 @@ from psa_casadi.report.words.phrases import (
     shown_in,
 )
 from psa_casadi.report.words.tables import Table
+from psa_casadi.simulation.start import is_stack
 from psa_casadi.units import convert
 
 _FAMILIES = {
-    "free": "free-form voltage, linear between corners",
+    "free": "free-form, linear between corners",
     "triangles": "triangles between reversal points",
     "steps": "steps and holds",
     "multisine": "multisine",
-    "sine": "sine (no designed voltage was better)",
-    "triangle": "triangle (no designed voltage was better)",
+    "sine": "sine (no designed input was better)",
+    "triangle": "triangle (no designed input was better)",
 }
 
 
@@ -39,18 +39,30 @@ class Titled:
     note: str = ""
 
 
-def sentences(design: Separated | Informative, capacitance: float | None) -> tuple[str, ...]:
+def sentences(design: Separated | Informative) -> tuple[str, ...]:
     """Return what the design promises, and what it asks of the amplifier."""
+    model = design.rivals[0].model
+    capacitance = model.values.get("C_p") if is_stack(model) else None
     said = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
-    record = design.record
-    rate = float(np.max(np.abs(np.diff(record.voltage) / np.diff(record.time))))
-    current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
-    voltage = (
+    record, parts = design.record, []
+    for name, values in record.columns.items():
+        unit, rate = (
+            record.units[name],
+            float(np.max(np.abs(np.diff(values) / np.diff(record.time)))),
+        )
+        current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
+        shown = "" if unit == "1" else f" {unit}"
+        each = f"{shown} a second" if shown == "" or "/" in unit else f"{shown}/s"
+        named = f"{name} " if len(record.columns) > 1 else ""
+        parts.append(
+            f"{named}{number(values.min())} to {number(values.max())}{shown}, at most"
+            f" {number(rate)}{each}{current}"
+        )
+    inputs = (
         f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
-        f" {number(design.limits.duration)} s, {number(record.voltage.min())} to"
-        f" {number(record.voltage.max())} V, at most {number(rate)} V/s{current}."
+        f" {number(record.n * record.sample_time)} s, {'; '.join(parts)}."
     )
-    return (*said, voltage)
+    return (*said, inputs)
 
 
 def _chances(design: Separated) -> tuple[str, ...]:
@@ -69,7 +81,7 @@ def _chances(design: Separated) -> tuple[str, ...]:
         again = (
             f"No record was found that is predicted to decide with {percent(ASKED)}, not even one"
             f" that is repeated {PLAYS[-1]} times: within these limits the effects look alike."
-            " Widen the range of voltages or the band, make the record longer, or lower the"
+            " Widen the range of the inputs or the band, make the record longer, or lower the"
             " noise of the sensor."
         )
     else:
@@ -90,11 +102,11 @@ def _narrower(design: Informative) -> str:
     )
 
 
-def design_tables(design: Separated | Informative, model: Model) -> tuple[Titled, ...]:
+def design_tables(design: Separated | Informative) -> tuple[Titled, ...]:
     """Return the figures behind the sentences."""
     if isinstance(design, Informative):
-        note = "The model's values are taken as true; the sensor's offset and the start are free."
-        return (Titled("Predicted intervals", _intervals(design, model), note),)
+        note = "The model's values are taken as true; what is not known of the start is free."
+        return (Titled("Predicted intervals", _intervals(design), note),)
     usual = list(design.usual_chance)
     pairs = [
         (plain(p.truth), plain(p.other), number(p.designed), *(number(p.usual[n]) for n in usual))
@@ -116,9 +128,9 @@ def design_tables(design: Separated | Informative, model: Model) -> tuple[Titled
     )
 
 
-def _intervals(design: Informative, model: Model) -> Table:
+def _intervals(design: Informative) -> Table:
     """Return the predicted 95 % interval of every chosen parameter, before and after."""
-    rows = []
+    rows, model = [], design.rivals[0].model
     for name, after in design.intervals.items():
         unit, display = shown_in(model, name)
         cells = (
@@ -127,7 +139,9 @@ def _intervals(design: Informative, model: Model) -> Table:
         )
         value = number(convert(model.values[name], unit, display), 4)
         half = 0.5 * (after[1] - after[0]) / max(abs(model.values[name]), 1e-300)
-        rows.append((name, value, display, *cells, percent(half) if half < 10 else "open"))
+        rows.append(
+            (name, value, display, *cells, f"{number(100.0 * half, 2)} %" if half < 10 else "open")
+        )
     head = ("parameter", "value", "unit", "known before", "95 % interval after", "half width")
     return Table(head, tuple(rows))
 

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
-from psa_casadi.any_model.identify import OdeIdentification
 from psa_casadi.identification.determinacy import DETERMINED_WIDTH
-from psa_casadi.identification.identify import Identification
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.report.words.phrases import Scale, listing, number, percent
 
@@ -42,29 +42,23 @@ def grades(found: Identification) -> tuple[Grade, ...]:
     return tuple(grade(found, p.name) for p in found.model.structure.parameters)
 
 
-def grade(found: Identification | OdeIdentification, name: str) -> Grade:
+def grade(found: Identification, name: str) -> Grade:
     """Return the grade of one parameter."""
-    values = found.model.values
-    if isinstance(found, OdeIdentification):
-        errors, undetermined = found.errors, found.undetermined
-        on_bound = tuple(r.values["name"] for r in found.remarks if r.code == "on_bound")
-    else:
-        known = found.determinacy
-        errors, undetermined, on_bound = known.standard_errors, known.undetermined, known.on_bound
+    values, errors = found.model.values, found.errors
     if name not in errors:
         return Grade(name, float("nan"), "fixed")
     parameter = found.model.parameter(name)
     size = abs(values[name]) if parameter.log else parameter.typical(values)
     error = errors[name] / size if size > 0 else float("inf")
     degree: Degree = "weak" if error > WEAK_ERROR else "determined"
-    if name in on_bound:
+    if name in found.determinacy.on_bound:
         degree = "on its bound"
-    elif name in undetermined:
+    elif name in found.undetermined:
         degree = "undetermined"
     return Grade(name, error, degree, by_change=not parameter.log)
 
 
-def determined(model: Model, found: Identification | None = None) -> frozenset[str]:
+def determined(model: Model, found: StackIdentification | None = None) -> frozenset[str]:
     """Return the parameters that the records determine, if only weakly.
 
     Without the identification that found them they are those whose 95 % interval is that of a

@@ -1,9 +1,11 @@
 """Records changed a little or a lot: by 1 % of their noise, by an effect on top, cut and spoilt."""
 
 import itertools
+import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from time import process_time
 from typing import NamedTuple
 
@@ -12,7 +14,6 @@ import numpy as np
 import psa_casadi as psa
 from psa_casadi import datasets
 from psa_casadi.records.drive import reversals
-from tests.studies.benchmarks.exam import read_back
 from tests.studies.benchmarks.hidden_cases import Case, names_of, records_of, study
 from tests.studies.benchmarks.records import noisy
 from tests.studies.benchmarks.table import (
@@ -23,6 +24,7 @@ from tests.studies.benchmarks.table import (
     on_all_cores,
     share,
 )
+from tests.studies.exam.play import write
 from tests.studies.exam.record import Record as ExamRecord
 from tests.studies.exam.records import RECORDS
 from tests.studies.plants.base import simulate_base
@@ -100,7 +102,10 @@ def _records(source: Source) -> tuple[float, Sequence[psa.Record]]:
         truth, records = records_of(source)
         return truth.sigma, records
     if isinstance(source, ExamRecord):
-        record = read_back(source)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"{source.name}.csv"
+            write(source, path)
+            record = psa.read_record(path)
         return 1e-2 * source.test.noise * record.range_m, [record]
     sine, loops = datasets.micromanipulator()
     rows = dict(zip(MEASURED, ([sine], [loops], [sine, loops]), strict=True))

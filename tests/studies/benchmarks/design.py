@@ -117,10 +117,11 @@ def resolve(seed: int) -> Resolved | None:
         designed = resolving_experiment(d)
     except psa.PsaError:
         return None
-    usual = usual_records(designed.limits, designed.limits.steepest(None))
+    limits = designed.limits["voltage"]
+    usual = usual_records(limits, limits.rate)
     named = {}
     for name, record in {"designed": designed.record, **usual}.items():
-        again = played_again(truth, seed, (record.time, record.voltage))
+        again = played_again(truth, seed, (record.time, record.columns["voltage"]))
         named[name] = judged(psa.diagnose([first, again], effects=pair), effect)
     growth = {"designed": min(p.designed for p in designed.pairs)}
     growth |= {n: min(p.usual[n] for p in designed.pairs) for n in _FURTHER[1:]}

@@ -1,8 +1,9 @@
 """What exact steps are worth to fits, beside the stepper in the same run.
 
 One simulation of the demonstration's record with twelve derivatives is what a fit is made of; both
-ways make it at falling tolerances and are held against the stepper at 1e-11. Then the ways and
-errors of all effects in `simulate`, lanes, and whole fits and diagnoses. Times are the least
+ways make it at falling tolerances and are held against the stepper at 1e-11. Then
+lanes, and whole fits and diagnoses; ways and errors of all effects are in
+`tests/simulation/test_exact.py`. Times are the least
 processor time over several repeats, in which both ways take turns.
 """
 
@@ -20,19 +21,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 import psa_casadi as psa
-from psa_casadi.identification.fitting.fit import FIT_RTOL
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records import decaying_triangle, time_grid, triangle
 from psa_casadi.report.words.phrases import number, plain
 from psa_casadi.simulation import simulate as simulate_module
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_exact, run_sets
-from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.simulate import EXACT, STEP_SHARE, STEPPER, Way, input_samples, trace
+from psa_casadi.simulation.simulate import EXACT, STEPPER
 from psa_casadi.simulation.start import start_on
-from tests.model.stack_models import at_ordinary_size
 from tests.studies.benchmarks import table
 from tests.studies.benchmarks.records import hidden_record, noisy, played_again
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, share
+from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
 from tests.voltages import concatenate, steps
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P", "m_B")
@@ -81,13 +79,12 @@ class Task:
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
-    """Measure one run, lanes, the ways of all effects, and whole fits and diagnoses."""
+    """Measure one run, lanes, and whole fits and diagnoses."""
     task, repeats = demonstration(), 3 if quick else 15
     points = measured(task, repeats, progress)
     tables = (
         run_table(points, task.record.n),
         _lanes(task, cheapest(points, EXACT, "plain").tolerance, repeats, progress),
-        *ways_tables(_tried(progress, quick)),
         diagnosis_table(task.record, progress, quick),
     )
     return Outcome(tables, partial(picture, points))
@@ -238,128 +235,6 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
         " displacement of every set has the same bits in a lane, by itself and from"
         " `simulate_many`, which this run checked.",
     )
-
-
-BASE_NAME = "base"
-#: Corners (share of the record, share of the rated voltage) of the records with kinks.
-KINKED: dict[str, tuple[tuple[float, float], ...]] = {
-    "triangles": tuple((k / 8.0 + 0.0003 * (0 < k < 8), 0.8 * (k % 2)) for k in range(9)),
-    "steps": (
-        (0.0, 0.0), (0.1, 0.0), (0.1, 0.7), (0.4, 0.7), (0.4, 0.2), (0.7, 0.2), (0.7, 0.9), (1, 0.9)
-    ),
-    "ramps and holds": ((0, 0), (0.1, 0), (0.3, 0.8), (0.5, 0.8), (0.6, 0.3), (0.8, 0.3), (1, 0)),
-}  # fmt: skip
-MIXED = "sine, ramp, hold, step"
-_SAMPLES, _RTOLS = 1500, (1e-4, 1e-5, 1e-6)
-
-
-class Trial(NamedTuple):
-    """A stack with one effect or none, on a record of 1500 samples at one sample time [s]."""
-
-    stack: str
-    effect: str
-    record: str
-    sample_time: float
-
-
-class Reached(NamedTuple):
-    """The way of a trial at one tolerance, and its error over the range.
-
-    `fit` is the way of a run as a fit makes it, whose steps have one tolerance at all of these.
-    """
-
-    trial: Trial
-    rtol: float
-    way: str
-    error: float
-    fit: str
-
-
-def _tried(progress: Progress, quick: bool) -> list[Reached]:
-    found: list[Reached] = []
-    hows = [(MIXED, 1e-3)] if quick else product((*KINKED, MIXED), (2e-5, 1e-3))
-    trials = list(product((BASE_NAME, *psa.EFFECTS), hows))
-    for stack in list(psa.STACKS)[: 1 if quick else None]:
-        progress(f"errors over tolerance: {stack}")
-        for reached in side_by_side(tried, [Trial(stack, n, *how) for n, how in trials]):
-            found += reached
-    return found
-
-
-def voltage(record: str, top: float, sample_time: float) -> tuple[FloatArray, FloatArray]:
-    """Return times and voltages of a record up to 0.8 or 0.9 of the rated voltage."""
-    s, t = np.linspace(0.0, 1.0, _SAMPLES), sample_time * np.arange(_SAMPLES, dtype=np.float64)
-    if record == MIXED:
-        v = 0.4 * (1.0 - np.cos(2.0 * np.pi * 10.0 * s))
-        v = np.where(s < 0.4, v, np.interp(s, (0.4, 0.6, 0.8), (0.0, 0.7, 0.7)))
-        return t, np.asarray(top * np.where(s < 0.8, v, 0.3))
-    corners = np.array(KINKED[record])
-    return t, np.asarray(top * np.interp(s, corners[:, 0], corners[:, 1]))
-
-
-def with_one_effect(stack: str, effect: str) -> psa.Model:
-    """Return a stack with an effect at its ordinary size."""
-    model = psa.stack_model(stack)
-    return model if effect == BASE_NAME else at_ordinary_size(model, psa.EFFECTS[effect])
-
-
-def tried(trial: Trial) -> list[Reached]:
-    """Return what a trial reaches at each tolerance; nothing where the truth cannot be had."""
-    model = with_one_effect(trial.stack, trial.effect)
-    t, v = voltage(trial.record, model.values["u_rated"], trial.sample_time)
-    given = {"voltage": v}
-    if "temperature" in model.input_names:
-        given["temperature"] = 293.15 + 2.0 * np.sin(3.0 * t / t[-1])
-    u = input_samples(model, len(t), given)
-    x0, warm = start_on(model, t, u).x, given.get("temperature")
-    try:
-        truth = psa.run(model, t, u, x0, rtol=_TRUTH).y[:, model.output_names.index(_OUTPUT)]
-    except psa.PsaError:
-        return []
-    fit = trace(model, t, u, x0, way=Way(FIT_RTOL, FIT_RTOL), outputs=(_OUTPUT,)).way
-    runs = [(rtol, psa.simulate(model, t, v, temperature=warm, rtol=rtol)) for rtol in _RTOLS]
-    return [Reached(trial, rtol, r.way, _error(r.displacement, truth), fit) for rtol, r in runs]
-
-
-def ways_tables(found: Sequence[Reached]) -> list[TitledTable]:
-    """Return the ways of the base and of each effect beside it, and errors over the tolerance."""
-    ways, errors = [], []
-    for name in dict.fromkeys(r.trial.effect for r in found):
-        own = [r for r in found if r.trial.effect == name]
-        row = {"effect": plain(name), "in a fit": ", ".join({r.fit: 0 for r in own})}
-        for rtol in dict.fromkeys(r.rtol for r in own):
-            exact = [r.way == EXACT for r in own if r.rtol == rtol]
-            row[f"exact at {rtol:.0e}"] = f"{sum(exact)} of {len(exact)}"
-        ways.append(row)
-    for rtol in sorted({r.rtol for r in found}, reverse=True):
-        own = [r for r in found if r.rtol == rtol]
-        worst = max(own, key=lambda r: r.error)
-        stack, effect, record, step = worst.trial
-        errors.append({
-            "tolerance": f"{rtol:.0e}", "by exact steps": share(r.way == EXACT for r in own),
-            "error / tolerance above 1": share(r.error > rtol for r in own),
-            "worst": number(worst.error / rtol, 2),
-            "where": f"{stack}, {plain(effect)}, {record}, {1e3 * step:g} ms",
-        })  # fmt: skip
-    effects = {r.trial.effect for r in found} - {BASE_NAME}
-    fits = effects - {r.trial.effect for r in found if r.fit != EXACT}
-    trials = [len(set(of)) for of in zip(*{r.trial for r in found}, strict=True)]
-    return [
-        TitledTable(
-            "Ways of the effects, one at a time",
-            ways,
-            f"Of {len(effects)} effects {len(fits)} take the exact way in a fit (tolerance of a"
-            f" step {FIT_RTOL:.0e}). In `simulate` the others fall back on the stepper at"
-            f" {STEP_SHARE:g} of the tolerance.",
-        ),
-        TitledTable(
-            "Error over tolerance of `simulate`, records with kinks and jumps",
-            errors,
-            f"{trials[0]} stacks, {trials[1]} models (the base, and each effect alone beside it),"
-            f" {trials[2]} kinds of record of {_SAMPLES} samples, {trials[3]} sampling times,"
-            f" against the stepper at {_TRUTH:.0e}.",
-        ),
-    ]
 
 
 #: Causes hidden in a device of the independent plants each, of which there are six records.

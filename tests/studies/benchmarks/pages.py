@@ -1,9 +1,9 @@
-"""Models in pages, measured in a headless browser; and diagnoses of models that are no stacks."""
+"""Models in pages, measured in a headless browser."""
 
 import gzip
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,13 +18,10 @@ from psa_casadi.report.page.document import render
 from psa_casadi.report.page.live import LiveModel, LiveRecord
 from psa_casadi.report.page.playground import playground
 from psa_casadi.report.words import colours
-from psa_casadi.report.words.own_words import with_its_unit
-from psa_casadi.report.words.phrases import number, plain
+from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.series import Curve, Series
 from psa_casadi.variables import Interval, Provenance
-from tests.any_model import own_plants as plants
-from tests.any_model.own_models import motor, oscillator, pair, tanks
-from tests.report.browser import DARK, PHONE, Browser, find_browser, on_a_phone, without_policy
+from tests.report.browser import DARK, Browser, find_browser, without_policy
 from tests.report.live_pages import case, run_in_browser
 from tests.report.report_cases import NOISE
 from tests.report.steered_browser import Steered, steered
@@ -185,51 +182,3 @@ def _strip() -> Figure:
             axes.set_title(f"{k + 1}. {caption}", fontsize=11)
             axes.set_axis_off()
     return figure
-
-
-_CASES: dict[str, tuple[Callable[[], psa.Model], Callable[[], psa.Signals]]] = {
-    "dry friction of a motor": (motor, lambda: plants.motor(1)),
-    "a motor, nothing hidden": (motor, lambda: plants.motor(2, friction=0.0)),
-    "Bouc-Wen hysteresis": (oscillator, lambda: plants.bouc_wen(1)),
-    "a bent level sensor": (tanks, lambda: plants.tanks(3, "sensor")),
-    "two oscillators, nothing hidden": (pair, lambda: plants.pair(4)),
-    "a stiffness that breathes": (oscillator, lambda: plants.breathing(4)),
-}
-_WIDTH, _HEIGHT, _TALL = 900, 1000, 940
-
-
-def own_model(progress: Progress, quick: bool) -> Outcome:
-    """Return what is found of every hidden cause, and the picture of the first one's page."""
-    rows, first = [], None
-    for name, (model, record) in list(_CASES.items())[: 1 if quick else None]:
-        progress(name)
-        began = time.process_time()
-        d = psa.diagnose(model(), record())
-        spent = number(time.process_time() - began, 2)
-        first = first or d
-        for e in d.errors:
-            errors = {"base, held-out rms": e.base, "extended": e.extended, "noise": e.noise}
-            rows.append(
-                {"hidden": name, "verdict": d.verdict,
-                 "named": ", ".join(plain(c.effect) for c in d.causes), "output": e.output}
-                | {n: with_its_unit(v, e.unit) for n, v in errors.items()}
-                | {"processor time [s]": spent}
-            )  # fmt: skip
-    table = TitledTable("Hidden causes of models that are no stacks", rows)
-    return Outcome((table,), None if first is None else lambda: _desk_and_phone(first))
-
-
-def _desk_and_phone(d: psa.OdeDiagnosis) -> Figure:
-    """Return pictures of the page of a diagnosis: on a desk, and on a phone at night."""
-    drawn, (desk, phone) = plt.subplots(
-        1, 2, figsize=(7.4, 5.4), layout="constrained", width_ratios=(_WIDTH / _HEIGHT, 0.39)
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        browser, page = find_browser(Path(folder)), Path(folder) / "page.html"
-        psa.write_report(d, page)
-        desk.imshow(plt.imread(browser.screenshot(page, _WIDTH, _HEIGHT)))
-        shot = browser.screenshot(on_a_phone(page, _TALL), 500, _TALL, DARK)
-        phone.imshow(plt.imread(shot)[:, :PHONE])
-    for axes in (desk, phone):
-        axes.set_axis_off()
-    return drawn

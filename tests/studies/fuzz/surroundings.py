@@ -1,4 +1,4 @@
-"""Commands in odd surroundings, many at once, and with a damaged cache.
+"""Commands in odd surroundings, and many at once.
 
 In each a command works, or ends with a sentence that names the cause.
 """
@@ -6,18 +6,15 @@ In each a command works, or ends with a sentence that names the cause.
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 
 from psa_casadi.errors import InputError
-from tests.studies.fuzz.campaign import FALSE_PASS, LEFT_OVER, WRONG_EXIT, Draw, Found, Target
+from tests.studies.fuzz.campaign import LEFT_OVER, WRONG_EXIT, Draw, Found, Target
 from tests.studies.fuzz.commands import (
     LIBC,
     LIMIT_S,
@@ -260,111 +257,9 @@ def _many(data: bytes, where: Path) -> Iterator[Found]:
             yield Found(LEFT_OVER, f"{what} leave folders: {', '.join(left[:3])}")
 
 
-#: Commands that keep a library, with the folder of the cache that it lies in.
-_KEPT = {"simulate": "models", "export fmu": "binaries"}
-
-
-def _content(change: Callable[[bytes], bytes]) -> Callable[[Path], object]:
-    return lambda path: path.write_bytes(change(path.read_bytes()))
-
-
-def _flipped(place: float) -> Callable[[Path], object]:
-    def flip(data: bytes) -> bytes:
-        at = int(place * (len(data) - 1))
-        return data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]
-
-    return _content(flip)
-
-
-def _instead(make: Callable[[Path], object]) -> Callable[[Path], object]:
-    """Put something else in the place of a library."""
-
-    def put(path: Path) -> None:
-        path.unlink()
-        make(path)
-
-    return put
-
-
-def _whole_file(path: Path) -> None:
-    """Put a file where the folder of the libraries is."""
-    shutil.rmtree(path.parent)
-    path.parent.write_text("x")
-
-
-#: Ways to damage a library in the cache.
-WAYS: dict[str, Callable[[Path], object]] = {
-    "empty": _content(lambda _: b""),
-    "one byte": _content(lambda data: data[:1]),
-    "header only": _content(lambda data: data[:64]),
-    "half": _content(lambda data: data[: len(data) // 2]),
-    "last byte gone": _content(lambda data: data[:-1]),
-    "zeros": _content(lambda data: bytes(len(data))),
-    "zeros at the end": _content(lambda data: data[: len(data) // 2] + bytes(len(data) // 2)),
-    "text": _content(lambda _: b"this is no library\n"),
-    "bit in the header": _flipped(0.0005),
-    "bit in the first third": _flipped(0.3),
-    "bit in the middle": _flipped(0.5),
-    "bit in the last third": _flipped(0.75),
-    "more bytes": _content(lambda data: data + bytes(4096)),
-    "folder": _instead(lambda path: (path / "inside").mkdir(parents=True)),
-    "link to nothing": _instead(lambda path: path.symlink_to("nowhere")),
-    "link to itself": _instead(lambda path: path.symlink_to(".")),
-    "link to a device": _instead(lambda path: path.symlink_to("/dev/null")),
-    "other library": _instead(lambda path: shutil.copyfile(shutil.which("true") or "", path)),
-    "not readable": lambda path: path.chmod(0o000),
-    "not executable": lambda path: path.chmod(0o444),
-    "folder is a file": _whole_file,
-    "pipe": _instead(os.mkfifo),
-    "gone": Path.unlink,
-}
-
-
-@cache
-def _sound(command: str) -> tuple[bytes, dict[str, bytes]]:
-    """Return the output of a command, and the libraries that it leaves in an empty cache."""
-    work = WORKS[command]
-    with tempfile.TemporaryDirectory() as name, place(Path(name)) as folder:
-        if (ended := psa(work.arguments, folder)).code:
-            raise RuntimeError(f"no output to compare with: {ended.err}")
-        libraries = [p for p in (folder / "cache" / _KEPT[command]).iterdir() if p.is_file()]
-        output = (folder / work.outputs[0]).read_bytes()
-        return output, {p.name: p.read_bytes() for p in libraries}
-
-
-def _cache_case(rng: Draw) -> bytes:
-    names, runs = list(WAYS), list(_KEPT)
-    turn = rng.turn // len(names)
-    return json.dumps({"way": names[rng.turn % len(names)], "run": runs[turn % len(runs)]}).encode()
-
-
-def _damage_cache(data: bytes, where: Path) -> Iterator[Found]:
-    """Damage a library in the cache: the next command repairs it and gives the same result."""
-    case = json.loads(data)
-    expected, libraries = _sound(case["run"])
-    with place(where) as folder:
-        kept = folder / "cache" / _KEPT[case["run"]]
-        kept.mkdir(parents=True)
-        for name, content in libraries.items():
-            (kept / name).write_bytes(content)
-            (kept / name).chmod(0o755)
-        WAYS[case["way"]](kept / max(libraries, key=lambda n: len(libraries[n])))  # no checksum
-        what = f"psa {case['run']} with a library in the cache: {case['way']}"
-        for turn in ("at first", "again"):
-            output = folder / WORKS[case["run"]].outputs[0]
-            found = [*misbehaved(psa(WORKS[case["run"]].arguments, folder), (0,), what)]
-            yield from found
-            if not found and output.read_bytes() != expected:
-                yield Found(FALSE_PASS, f"{what}, {turn}: the output differs")
-            output.unlink(missing_ok=True)
-        yield from left_files(folder, what)
-
-
 TARGETS = (
     Target("environments", "environments", ".json", _surroundings_case, _surround, 5.0,
            2 * LIMIT_S, None, given_files),
     Target("many-at-once", "environments", ".json", lambda _: b'{"commands": 20}', _many, 1.0,
            2 * LIMIT_S, None, given_files),
-    Target("cache", "cache", ".json", _cache_case, _damage_cache, 1.0, 4 * LIMIT_S, None,
-           lambda: [_sound(command) for command in _KEPT]),
 )  # fmt: skip

@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ids.sort(key=lambda i: -float(before.get(i, {}).get(SECONDS, "1e9")))
 
     def told(case: str, row: Row) -> None:
-        said = row.get("failed") or row.get("causes") or row.get("code")
+        said = next((row[n] for n in ("failed", "causes", "told", "code") if n in row), "")
         print(f"{case}: {row.get('verdict', '')} {said} [{row[SECONDS]} s]", file=sys.stderr)
         if given.accept and "failed" not in row:
             keep({case: row})

@@ -1,5 +1,6 @@
 """The cases: records with known causes, measured ones, models of one's own, and exports."""
 
+import json
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from typing import Any
 import psa_casadi as psa
 from tests.any_model import own_models as models
 from tests.any_model import own_plants as plants
+from tests.contract.helpers import done
 from tests.studies.exam.marks import Answer, Named, mark
 from tests.studies.exam.play import write
 from tests.studies.exam.record import Record, Stack, Test
@@ -214,6 +216,23 @@ def _own(name: str, folder: Path) -> Row:
     return diagnosed(_asked(letter, *accepted), model(), records, **words)
 
 
+def _identified(folder: Path) -> Row:
+    """Return what `psa identify` says of a sound stack: what is told, and its intervals."""
+    record, file = folder / "record.csv", folder / "found.json"
+    make_record(None, 990101, record, excitation="loops", visible=None)
+    done("identify", record, "--json", file, "--quiet")
+    found = json.loads(file.read_text("utf-8"))
+    names: dict[str, list[str]] = {}
+    for name, parameter in found["parameters"].items():
+        names.setdefault(parameter["determined"], []).append(name)
+    told = (found["parameters"][name] for name in names["determined"])
+    return {
+        "told": "; ".join(f"{how}: {' '.join(own)}" for how, own in names.items()),
+        "parameters": _numbers([x for p in told for x in (p["value"], *p["interval"])]),
+        "base": _numbers([found["rms_m"]]),
+    }
+
+
 def _all() -> Iterator[Case]:
     for record in RECORDS:
         yield Case("exam", record.name, record.says, partial(_sat, record))
@@ -222,6 +241,7 @@ def _all() -> Iterator[Case]:
         yield Case("measured", name, "-", partial(_measured, fitted, held))
     for name, (hidden, *_) in _OWN.items():
         yield Case("own", name, hidden or "-", partial(_own, name))
+    yield Case("identify", "loops", "-", _identified)
     for name, work in EXPORTS.items():
         yield Case("export", name, "-", work)
 

@@ -13,7 +13,7 @@ SECONDS = "seconds"
 #: other columns are exact; the probabilities of the causes differ by less than PROBABILITY.
 _ROUNDING = {
     "removed": (0.0, 0.01), "base": (0.01, 0.0), "extended": (0.01, 0.0),
-    "numbers": (1e-5, 0.0), "errors": (0.05, 1e-8),
+    "numbers": (1e-5, 0.0), "parameters": (5e-3, 0.0), "errors": (0.05, 1e-8),
 }  # fmt: skip
 PROBABILITY = 0.02
 #: A change of processor time by this factor, of a case of more than a second, is shown.

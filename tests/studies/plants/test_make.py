@@ -1,4 +1,4 @@
-"""Noise, voltages, strengths and second effects of the records."""
+"""Voltages and strengths of the records."""
 
 from pathlib import Path
 
@@ -7,50 +7,9 @@ import pytest
 
 from tests.studies.plants.base import first_order, follow, simulate_base
 from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind
-from tests.studies.plants.make import HEADER, THERMOMETER, make_record
-from tests.studies.plants.stack import FloatArray
+from tests.studies.plants.make import make_record
 from tests.studies.plants.visibility import base_directions, refitted_ratio, visible_ratio
 from tests.tiers import slow, slow_but
-
-
-def column(path: Path, number: int) -> FloatArray:
-    return np.genfromtxt(path, delimiter=",", skip_header=1)[:, number]
-
-
-def test_autoregressive_record(tmp_path: Path) -> None:
-    truth = make_record(None, 1, tmp_path / "a.csv", noise="ar")
-    noise = column(tmp_path / "a.csv", 2) * 1e-6 - truth.displacement
-    assert 0.4 <= truth.noise.correlation <= 0.8
-    found = np.corrcoef(noise[1:], noise[:-1])[0, 1]
-    assert found == pytest.approx(truth.noise.correlation, abs=0.05)
-    assert np.std(noise) == pytest.approx(truth.sigma, rel=0.08)
-
-
-def test_quantised_record(tmp_path: Path) -> None:
-    truth = make_record(None, 1, tmp_path / "a.csv", noise="quantised")
-    counts = column(tmp_path / "a.csv", 2) * 1e-6 / truth.quantum
-    assert np.allclose(counts, np.round(counts), atol=1e-3)
-    assert 1.0 <= truth.quantum / truth.noise.white <= 3.0
-    noise = counts * truth.quantum - truth.displacement
-    assert np.std(noise) == pytest.approx(truth.sigma, rel=0.08)
-
-
-@pytest.mark.parametrize("stuck", [False, True])
-def test_record_with_drop_outs(stuck: bool, tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    seeds = iter(range(20))
-    truth = make_record(None, next(seeds), path, noise="drop-outs")
-    while truth.noise.stuck != stuck:
-        truth = make_record(None, next(seeds), path, noise="drop-outs")
-    assert 0.005 <= np.mean(truth.lost) <= 0.021
-    read = column(path, 2)
-    if stuck:
-        assert np.all(np.isfinite(read))
-        assert np.all(np.diff(read)[truth.lost[1:]] == 0.0)
-    else:
-        assert np.array_equal(np.isnan(read), truth.lost)
-    kept = (read * 1e-6 - truth.displacement)[~truth.lost]
-    assert np.std(kept) == pytest.approx(truth.sigma, rel=0.05)
 
 
 @pytest.mark.parametrize("kind", slow_but(["rich", "bipolar", "small"], EXCITATIONS))
@@ -80,33 +39,6 @@ def test_visible_ratio_is_what_was_asked_for(effect: str, tmp_path: Path) -> Non
     huge = make_record(effect, 4, tmp_path / "a.csv", visible=1e4)
     assert huge.gain_limited
     assert huge.visible < 1e4
-
-
-@slow
-def test_two_effects_add_up(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    both = make_record("slow_creep", 5, path, more=("mains_hum",), more_visible=2.0)
-    read = column(path, 2)
-    alone = make_record("slow_creep", 5, path)
-    (second,) = both.more
-    assert second.effect.name == "mains_hum"
-    assert second.visible == pytest.approx(2.0, rel=0.01)
-    assert both.gain == alone.gain
-    assert np.allclose(both.displacement, alone.displacement + second.added, atol=1e-18)
-    assert np.std(read * 1e-6 - both.displacement) == pytest.approx(both.sigma, rel=0.05)
-    only = make_record(None, 5, path, more=("mains_hum",), more_visible=2.0)
-    assert only.effect is None
-    assert np.array_equal(only.displacement - only.base_displacement != 0.0, only.times >= 0.0)
-
-
-def test_thermometer_is_in_the_record(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    truth = make_record("temperature", 6, path)
-    assert path.read_text(encoding="utf-8").startswith(HEADER + THERMOMETER + "\n")
-    assert truth.temperature is not None
-    assert np.allclose(column(path, 3), truth.temperature, atol=5.1e-4)
-    assert np.ptp(truth.temperature) > 0.1
-    assert make_record("slow_creep", 6, path).temperature is None
 
 
 @slow

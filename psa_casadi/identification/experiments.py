@@ -13,7 +13,7 @@ from psa_casadi.notes import Note, note
 from psa_casadi.records.read.reading import signals_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Hold, Signals, stairs
-from psa_casadi.records.split import Channel, Experiment, divided, whole
+from psa_casadi.records.split import Channel, Experiment, divided, whole, without_gaps
 from psa_casadi.records.suspects import suspects_of
 from psa_casadi.units import convert, parse_unit, si_unit
 
@@ -26,35 +26,12 @@ STRAIGHT = 2e-5
 _FIRST_LEVEL = 0.1
 
 
-def noise_share(experiments: Sequence[Experiment], channel: int) -> float:
-    """Return the rms of a channel's `noise` over the samples that judge, else over the fitted."""
-    counts = [int(c.sum()) for c in counted(experiments, channel)]
-    squares = [e.share(channel) ** 2 for e in experiments]
-    return float(np.sqrt(np.average(squares, weights=counts)))
-
-
-def missed_rms(
-    experiments: Sequence[Experiment], shown: Sequence[FloatArray], channel: int
-) -> float:
-    """Return the rms of measured minus predicted of a channel, in its unit, over these samples."""
-    rows = zip(experiments, shown, counted(experiments, channel), strict=True)
-    errors = np.concatenate([(e.measured(channel) - y[:, channel])[c] for e, y, c in rows])
-    return float(np.sqrt(np.mean(errors**2)))
-
-
-def counted(experiments: Sequence[Experiment], channel: int) -> list[BoolArray]:
-    """Return the samples of a channel that judge, the fitted ones where none does."""
-    judged = [e.at(channel, e.held_out) for e in experiments]
-    some = any(j.any() for j in judged)
-    return judged if some else [e.at(channel) for e in experiments]
-
-
 def given_to(model: Model, records: Any, hold: Hold | None, first: int = 1) -> list[Signals]:
     """Return the records that a user gave to a model (`signals_given`). Raises InputError."""
     return signals_given(records, model.input_names, model.output_names, hold=hold, first=first)
 
 
-def runs_of(
+def experiments_of(
     model: Model,
     given: Sequence[Signals],
     holdout: Sequence[Signals] = (),
@@ -85,6 +62,7 @@ def runs_of(
         )
     problems.raise_if_any()
     clean = [[_cleaned(model, s) for s in part] for part in parts]
+    clean = [[own for s in part for own in _cut(model, *s)] for part in clean]
     shadows = [[_shadow(model, s) for s, _ in part] for part in clean]
     split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
     records = cast("Sequence[Any]", [own for part in clean for own in part])
@@ -107,7 +85,15 @@ def runs_of(
     return tuple(replace(e, channels=tuple(channels)) for e in found)
 
 
-def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note, ...]]:
+def _cut(
+    model: Model, s: Signals, said: tuple[Note | str, ...]
+) -> list[tuple[Signals, tuple[Note | str, ...]]]:
+    """Return the parts of signals between gaps that hide a motion of an input that is no stairs."""
+    parts, cut = without_gaps([s], model.input_names if s.hold == "linear" else ())
+    return [(p, () if k else (*said, *cut)) for k, p in enumerate(parts)]
+
+
+def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note | str, ...]]:
     """Return signals without the samples that an output's sensor has made, and what these are."""
     inputs = {n: s.columns[n] for n in model.input_names}
     columns, said = dict(s.columns), list[Note]()
@@ -126,7 +112,7 @@ def varied(model: Model, e: Experiment) -> str | None:
     return most if most is not None and spans[most] > 0 else None
 
 
-def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note, ...]:
+def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note | str, ...]:
     """Return which inputs look held between samples and are read as lines, which outputs lack.
 
     And what units were not stated, and which samples are masked.

@@ -1,0 +1,285 @@
+"""The next record of any model: rivals, noise and what is known, from what is given; the design."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.any_model.effects.attached import Attached, extended, of_ones_own
+from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.component import Component
+from psa_casadi.design.experiment.criteria import (
+    Optimality,
+    Rival,
+    SensorNoise,
+    noise_of_fit,
+    rival_of_fit,
+    rival_of_model,
+)
+from psa_casadi.design.experiment.experiment import (
+    Informative,
+    Separated,
+    informative_experiment,
+    record_for,
+    rival_of_effect,
+    separating_experiment,
+    usual_inputs,
+)
+from psa_casadi.design.experiment.limits import KINDS, Kind, Limits
+from psa_casadi.design.experiment.search import Effort, Progress
+from psa_casadi.diagnosis.pack import Pack, Task
+from psa_casadi.diagnosis.result import Contender
+from psa_casadi.diagnosis.search.steps import fit_contenders, fitted_rivals
+from psa_casadi.effects import EFFECTS
+from psa_casadi.errors import InputError
+from psa_casadi.identification.experiments import experiments_of, given_to
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.multistart import free_of, known_zeros, search_starts
+from psa_casadi.identification.search import CORE
+from psa_casadi.interruption import interruptible_work
+from psa_casadi.model.compose import Model
+from psa_casadi.model.ports import with_ports
+from psa_casadi.progress import on_a_terminal
+from psa_casadi.records.signals import Hold
+from psa_casadi.records.split import Experiment, whole
+from psa_casadi.simulation.sizes import sized, sizes_of
+from psa_casadi.simulation.start import is_stack
+
+#: Noise of a sensor over what the output moves, where none is given.
+NOISE_SHARE = 1e-3
+_RAMP = 100
+
+
+@on_a_terminal
+@interruptible_work()
+def design_experiment(
+    model: Model,
+    limits: Mapping[str, Limits],
+    *,
+    records: Any = (),
+    separate: Sequence[str | Component] = (),
+    parameters: Sequence[str] = (),
+    free: Sequence[str] | None = None,
+    optimality: Optimality = "D",
+    noise: float | Mapping[str, float] | None = None,
+    correlation: float = 0.0,
+    zeros: Sequence[str] = (),
+    hold: Hold | None = None,
+    known_start: bool = False,
+    kinds: Sequence[Kind] = KINDS,
+    effort: Effort | None = None,
+    progress: Progress = lambda _: None,
+) -> Informative | Separated:
+    """Return the record to measure next with any model: the inputs within their limits.
+
+    Without effects to `separate` it is the record that best determines the `parameters` (all that
+    may be fitted): D-, E- or A-optimal for their covariance (known + J^T W J)^-1. Else it is the
+    one that best tells the effects apart, by the least distance between what one rival predicts and
+    another that is fitted again to that (`psa_casadi.design.experiment.criteria`).
+
+    Args:
+        model: A stack's model, or one of one's own.
+        limits: `Limits` of every input that is to move, by name; the others stay at their start
+            values. Of a model of one's own the inputs begin at their start values too.
+        records: Records already measured: rivals are fitted to them. None stands for ordinary
+            sizes of the effects.
+        separate: Names of effects, of a stack's table or as a diagnosis of a model of one's own
+            names them, or components of one's own.
+        parameters: Parameters to determine, by default all that are free.
+        free: Parameters of a model of one's own that are not known, by default all that may be
+            fitted.
+        optimality: "D" volume, "A" mean square, "E" worst direction of the confidence region.
+        noise: Rms of every output's sensor in its unit, by name; one number where there is one
+            output. By default a thousandth of what the output moves, or what the fits leave.
+        correlation: Correlation of the noise in neighbouring samples.
+        zeros: Outputs of a model of one's own whose zero is unknown in each record.
+        hold: What the inputs of a model of one's own do between samples, by default linear.
+        known_start: The record of a model of one's own will begin at its declared states.
+        kinds: Families of waveforms to choose from.
+        effort: How long to search.
+        progress: Is told what is being done.
+
+    Raises:
+        InputError: limits, names or records do not fit.
+        SimulationError: the model cannot follow any of the inputs.
+    """
+    rivals, base, left = rivals_of(
+        model, limits, records=records, separate=separate, parameters=parameters, free=free,
+        zeros=zeros, hold=hold, known_start=known_start, progress=progress,
+    )  # fmt: skip
+    told = left if noise is None else None
+    told = told or noise_of(rivals[0], limits, noise, correlation)
+    ready = _resting(model, limits)
+    if not separate:
+        return informative_experiment(
+            rivals[0], told, ready, names=parameters, optimality=optimality, kinds=kinds,
+            effort=effort, progress=progress,
+        )  # fmt: skip
+    return separating_experiment(
+        rivals, told, ready, base=base, kinds=kinds, effort=effort, progress=progress
+    )
+
+
+def _resting(model: Model, limits: Mapping[str, Limits]) -> dict[str, Limits]:
+    """Return the limits with where the inputs rest: a stack's at the lowest voltage."""
+    starts = {} if is_stack(model) else {i.name: i.start for i in model.structure.inputs}
+    return {
+        n: own if own.rest is not None else replace(own, rest=starts.get(n))
+        for n, own in limits.items()
+    }
+
+
+def noise_of(
+    rival: Rival,
+    limits: Mapping[str, Limits],
+    noise: float | Mapping[str, float] | None,
+    correlation: float,
+) -> tuple[SensorNoise, ...]:
+    """Return the noise of every output as given, else a share of what it moves along a ramp.
+
+    Raises InputError for a number where there are several outputs, and for a wrong name.
+    """
+    names = rival.outputs
+    if isinstance(noise, float | int):
+        if len(names) > 1:
+            raise InputError(
+                f"The model has the outputs {', '.join(names)}; give the noise of each by name, as"
+                f" {{'{names[0]}': {noise:g}, ...}}."
+            )
+        noise = {names[0]: float(noise)}
+    own = dict(noise or {})
+    for name, rms in own.items():
+        if name not in names or not rms > 0.0:
+            raise InputError(
+                f"The noise of '{name}' is given as {rms:g}; give a positive rms of one of"
+                f" {', '.join(names)}."
+            )
+    if len(own) < len(names):
+        some = next(iter(limits.values()))
+        time = some.grid(_RAMP)
+        ramps = {n: each.low + each.span * time / time[-1] for n, each in limits.items()}
+        shown = rival.predict(record_for(rival.model)("ramp", time, ramps), rival.truth)
+        sizes = dict(zip(rival.model.output_names, rival.model.output_nominals(), strict=True))
+        for name, y in zip(names, shown.T, strict=True):
+            moved = float(np.ptp(y))
+            own.setdefault(name, NOISE_SHARE * (moved or float(sizes[name])))
+    return tuple(SensorNoise(own[n], correlation) for n in names)
+
+
+def rivals_of(
+    model: Model,
+    limits: Mapping[str, Limits],
+    *,
+    records: Any = (),
+    separate: Sequence[str | Component] = (),
+    parameters: Sequence[str] = (),
+    free: Sequence[str] | None = None,
+    zeros: Sequence[str] = (),
+    hold: Hold | None = None,
+    known_start: bool = False,
+    progress: Progress = lambda _: None,
+) -> tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]:
+    """Return the models that a record is designed for, the base, and the noise that a fit leaves.
+
+    Without effects the one rival is the model. Raises InputError.
+    """
+    if isinstance(records, tuple | list) and not records:
+        records = None
+    if is_stack(model):
+        return _of_a_stack(model, records, separate, parameters, progress)
+    words: dict[str, Any] = {
+        "outputs": model.output_names, "zeros": known_zeros(model, zeros),
+        "known_start": known_start, "hold": hold or "linear",
+    }  # fmt: skip
+    names = tuple(dict.fromkeys([*free_of(model, free), *parameters]))
+    runs: tuple[Experiment, ...] = ()
+    base: Fit | None = None
+    if records is not None:
+        runs = experiments_of(
+            model, given_to(model, records, hold), judged=False, zeros=words["zeros"],
+            known_start=known_start,
+        )  # fmt: skip
+        progress("fitting from several starts")
+        base, runs, _ = search_starts(sized(model, runs), runs, names, starts=8)
+        words["outputs"] = tuple(c.column for c in base.channels)
+    if not separate:
+        if base is None:
+            return [rival_of_model(model.name, model, names, **words)], None, None
+        noise, colours = noise_of_fit(base)
+        return [rival_of_fit(model.name, base, colours, **words)], None, noise
+    effects = _attached(model, limits, separate, runs, base)
+    if base is None:
+        return [
+            rival_of_effect(extended(model, [e]), e.component, names, **words) for e in effects
+        ], None, None  # fmt: skip
+    opened = replace(base, model=with_ports(base.model))
+    table = tuple(e.component for e in effects)
+    task = Task(runs, table, Pack(), progress=progress)
+    return _fitted(base, fitted_rivals(opened, task), words)
+
+
+def _of_a_stack(
+    model: Model,
+    records: Any,
+    separate: Sequence[str | Component],
+    parameters: Sequence[str],
+    progress: Progress,
+) -> tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]:
+    free = [n for n in CORE if n in model.parameter_names]
+    if not separate:
+        own = [n for e in model.effects for n in e.fitted]
+        names = dict.fromkeys([*free, *own, *(n for n in parameters if n in model.parameter_names)])
+        return [rival_of_model(model.name, model, tuple(names))], None, None
+    effects = [EFFECTS[e] if isinstance(e, str) else e for e in separate]
+    if records is not None:
+        base, found, _ = fit_contenders(records, effects, model=model, progress=progress)
+        return _fitted(base, found, {})
+    plain = model.without(e.name for e in effects)
+    free = [n for n in free if n in plain.parameter_names]
+    return [rival_of_effect(model, e, free) for e in effects], None, None
+
+
+def _fitted(
+    base: Fit, found: Sequence[Contender], words: dict[str, Any]
+) -> tuple[list[Rival], Rival, tuple[SensorNoise, ...]]:
+    """Return rivals that were fitted to records, the base, and the noise that the best leaves."""
+    best = min(found, key=lambda c: c.fit.cost if words else c.fit.rms).fit
+    noise, colours = noise_of_fit(best)
+    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence, **words) for c in found]
+    return rivals, rival_of_fit("base", base, colours, **words), noise
+
+
+def _attached(
+    model: Model,
+    limits: Mapping[str, Limits],
+    separate: Sequence[str | Component],
+    runs: Sequence[Experiment],
+    base: Fit | None,
+) -> list[Attached]:
+    """Return effects of a model of one's own, by their names or as components.
+
+    Their sizes are those of the records, else those that a triangle within the limits shows.
+    """
+    if base is None:
+        waves = usual_inputs(_resting(model, limits))["triangle"]
+        time = next(iter(limits.values())).grid()
+        planned: Any = record_for(model)("triangle", time, waves)
+        sizes = sizes_of(model, [whole(planned)])
+    else:
+        sizes = sizes_of(base.model, runs, base.starts())
+    table = {e.name: e for e in effects_of(model, sizes)}
+    found = []
+    for effect in separate:
+        if isinstance(effect, Component):
+            found.append(of_ones_own(model, effect))
+        elif effect in table:
+            found.append(table[effect])
+        else:
+            near = get_close_matches(effect, table, 3, 0.3) or list(table)[:3]
+            raise InputError(
+                f"There is no effect '{effect}' of the model '{model.name}'; of {len(table)} the"
+                f" nearest are {', '.join(near)}."
+            )
+    return found

@@ -1,0 +1,259 @@
+"""Identify any model from its records: several starts, and the noise that every output leaves."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.refitting import (
+    refit,
+    relevelled,
+    reweighted,
+    unlike,
+    weighted,
+    with_noise,
+)
+from psa_casadi.identification.result import (
+    MISSED,
+    Identification,
+    StartOutcome,
+    doubts_of,
+    with_told,
+)
+from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
+from psa_casadi.progress import Progress, silent
+from psa_casadi.records.signals import Hold
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.sizes import sized
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.variables import Parameter
+
+#: Evaluations of a start's first fit, and how many of the best go on to the end.
+_QUICK, _FOLLOWED = 15, 2
+#: Starts whose costs differ by less than this share have found the same minimum.
+_SAME = 0.01
+#: Starts lie within so many natural logarithms, or ordinary changes, of the declared value.
+_DECADES, _CHANGES = 2.3, 2.0
+_SEED = 29
+#: A fit that leaves this share of an output's standard deviation explains nothing of it.
+_ALL = 0.8
+
+
+def identify_ode(
+    model: Model,
+    records: Any,
+    *,
+    free: Sequence[str] | None = None,
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+    hold: Hold | None = None,
+    progress: Progress = silent,
+) -> Identification:
+    """Fit the parameters of a model to all samples of all its records.
+
+    `records` are `Signals`, tables with a column `time`, or CSV files, whose columns bear the names
+    of the model's inputs and outputs. Between samples inputs are straight lines, or constant with
+    `hold="zero"`. Maximum likelihood over all outputs, each with the noise level that it leaves,
+    and where the noise of records differs, each with its own; the parameters stay within their
+    bounds. `free` names the parameters to fit, all that are `fitted` by default. The initial state
+    of every record is estimated too, unless it is known to be the declared one (`known_start`).
+    `zeros` names outputs whose zero is unknown in each record. The search begins at the declared
+    values and at `starts` - 1 random ones within the bounds, and follows the best two to their end.
+    `progress` gets what is done in words, by default a terminal.
+
+    Raises InputError for records or names that do not fit, SimulationError where the model cannot
+    be simulated at its values.
+    """
+    refuse_unfit(model)
+    runs = experiments_of(
+        model, given_to(model, records, hold), judged=False, zeros=known_zeros(model, zeros),
+        known_start=known_start,
+    )  # fmt: skip
+    progress("fitting from several starts")
+    best, runs, outcomes = search_starts(
+        sized(model, runs), runs, free_of(model, free), starts=starts, progress=progress
+    )
+    found = determinacy(best, runs)
+    result = Identification(
+        model=with_told(
+            best.model, [e.record for e in runs], found.names, found.intervals,
+            force_scale="given", interrupted=best.interrupted,
+        ),
+        fit=best,
+        determinacy=found,
+        experiments=runs,
+        doubts=(),
+        starts=outcomes,
+        interrupted=best.interrupted,
+    )  # fmt: skip
+    doubts = *doubts_of(best, found, outcomes), *_of_outputs(result), *told_of_columns(model, runs)
+    return replace(result, doubts=doubts)
+
+
+def _of_outputs(found: Identification) -> list[Note]:
+    """Return which outputs a model misses, and which it does not follow at all."""
+    said, rms = [], found.rms
+    for o in found.fit.channels:
+        left, noise = rms[o.column], found.noise[o.column]
+        parts = [e.measured(o.number)[e.at(o.number)] for e in found.experiments]
+        share = left / float(np.std(np.concatenate(parts)))
+        if noise > 0 and left > MISSED * noise:
+            said.append(note("output_missed", output=o.column, ratio=left / noise))
+        if share > _ALL:
+            said.append(note("output_not_followed", output=o.column, share=share))
+    return said
+
+
+def free_of(model: Model, free: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the parameters to fit. Raises InputError for a name that is none."""
+    if free is None:
+        return tuple(p.name for p in model.structure.parameters if p.fitted)
+    for name in free:
+        model.parameter(name)
+    return tuple(free)
+
+
+def known_zeros(model: Model, zeros: Sequence[str]) -> tuple[str, ...]:
+    """Return the outputs with an unknown zero. Raises InputError for a name that is none."""
+    for name in zeros:
+        if name not in model.output_names:
+            raise InputError(
+                f"`zeros` has '{name}', which is no output of '{model.name}'; there are"
+                f" {model.output_names}."
+            )
+    return tuple(zeros)
+
+
+_Start = TypeVar("_Start")
+
+
+def fits_from(
+    starts: Iterable[tuple[str, _Start]], quick: Callable[[str, _Start], Fit]
+) -> list[tuple[str, Fit]]:
+    """Return the quick fits from named starts that can be simulated.
+
+    A keyboard interrupt ends it with those that there are, if any.
+    """
+    found: list[tuple[str, Fit]] = []
+    for name, start in starts:
+        try:
+            one = quick(name, start)
+        except PsaError:
+            continue
+        except KeyboardInterrupt:
+            if not found:
+                raise
+            return [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
+        found.append((name, one))
+        if one.interrupted:
+            break
+    return found
+
+
+def search_starts(
+    model: Model,
+    experiments: Sequence[Experiment],
+    free: Sequence[str],
+    *,
+    starts: int,
+    progress: Progress = lambda _: None,
+) -> tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]]:
+    """Return the best fit from several starts, the experiments with their noise, and the starts.
+
+    The costs are those with the same noise in all experiments. Raises SimulationError where none
+    can be simulated.
+    """
+    sigma = [experiments[0].channels[0].level] * len(experiments)
+    seen = None if experiments[0].known_start else seen_starts(model, experiments)
+    rng, declared = np.random.default_rng(_SEED), model.values
+    drawn = [{n: _drawn(model.parameter(n), declared, rng) for n in free} for _ in range(1, starts)]
+    begins = [("declared values", {}), *((f"random values {k}", v) for k, v in enumerate(drawn, 1))]
+
+    def quick(name: str, values: Mapping[str, float]) -> Fit:
+        progress(f"fit from {name}")
+        return fit(
+            model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
+            evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4,
+        )  # fmt: skip
+
+    found = sorted(fits_from(begins, quick), key=lambda pair: pair[1].cost)
+    if not found:
+        raise SimulationError(
+            f"The model '{model.name}' cannot be simulated on these records from any start; check"
+            " the units of its inputs, its values and their bounds."
+        )
+    cut = any(f.interrupted for _, f in found)
+    ended = [
+        refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)
+        for _, f in found[: 0 if cut else _FOLLOWED]
+    ]
+    fits = dict(found) | {name: f for (name, _), f in zip(found, ended, strict=False)}
+    best = min(fits.values(), key=lambda f: f.cost)
+    outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begins)
+    if cut:
+        return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
+    best = relevelled(best, experiments, every=True)[0]
+    again = with_noise(best, experiments)
+    if unlike(again, experiments):
+        best = reweighted(best, again)
+    return best, again, outcomes
+
+
+def _outcome(name: str, end: Fit | None, best: Fit) -> StartOutcome:
+    if end is None:
+        return StartOutcome(name, float("nan"), float("nan"), None)
+    same = end.cost <= (1.0 + _SAME) * best.cost
+    return StartOutcome(name, end.cost, end.rms, True if same else None)
+
+
+def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[str, float]]:
+    """Return deviations of initial states that an output shows at its first sample."""
+    y, x = model.structure.y, model.structure.x
+    names = [x[k].name() for k in range(x.numel())]
+    shown = [
+        (model.output_names[j], names.index(y[j].name()))
+        for j in range(y.numel())
+        if y[j].is_symbolic() and y[j].name() in names
+    ]
+    found = []
+    for e in experiments:
+        own, known = {}, e.known if e.held_out_whole else e.used
+        for output, k in shown:
+            readings = e.record.column(output)
+            if readings is None:
+                continue
+            valid = readings[known & np.isfinite(readings)]
+            if valid.size:
+                own[names[k]] = float(valid[0]) - model.structure.states[k].start
+        found.append(own)
+    return found
+
+
+def _drawn(p: Parameter, values: Mapping[str, float], rng: np.random.Generator) -> float:
+    low, high = p.bounds
+    value = values[p.name]
+    if p.log and value > 0:
+        drawn = value * float(np.exp(rng.uniform(-_DECADES, _DECADES)))
+    elif np.isfinite(high - low):
+        drawn = float(rng.uniform(low, high))
+    else:
+        drawn = value + p.typical(values) * float(rng.uniform(-_CHANGES, _CHANGES)) * 0.5
+    return float(np.clip(drawn, low, high))
+
+
+def refuse_unfit(model: Model) -> None:
+    """Refuse a model without an output, and one with sampled states. Raises InputError."""
+    if not model.output_names:
+        raise InputError(f"The model '{model.name}' has no output; a fit compares with one.")
+    if model.structure.sampled:
+        raise InputError(
+            f"The model '{model.name}' has sampled states, whose sensitivities are not computed;"
+            " leave the sampled component out."
+        )

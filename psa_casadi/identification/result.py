@@ -1,0 +1,176 @@
+"""What an identification finds: a fitted model, what its records determine, and what to doubt."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.identification.determinacy import Determinacy
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.noise import first_order_noise
+from psa_casadi.records.record import Record
+from psa_casadi.records.signals import Signals
+from psa_casadi.records.split import Experiment, noise_share
+from psa_casadi.shown import Reported, frame, made
+from psa_casadi.strict_json import json_text
+from psa_casadi.variables import Interval, Provenance
+from psa_casadi.version import __version__
+
+#: A residual above so many times its own fast noise shows that the model misses something.
+MISSED = 1.5
+
+
+@dataclass(frozen=True)
+class StartOutcome:
+    """One start of a search: its name, the cost and rms it led to, and what became of it.
+
+    `rms` is that of the first output, in its unit; both are nan where it could not be simulated.
+    `agrees` is True where it led to the same minimum as the best, False where it led elsewhere,
+    None where the quick fit was so much worse that it was not followed to the end.
+    """
+
+    name: str
+    cost: float
+    rms: float
+    agrees: bool | None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Reported):
+    """An identified model with the fit behind it, what the data determine, and doubts.
+
+    `starts` tells what became of every start of the search; `notes` what was done to the records
+    (samples masked, averaged), which is no doubt. `warnings` and `sentences` are both in words.
+    `interrupted` says that a keyboard interrupt ended the search, or what came after it.
+    """
+
+    model: Model
+    fit: Fit
+    determinacy: Determinacy
+    experiments: tuple[Experiment, ...]
+    doubts: tuple[Note | str, ...]
+    starts: tuple[StartOutcome, ...] = ()
+    notes: tuple[Note | str, ...] = ()
+    interrupted: bool = False
+
+    def __repr__(self) -> str:
+        """Return the parameters with their standard errors, and what is left of the outputs."""
+        return str(note("own_identification", found=self))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is to be doubted, in words."""
+        return texts(self.doubts)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was done to the records and found in them, in words."""
+        return texts(self.notes)
+
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """The standard errors of the fitted parameters, in SI units."""
+        return self.determinacy.standard_errors
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """The parameters that these records do not determine."""
+        return self.determinacy.undetermined
+
+    @property
+    def rms(self) -> Mapping[str, float]:
+        """What is left of every measured output over all records (rms), in its unit."""
+        return rms_left(self.fit, self.experiments)
+
+    @property
+    def noise(self) -> Mapping[str, float]:
+        """The fast part of what is left of every measured output (rms), in its unit."""
+        return {
+            o.column: first_order_noise(o.residuals)[0] * noise_share(self.experiments, o.number)
+            for o in self.fit.channels
+        }
+
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas DataFrame.
+
+        Value, standard error, 95 % interval, unit and meaning; nan where one was not fitted.
+        """
+        parameters, nan = self.model.structure.parameters, float("nan")
+        intervals = [
+            self.model.provenance.intervals.get(p.name, Interval(nan, nan)) for p in parameters
+        ]
+        columns = {
+            "parameter": [p.name for p in parameters],
+            "value": [self.model.values[p.name] for p in parameters],
+            "error": [self.errors.get(p.name, nan) for p in parameters],
+            "low": [i.low for i in intervals],
+            "high": [i.high for i in intervals],
+            "unit": [p.unit for p in parameters],
+            "meaning": [p.description for p in parameters],
+        }
+        return frame(columns)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of IDENTIFICATION.json."""
+        found: dict[str, Any] = made("identification_file", self)
+        return found
+
+    def to_json(self) -> str:
+        """Return the text of IDENTIFICATION.json."""
+        return json_text(self.to_dict())
+
+
+def rms_left(fit: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
+    """Return what a fit leaves of every measured output over all records (rms), in its unit."""
+    found = {}
+    for o in fit.channels:
+        rows = zip(o.records, o.parts, strict=True)
+        left = np.concatenate([p * experiments[k].share(o.number) for k, p in rows])
+        found[o.column] = float(np.sqrt(np.mean(left**2)))
+    return found
+
+
+def doubts_of(
+    fit: Fit,
+    found: Determinacy,
+    starts: Sequence[StartOutcome],
+    not_unique: Sequence[str] = (),
+) -> list[Note]:
+    """Return what of a fit is to be doubted: its end, its minimum, what is open or on a bound.
+
+    `not_unique` names parameters that equally good fits differ in.
+    """
+    said = []
+    if fit.interrupted or not fit.converged:
+        said.append(note("interrupted" if fit.interrupted else "cut_off"))
+    if not_unique:
+        said.append(note("not_unique", names=not_unique))
+    elif len(starts) > 1 and sum(bool(s.agrees) for s in starts) == 1:
+        said.append(note("one_start", starts=len(starts)))
+    said += [note("on_bound", name=name) for name in found.on_bound]
+    alone = [n for n in found.undetermined if n not in not_unique]
+    return [*said, note("undetermined", names=alone)] if alone else said
+
+
+def with_told(
+    model: Model,
+    records: Sequence[Record | Signals],
+    free: Sequence[str],
+    intervals: Mapping[str, Interval],
+    **more: Any,
+) -> Model:
+    """Return a fitted model that says from which records it comes and how sure its values are.
+
+    `more` are other fields of `Provenance` by name.
+    """
+    told = Provenance(
+        identified_from=tuple((r.name, r.sha256) for r in records),
+        package_version=__version__,
+        free=tuple(free),
+        intervals=intervals,
+        **more,
+    )
+    return replace(model, provenance=told, evidence=None)

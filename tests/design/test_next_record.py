@@ -1,0 +1,149 @@
+"""The next record of any model: within its limits, as telling as it says, for two inputs too."""
+
+import math
+from functools import cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import psa_casadi as psa
+from psa_casadi.design import Limits, design_experiment
+from psa_casadi.design.experiment.experiment import Informative, Separated
+from psa_casadi.design.experiment.search import Effort
+from psa_casadi.units import FloatArray
+from tests.contract.helpers import done, refused, table
+from tests.tiers import slow
+
+#: Outflows of two tanks, the flow between them, rms noise of the levels [m].
+TRUTH, NOISE = {"a": 9e-4, "b": 1.2e-3, "c": 4e-4}, 1e-3
+LIMITS = {
+    "q": Limits(0.0, 8e-4, 600.0, 600, rate=4e-5),
+    "r": Limits(0.0, 6e-4, 600.0, 600, bandwidth=0.02),
+}
+BRIEF = Effort(draws=2, starts=1, steps=3)
+
+
+def tanks() -> psa.Model:
+    h, k, q, r, a, b, c = (ca.SX.sym(n) for n in ("h", "k", "q", "r", "a", "b", "c"))
+    between = c * (h - k)
+    return psa.ode_model(
+        {
+            "x": [h, k],
+            "u": [q, r],
+            "p": [a, b, c],
+            "ode": [(q - a * h - between) / 0.02, (r - b * k + between) / 0.02],
+            "y": [h, k],
+        },
+        name="tanks",
+        states=[psa.State("h", "m", "level", 0.3, start=0.2), psa.State("k", "m", "level", 0.3)],
+        inputs=[psa.Input("q", "m3/s", "flow", start=2e-4), psa.Input("r", "m3/s", "flow")],
+        parameters=[
+            psa.Parameter(n, v, "m2/s", (1e-5, 1e-2), "outflow", log=True) for n, v in TRUTH.items()
+        ],
+        outputs=[psa.Output("high", "m", "level"), psa.Output("low", "m", "level")],
+    )
+
+
+def played(record: psa.Signals, seed: int) -> psa.Signals:
+    """Return what two tanks of SciPy do with the inputs of a record, with noise."""
+    t, (q, r) = record.time, (record.columns[n] for n in ("q", "r"))
+    a, b, c = TRUTH.values()
+
+    def rates(time: float, x: FloatArray) -> list[float]:
+        flow = c * (x[0] - x[1])
+        first = np.interp(time, t, q) - a * x[0] - flow
+        return [first / 0.02, (np.interp(time, t, r) - b * x[1] + flow) / 0.02]
+
+    x = solve_ivp(rates, (t[0], t[-1]), [0.2, 0.0], t_eval=t, rtol=1e-8, max_step=1.0).y
+    x = x + NOISE * np.random.default_rng(seed).standard_normal(x.shape)
+    return psa.Signals(name="played", time=t, columns={**record.columns, "high": x[0], "low": x[1]})
+
+
+@cache
+def sharp() -> Informative:
+    found = design_experiment(
+        tanks(), LIMITS, noise={"high": NOISE, "low": NOISE}, known_start=True, effort=BRIEF
+    )
+    assert isinstance(found, Informative)
+    return found
+
+
+def test_inputs_keep_their_limits_and_begin_at_their_start_values() -> None:
+    record = sharp().record
+    assert (record.n, record.units) == (600, {"q": "m3/s", "r": "m3/s"})
+    for name, first in (("q", 2e-4), ("r", 0.0)):
+        values, own = record.columns[name], LIMITS[name]
+        assert values[0] == pytest.approx(first, abs=1e-12)
+        assert own.low <= values.min() < values.max() <= own.high
+        assert np.ptp(values) > 0.3 * own.span
+    rate = np.abs(np.diff(record.columns["q"]) / np.diff(record.time))
+    assert rate.max() <= 4e-5 * (1.0 + 1e-6)
+    assert abs(np.corrcoef(record.columns["q"], record.columns["r"])[0, 1]) < 0.95
+    assert min(sharp().factor.values()) > 1.0
+
+
+def test_identify_is_as_sure_on_the_designed_record_as_was_predicted() -> None:
+    found = psa.identify(tanks(), played(sharp().record, 1), starts=1, known_start=True)
+    for name, (low, high) in sharp().intervals.items():
+        half = 0.5 * (high - low)
+        assert 1.96 * found.errors[name] == pytest.approx(half, rel=0.2)
+        assert abs(found.model.values[name] - TRUTH[name]) < 2.0 * half
+    before = played(sharp().record, 2)
+    again = design_experiment(
+        tanks(), LIMITS, records=[before], zeros=["low"], parameters=["c"], effort=BRIEF,
+        optimality="E", kinds=["steps"],
+    )  # fmt: skip
+    assert isinstance(again, Informative)
+    low, high = again.before["c"]
+    more, less = again.intervals["c"]
+    assert list(again.intervals) == ["c"]
+    assert high - low > less - more > 0.4 * (high - low)  # a record like the first: 1 / sqrt(2)
+
+
+def test_what_does_not_fit_is_named() -> None:
+    model = tanks()
+    for words, told in (
+        ({"limits": {"u": Limits(0.0, 1.0, 1.0, 100)}}, "'u', which is no input of 'tanks'"),
+        ({"noise": 1e-3}, "give the noise of each by name"),
+        ({"noise": {"middle": 1.0}}, "The noise of 'middle'"),
+        ({"separate": ["friction_in_z", "drag_in_h"]}, "no effect 'friction_in_z'"),
+        ({"parameters": ["d"]}, "no parameter 'd'"),
+        ({"zeros": ["middle"]}, "`zeros` has 'middle'"),
+    ):
+        with pytest.raises(psa.InputError, match=told):
+            design_experiment(model, **{"limits": LIMITS, **words})  # type: ignore[arg-type]
+
+
+@slow
+def test_a_designed_record_tells_two_effects_apart(tmp_path: Path) -> None:
+    """The one that is there is named, on a record that was designed with ordinary sizes."""
+    psa.save_model(tanks(), tmp_path / "m.json")
+    done(
+        "design", "experiment", "--model", tmp_path / "m.json", "--input", "q=0:8e-4", "--input",
+        "r=0:6e-4", "--duration", "600", "--samples", "600", "--noise", "high=1e-3", "--noise",
+        "low=1e-3", "--known-start", "--starts", "1", "--separate", "bend_of_q", "loss_in_h",
+        "-o", tmp_path / "next.csv", "--report", tmp_path / "next.html",
+    )  # fmt: skip
+    columns = table(tmp_path / "next.csv")
+    assert list(columns) == ["time [s]", "q [m3/s]", "r [m3/s]"]
+    assert "The r to apply" in (tmp_path / "next.html").read_text("utf-8")
+    found = design_experiment(
+        tanks(), LIMITS, separate=["bend_of_q", "drag_in_h"], known_start=True, effort=BRIEF
+    )
+    assert isinstance(found, Separated)
+    assert min(p.designed for p in found.pairs) > 0.0
+    assert all(math.isfinite(p) for p in found.chance.values())
+
+
+def test_the_command_says_which_input_may_move(tmp_path: Path) -> None:
+    psa.save_model(tanks(), tmp_path / "m.json")
+    words = ("design", "experiment", "--model", tmp_path / "m.json", "--duration", "600")
+    assert "add --input NAME=LOW:HIGH, of q, r." in refused(*words)
+    told = refused(*words, "--input", "q=1", "--low", "3", "--noise", "-1")
+    for part in ("--input is 'q=1'", "--low is not there for a model", "--noise is -1"):
+        assert part in told
+    told = refused("design", "experiment", "--stack", "demo", "--duration", "1", "--known-start")
+    assert "--known-start is said of a model of your own" in told
