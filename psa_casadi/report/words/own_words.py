@@ -12,6 +12,7 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, verdict_words
+from psa_casadi.report.words.fit_words import determined_sentence, grades
 from psa_casadi.report.words.phrases import (
     added,
     either,
@@ -152,12 +153,7 @@ def own_fit_sentence(found: Identification) -> str:
         noise = found.noise[name]
         ratio = f" ({number(rms / noise, 2)} times its noise)" if noise > 0 else ""
         parts.append(f"{name} by {prefixed_scale(rms, unit).text(rms)}{ratio}")
-    count, open_ = len(found.errors), len(found.undetermined)
-    told = "all" if not open_ else f"{count - open_} of"
-    return (
-        f"The model misses {listing(parts)} rms. The records determine {told} {count} fitted"
-        f" parameter{'s' if count > 1 else ''}."
-    )
+    return f"The model misses {listing(parts)} rms. {determined_sentence(grades(found))}"
 
 
 def with_its_unit(value: float, unit: str) -> str:
