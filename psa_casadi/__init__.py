@@ -26,8 +26,6 @@ from psa_casadi.version import __version__
 
 if TYPE_CHECKING:
     from psa_casadi import datasets, design, online, system
-    from psa_casadi.any_model.diagnose import diagnose, identify
-    from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.component import Component, Equations, Symbols
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
     from psa_casadi.design.mechanism.mechanism import (
@@ -37,7 +35,7 @@ if TYPE_CHECKING:
     )
     from psa_casadi.devices.batch import BatchRun, batch
     from psa_casadi.devices.jobs import Job, Options
-    from psa_casadi.diagnosis.result import Diagnosis
+    from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
     from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
     from psa_casadi.errors import InputError, MachineError, PsaError
@@ -47,7 +45,8 @@ if TYPE_CHECKING:
     from psa_casadi.export.importer.fmu_model import fmu_model
     from psa_casadi.export.importer.model_with_fmu import load_model
     from psa_casadi.export.modelica.package import export_modelica
-    from psa_casadi.export.ssp.archive import export_ssp
+    from psa_casadi.export.ssp import export_ssp
+    from psa_casadi.faces import diagnose, identify
     from psa_casadi.identification.result import Identification
     from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
@@ -122,11 +121,10 @@ _HOMES = {
     "simulation.stepper": "run",
     "simulation.timings": "Timings timed",
     "simulation.simulate": "Trajectory memory_after settled_at simulate simulate_record",
-    "any_model.diagnose": "identify diagnose",
-    "any_model.result": "OdeDiagnosis",
+    "faces": "identify diagnose",
     "posterior.sample": "Posterior sample",
     "diagnosis.verdict": "patched_model",
-    "diagnosis.result": "Diagnosis",
+    "diagnosis.result": "Diagnosis OdeDiagnosis",
     "report.words.text": "story",
     "report.plots.figures": "save_figure",
     "report.page.results": "write_report write_fit_report",
@@ -138,7 +136,7 @@ _HOMES = {
     "export.fixed_step.export": "CodeExport export_c",
     "export.fmu.archive": "export_fmu",
     "export.modelica.package": "export_modelica",
-    "export.ssp.archive": "export_ssp",
+    "export.ssp": "export_ssp",
     "export.importer.fmu_model": "fmu_model",
     "export.check.check": "CheckReport check_fmu",
     "errors": "InputError MachineError PsaError",
@@ -181,6 +179,7 @@ def __getattr__(name: str) -> Any:
 #: Where texts are made, which need no pictures; all else that a result shows is in `report.shown`.
 _TEXTS = {
     "note_text": "psa_casadi.report.words.notes",
+    "told": "psa_casadi.report.words.text",
     "sentence_of": "psa_casadi.report.words.advice_words",
     "identification_file": "psa_casadi.report.documents.files",
 }

@@ -48,7 +48,12 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
         OSError: the folder cannot be made.
     """
     place = Path(tempfile.gettempdir()) if parent is None else parent
-    with _made(place, "", lambda path: path.mkdir(mode=0o700)) as path:
+
+    def make(path: Path) -> None:
+        path.mkdir(mode=0o700)
+        path.chmod(0o700)  # whatever the umask is
+
+    with _made(place, "", make) as path:
         yield path
 
 
@@ -141,10 +146,14 @@ def _locked(place: Path, ending: str, make: Callable[[Path], None]) -> tuple[Pat
         except FileExistsError:
             continue
         _MADE.add(path)
-        with contextlib.suppress(BlockingIOError, FileNotFoundError):
-            lock = _lock(path)
-            if path.exists():
-                return path, lock
+        try:
+            with contextlib.suppress(BlockingIOError, FileNotFoundError):
+                lock = _lock(path)
+                if path.exists():
+                    return path, lock
+        except OSError:  # where the umask lets nobody open it
+            _remove(path)
+            raise
         _MADE.discard(path)  # another process took it for left before it was locked
 
 

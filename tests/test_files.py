@@ -54,6 +54,18 @@ def test_a_new_file_is_readable_as_the_umask_says(tmp_path: Path) -> None:
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no umask that counts")
+def test_a_umask_that_lets_nobody_read_leaves_no_folder(tmp_path: Path) -> None:
+    before = os.umask(0o777)
+    try:
+        with temporary_folder(tmp_path) as folder:
+            assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+            (folder / "x").touch()
+    finally:
+        os.umask(before)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.skipif(not Path("/dev/null").is_char_device(), reason="this system has no /dev/null")
 def test_a_device_is_written_to_and_stays_a_device() -> None:
     atomic_write("/dev/null", "text")

@@ -5,11 +5,11 @@ from pathlib import Path
 import psa_casadi as psa
 from psa_casadi.cli.batch import tell_lost
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.screen import show, tell_written, working
+from psa_casadi.cli.screen import show, show_table, tell_written, working
 
 
 def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Given) -> None:
-    """Write a page that shows two or more devices side by side, or a population of many.
+    """Compare two or more devices side by side, or a population of many; write the page of that.
 
     A model and a diagnosis of the same records are one device. The page needs no network.
 
@@ -19,9 +19,10 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
         output: HTML page to write.
     """
     from psa_casadi.devices.batch import read_results
-    from psa_casadi.population.population import population
-    from psa_casadi.report.words.population_words import difference_sentence, population_sentences
+    from psa_casadi.population.population import differences, population
+    from psa_casadi.report.words import population_words as words
 
+    tables = []
     given.outputs({"--output": output}, files)
     given.check()
     with working("comparing", given.quiet):
@@ -30,11 +31,17 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
             tell_lost(lost, output, given.quiet)
             shown = population(found)
             psa.write_population(shown, output, without=lost)
-            told = population_sentences(shown)
+            told = words.population_sentences(shown)
         else:
             findings = psa.read_findings(files, given.own)
             psa.write_comparison(findings, output)
-            told = (difference_sentence(findings),)
+            rows = differences(findings)
+            told = (words.difference_sentence(findings, rows),)
+            tables = [words.verdict_table(findings, words.error_scale(findings))]
+            tables += [words.difference_table(findings, rows)] if rows else []
     for sentence in told:
         show(sentence, given.quiet)
+    for table in tables:
+        show("", given.quiet)
+        show_table(table, given.quiet)
     tell_written(output, quiet=given.quiet)

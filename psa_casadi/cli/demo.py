@@ -56,6 +56,7 @@ def demo(
         output: The same as DIRECTORY.
     """
     from psa_casadi.diagnosis.diagnose import diagnose
+    from psa_casadi.diagnosis.probes import laws_of, screened_with
     from psa_casadi.export.fmu.platforms import make_compiler_ready
     from psa_casadi.identification.identify import identify
     from psa_casadi.identification.start.ordinary import starting_model
@@ -68,9 +69,8 @@ def demo(
     record = psa.read_record(paths[RECORD], need_excitation=True)
     show("A synthetic record, made by a simulated stack with one effect hidden in it.", quiet)
     start = starting_model([record])
-    searched = (  # the last ones first, see `diagnose`
-        start.with_effect(e) for e in reversed(psa.EFFECTS.values()) if not e.needs_column
-    )
+    table = [e for e in psa.EFFECTS.values() if not e.needs_column and not e.inputs]
+    searched = reversed(screened_with(start, table, laws_of(start, [record], table)))
     with (
         working("identifying", quiet, IDENTIFY) as progress,
         compiled_ahead(searched, first=[make_compiler_ready]),

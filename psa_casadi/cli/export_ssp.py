@@ -36,9 +36,7 @@ def ssp(
         picture: Picture of the wiring to write, .svg or .png.
     """
     from psa_casadi.export.fmu.platforms import chosen_platforms
-    from psa_casadi.export.ssp.archive import layout_of, save_wiring, wiring_of
-    from psa_casadi.export.ssp.drawing import OUTSIDE, Port
-    from psa_casadi.export.ssp.steps import stable_step
+    from psa_casadi.export.ssp import OUTSIDE, Port, layout_of, save_wiring, stable_step, wiring_of
 
     given.outputs({"--output": output, "--picture": picture}, [model])
     if picture is not None and picture.suffix.lower() not in (".svg", ".png"):

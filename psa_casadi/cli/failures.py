@@ -176,6 +176,8 @@ P = ParamSpec("P")
 
 #: Set in the environment, this variable lets a failure end with its traceback.
 DEBUG = "PSA_CASADI_DEBUG"
+#: What is told where the folder that the command runs in was removed.
+NOWHERE = "The folder that this runs in is not there any more; change to another one, as by `cd`."
 #: What is told of an interrupt before there was any result.
 NOTHING_KEPT = "there was no result yet, so nothing was kept."
 
@@ -209,11 +211,21 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except Exception as error:
             if os.environ.get(DEBUG):
                 raise
-            for line in _told(error):
+            told_of = InputError(NOWHERE) if _is_nowhere(error) else error
+            for line in _told(told_of):
                 tell(line)
-            raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
+            raise typer.Exit(2 if isinstance(told_of, InputError) else 1) from error
 
     return run
+
+
+def _is_nowhere(error: Exception) -> bool:
+    """Whether an error comes from a working folder that was removed."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        return isinstance(error, FileNotFoundError)
+    return False
 
 
 def _told(error: Exception) -> list[str]:

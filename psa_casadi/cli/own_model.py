@@ -116,7 +116,7 @@ def diagnosed_own(
     if model is None:
         return False
     from psa_casadi.cli.diagnosis_files import expected, verdict_case
-    from psa_casadi.report.words.own_words import own_verdict_sentence
+    from psa_casadi.report.words.verdict_words import verdict_sentence
 
     began, own = clock.perf_counter(), given.of_any_model()
     given.refuse(others)
@@ -138,6 +138,6 @@ def diagnosed_own(
         psa.write_report(d, report)
     show(psa.story(d, width=width()), given.quiet)
     tell_written(output, json, report, quiet=given.quiet)
-    case = verdict_case(d.verdict, own_verdict_sentence(d), wanted)
+    case = verdict_case(d.verdict, verdict_sentence(d), wanted)
     judge("diagnose", ", ".join(p.name for p in records), [case], junit, began, tells=True)
     return True

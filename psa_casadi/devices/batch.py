@@ -43,6 +43,7 @@ from psa_casadi.identification.refitting import Progress
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding
+from psa_casadi.progress import on_a_terminal
 from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
 from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of
 from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding, finding_content
@@ -221,6 +222,7 @@ class BatchRun:
 
 
 @interruptible_work()
+@on_a_terminal
 def batch(
     jobs: Jobs,
     output: str | os.PathLike[str],

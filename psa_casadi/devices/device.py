@@ -5,18 +5,19 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 
-from psa_casadi.any_model.diagnose import diagnose as any_diagnose
-from psa_casadi.any_model.diagnose import identify as any_identify
 from psa_casadi.component import Component
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError, MachineError, PsaError
+from psa_casadi.faces import diagnose as any_diagnose
+from psa_casadi.faces import identify as any_identify
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.interruption import Work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.own_effects import known_effects, own_effects
+from psa_casadi.progress import silent
 from psa_casadi.records import Record, read_records, read_signals
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.documents.files import Status, identification_file
@@ -98,10 +99,10 @@ def _worked_own(task: DeviceTask, model: Model, began: float) -> DeviceOutcome:
     )  # fmt: skip
     _refuse_same(records)
     if o.work == "diagnose":
-        d = any_diagnose(model, records, **o.words)
+        d = any_diagnose(model, records, progress=silent, **o.words)
         name, text, last = DIAGNOSIS, d.to_json(), d.model
     else:
-        found = any_identify(model, records, **o.words)
+        found = any_identify(model, records, progress=silent, **o.words)
         if found.fit.interrupted:
             raise KeyboardInterrupt
         name, text, last = IDENTIFICATION, json_text(identification_file(found)), found.model

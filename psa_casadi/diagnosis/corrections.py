@@ -20,19 +20,21 @@ Stops and plays: Visintin 1994; their squares and cubes make loops that are asym
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.held_out import held_out_rms
-from psa_casadi.diagnosis.screening import independent, without
-from psa_casadi.diagnosis.task import shows_ringing
+from psa_casadi.diagnosis.screening import independent, temperature, without
+from psa_casadi.diagnosis.task import LIMITS, Thresholds, shows_ringing
 from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.start.linear_response import plays
+from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
@@ -185,27 +187,136 @@ _AT_BOUND = 1e-6
 _SIZES = np.geomspace(1e-3, 1e3, 25)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
-    """One correction beside a model: evidence over it, what it leaves, and what it adds.
+    """An unnamed correction beside a model, at a `port`: evidence over it, and what it leaves.
 
-    `predicted` [m] are whole records with the correction, `added` its own part of them; `weights`
-    those of the kind's columns; `holdout_rms` [m] the error in held-out samples; `moved` is how far
-    the model's own theta follows.
+    `predicted` are whole records with the correction, (n,) of one channel or (n, channels), and
+    `held` the errors of these channels in held-out samples. Of one that is told, `open_to` are
+    others that explain the data as well, and `share` is what it removes of the base's held-out
+    error above the noise.
     """
 
-    kind: Kind
+    port: str
     evidence: float
-    holdout_rms: float
-    weights: FloatArray
+    held: tuple[float, ...]
     predicted: tuple[FloatArray, ...]
+    open_to: tuple[str, ...] = ()
+    share: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """What it is, and where."""
+        raise NotImplementedError
+
+    @property
+    def sentence(self) -> str:
+        """What it is in words."""
+        return str(self.said)
+
+    @property
+    def said(self) -> Note:
+        """What it is."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Patch(Correction):
+    """One of a stack: its kind of columns at a port of the plant, and what it adds.
+
+    `weights` [m] are those of the kind's columns, `added` [m] their own part of `predicted` [m];
+    `moved` is how far the model's own theta follows.
+    """
+
+    kind: str
+    weights: FloatArray
     added: tuple[FloatArray, ...]
     moved: FloatArray
 
+    @property
+    def name(self) -> str:
+        """Kind and port."""
+        return f"{self.kind} at the {self.port}"
 
-def corrections(
-    fit: Fit, experiments: Sequence[Experiment], colour: Colour
-) -> tuple[Correction, ...]:
+    @property
+    def said(self) -> Note:
+        """What it is."""
+        return note("correction", kind=self.kind, port=self.port)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for DIAGNOSIS.json."""
+        return {
+            "kind": self.kind,
+            "port": self.port,
+            "sentence": self.sentence,
+            "evidence": self.evidence,
+            "open_to": list(self.open_to),
+        }
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FreeFunction(Correction):
+    """One of any model: a function without memory `of` some variables, added to a port's sum.
+
+    Along all records it adds `added` (n,) in the port's `unit`; that follows the `variable`, of
+    these the one that tells most of it, with the values `along` (n,).
+    """
+
+    of: str
+    unit: str
+    variable: str
+    variable_unit: str
+    along: FloatArray
+    added: FloatArray
+
+    @property
+    def name(self) -> str:
+        """What it is a function of, and its port."""
+        return f"a free function of {self.of} in {self.port}"
+
+    @property
+    def said(self) -> Note:
+        """What it is."""
+        return note("free", of=self.of, port=self.port)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for DIAGNOSIS.json."""
+        names = ("port", "of", "evidence", "share", "unit", "variable")
+        return {n: getattr(self, n) for n in names}
+
+
+def best_of(
+    found: Sequence[Correction],
+    experiments: Sequence[Experiment],
+    held: Sequence[float],
+    colour: Colour,
+    limits: Thresholds = LIMITS,
+) -> Correction | None:
+    """Return the best correction beside a model; None if none helps.
+
+    Its evidence must be above the price of a cause, and the log-likelihood of the held-out samples,
+    where the model's channels err by `held`, must gain as much as for a cause.
+    """
+    samples = [sum(int(e.at(j, e.held_out).sum()) for e in experiments) for j in range(len(held))]
+
+    def gained(c: Correction) -> float:
+        rows = zip(samples, colour.each, held, c.held, strict=False)
+        return sum(
+            n / own.inflation * float(np.log(before / max(after, 1e-300)))
+            for n, own, before, after in rows
+        )
+
+    told = [c for c in found if c.evidence > limits.price]
+    good = [c for c in told if not any(samples) or gained(c) > limits.held_out]
+    if not good:
+        return None
+    best = max(good, key=lambda c: c.evidence)
+    near = limits.clearly * temperature(best.evidence, limits)
+    others = [c for c in good if c is not best and c.evidence > best.evidence - near]
+    return replace(best, open_to=tuple(c.name for c in others))
+
+
+def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> tuple[Patch, ...]:
     """Return all corrections beside a fit, the one of the highest evidence first."""
     try:
         full = fit.predictions(experiments)
@@ -258,7 +369,7 @@ class _Following:
         return theta
 
 
-def _correction(kind: Kind, signals: Signals, follow: _Following) -> Correction:
+def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
     experiments = signals.experiments
     parts = [kind.columns(signals, k) for k in range(len(experiments))]
     shape = kind.shape(parts[0].shape[1])
@@ -269,8 +380,16 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Correction:
     moved = follow.moved(used @ weights)
     changes = [j @ moved for j in follow.whole]
     predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, own, strict=True))
-    held = held_out_rms(experiments, predicted)
-    return Correction(kind, evidence, held, weights * shape, predicted, own, moved)
+    return Patch(
+        port=kind.port,
+        evidence=evidence,
+        held=(held_out_rms(experiments, predicted),),
+        predicted=predicted,
+        kind=kind.name,
+        weights=weights * shape,
+        added=own,
+        moved=moved,
+    )
 
 
 def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:

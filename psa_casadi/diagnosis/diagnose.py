@@ -9,15 +9,16 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
-from psa_casadi.diagnosis.judgement import told_from
+from psa_casadi.diagnosis.judgement import NAMING, told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
+from psa_casadi.diagnosis.probes import laws_of, screened_with
 from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupted, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried
-from psa_casadi.diagnosis.verdict import NAMING, conclude
+from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
@@ -326,8 +327,9 @@ def diagnose(
         experiments, tuple(table), STACK, method, progress, so_far.append, watch, hidden=hidden
     )
     try:
+        laws = laws_of(start, [e.record for e in experiments if e.stop], table)
         # from the end: the screening begins at the front
-        with compiled_ahead(start.with_effect(e) for e in reversed(table)):
+        with compiled_ahead(reversed(screened_with(start, table, laws))):
             found = _diagnose(start, task, scale_given)
         return replace(found, remarks=(*found.remarks, *said))
     except KeyboardInterrupt:
@@ -383,7 +385,8 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     seen = driven(base, start, task)
     if not seen.follows:
         steps = unsearched(base, task)
-        found = conclude(steps, task, scale_given, driven=seen.filtered)
+        judge = StackJudge(steps, task, scale_given=scale_given, driven=seen.filtered)
+        found = judge.conclude()
         return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = steps_of(best_first(base, task), task)
     task.keep(steps[-1].fit)
@@ -402,7 +405,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         else:
             between = None
     progress("judging")
-    found = conclude(steps, task, scale_given)
+    found = StackJudge(steps, task, scale_given=scale_given).conclude()
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
     more_said = [

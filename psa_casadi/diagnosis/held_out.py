@@ -16,7 +16,7 @@ P_without is that of the model fitted again without the cause.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ import scipy
 
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, counted
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -312,54 +312,90 @@ def _powers(sums: FloatArray, counts: npt.NDArray[np.int64]) -> FloatArray:
 
 @dataclass(frozen=True)
 class Budget:
-    """The held-out error of the base model above the noise, and where it goes.
+    """Where the held-out error of the base model above the noise goes.
 
-    `excess_rms_m` is that error, `noise_rms_m` the noise; `together` what all causes remove,
-    `causes` what each does beside the others, `unnamed` what the best correction would remove of
-    the base's error (nothing named) or beyond the causes; `remains_rms_m` and
+    `together` is what all causes remove, `causes` what each does beside the others (the model
+    fitted again without it leaves so much more), `unnamed` what the best unnamed correction would
+    remove of the base's error (nothing named) or beyond the causes.
+    """
+
+    together: Share
+    causes: tuple[Share, ...]
+    unnamed: Share | None
+
+
+@dataclass(frozen=True)
+class StackBudget(Budget):
+    """The same of a stack, in lengths [m].
+
+    `excess_rms_m` is the base's error above the noise `noise_rms_m`; `remains_rms_m` and
     `remains_percent` of the range, each record's over its own as of all errors, are what the named
     causes leave above the noise.
     """
 
     excess_rms_m: float
     noise_rms_m: float
-    together: Share
-    causes: tuple[Share, ...]
-    unnamed: Share | None
     remains_rms_m: float
     remains_percent: float
 
 
 def removed_from(
-    experiments: Sequence[Experiment], base: Sequence[FloatArray], noise: float
+    experiments: Sequence[Experiment], base: Sequence[FloatArray], noise: Sequence[float]
 ) -> Removed:
-    """Return what models remove of a base's held-out error [m]; `noise` [m] is the rms of it."""
-    return Removed(partial(held_out_columns, experiments), base, (noise,))
+    """Return what models remove of a base's held-out error in its first channels, one a `noise`.
+
+    `base` are its predictions (n, channels), or (n,) of one, of all records; `noise` is the rms of
+    each channel's noise in its unit.
+    """
+    judged = [counted(experiments, j) for j in range(len(noise))]
+
+    def errors(shown: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return the errors (n, channels) where any channel is judged, else nan."""
+        parts = []
+        for e, y, *own in zip(experiments, shown, *judged, strict=True):
+            which, each = np.column_stack(own), y.reshape(len(y), -1).T
+            left = np.column_stack([e.errors(j, each[j]) for j in range(len(own))])
+            parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
+        return parts
+
+    return Removed(errors, base, tuple(noise))
 
 
 def budget(
-    experiments: Sequence[Experiment],
-    base: Sequence[FloatArray],
+    removed: Removed,
     extended: Sequence[FloatArray],
     without: Sequence[tuple[str, Sequence[FloatArray]]],
     correction: tuple[str, Sequence[FloatArray]] | None,
-    noise: float,
 ) -> Budget:
     """Return the budget of an extended model over a base.
 
-    `without` holds the predictions [m] of the model fitted again without each cause, `correction`
-    those with the best unnamed correction; `noise` [m] is the rms of the noise.
+    `without` holds the predictions of the model fitted again without each cause, `correction` those
+    with the best unnamed correction.
     """
-    removed = removed_from(experiments, base, noise)
+    return Budget(
+        together=removed.share("together", removed.base, extended),
+        causes=tuple(removed.share(name, less, extended) for name, less in without),
+        unnamed=removed.share(correction[0], extended, correction[1]) if correction else None,
+    )
+
+
+def stack_budget(
+    found: Budget,
+    experiments: Sequence[Experiment],
+    base: Sequence[FloatArray],
+    extended: Sequence[FloatArray],
+    noise: float,
+) -> StackBudget:
+    """Return a budget with its lengths; `base` and `extended` are predictions [m]."""
     powers = _powers(*held_out_parts(experiments, base, extended))
     excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
     whole = errors_of(experiments, extended)
-    return Budget(
+    return StackBudget(
+        found.together,
+        found.causes,
+        found.unnamed,
         excess_rms_m=excess,
         noise_rms_m=noise,
-        together=removed.share("together", base, extended),
-        causes=tuple(removed.share(name, less, extended) for name, less in without),
-        unnamed=removed.share(correction[0], extended, correction[1]) if correction else None,
         remains_rms_m=remains,
         remains_percent=whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300),
     )

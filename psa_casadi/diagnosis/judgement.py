@@ -1,17 +1,43 @@
-"""From what a search found to a verdict: do the names stand, and how much do they explain?"""
+"""From what a search found to a diagnosis of any model: do the names stand, and what is left?"""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
-from psa_casadi.diagnosis.corrections import Correction, corrections
-from psa_casadi.diagnosis.held_out import Share, removed_from
-from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.diagnosis.screening import credible_set
+import numpy as np
+
+from psa_casadi.any_model.effects.attached import Attached, extended
+from psa_casadi.diagnosis.colour import noise_left, noise_told
+from psa_casadi.diagnosis.confirmation import too_few_held_out
+from psa_casadi.diagnosis.corrections import Correction, best_of
+from psa_casadi.diagnosis.free_functions import free_functions
+from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
+from psa_casadi.diagnosis.pack import Task
+from psa_casadi.diagnosis.remedy import Size, changes
+from psa_casadi.diagnosis.result import (
+    Candidate,
+    Cause,
+    OdeDiagnosis,
+    OutputError,
+    Remaining,
+    Verdict,
+    estimates,
+)
+from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
-from psa_casadi.diagnosis.search.steps import Step
+from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
+from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.result import MISSED, with_told
+from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, missed_rms
+from psa_casadi.simulation.timings import stage
+
+#: Verdicts that name causes.
+NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
 
 
 @dataclass(frozen=True)
@@ -19,12 +45,14 @@ class Weighed:
     """Causes against the unnamed corrections beside the model without them.
 
     `evidence` of the causes together over that model; `share` that they remove of its held-out
-    excess; `shares` those that the `corrections` would.
+    excess, outputs over their noise, and `each` of every output by itself that it clearly misses;
+    `shares` are those that the `corrections` would remove.
     """
 
     evidence: float
     causes: int
     share: float
+    each: Mapping[str, float]
     corrections: Sequence[Correction]
     shares: Sequence[float]
     limits: Thresholds
@@ -34,8 +62,13 @@ class Weighed:
         """Do the causes remove more than their form may be wrong by, named or not?"""
         return self.share > self.limits.form
 
-    def beaten_by(self) -> Correction | None:
-        """Return the unnamed correction that takes the names away, if there is one.
+    @property
+    def least(self) -> tuple[str, float]:
+        """The output of which the least is removed, "" for all together, and that share."""
+        return min({"": self.share, **self.each}.items(), key=lambda item: item[1])
+
+    def beaten_by(self) -> tuple[Correction, float] | None:
+        """Return the unnamed correction that takes the names away, and what it would remove.
 
         It has more evidence, a price paid for it too, and they remove less than `enough` of what it
         removes of the held-out excess: it has more freedom.
@@ -44,7 +77,7 @@ class Weighed:
         own = self.evidence - limits.price * self.causes
         for c, share in zip(self.corrections, self.shares, strict=True):
             if self.share < limits.enough * max(share, 0.0) and c.evidence - limits.price > own:
-                return c
+                return c, share
         return None
 
 
@@ -64,109 +97,396 @@ def verdict_by(*, missing: bool, withdrawn: bool, ambiguous: bool, more: bool) -
 
 def told_from(step: Step, limits: Thresholds) -> tuple[str, ...]:
     """Effects that may as well be a step's cause: with the chosen one, the credible set."""
-    return () if step.chosen is None else rivals(step.probability, step.cause.name, limits)
+    if step.chosen is None:
+        return ()
+    within = credible_set(step.probability, limits.credible)
+    return tuple(name for name in within if name != step.cause.name)
 
 
-def rivals(
-    probability: Mapping[str, float], cause: str, limits: Thresholds = LIMITS
-) -> tuple[str, ...]:
-    """Return the other effects of the credible set that holds a cause."""
-    within = credible_set(probability, limits.credible)
-    return tuple(name for name in within if name != cause)
-
-
-def too_small(causes: Sequence[Share], limits: Thresholds) -> tuple[Share, ...]:
+def too_small(causes: Collection[Share], limits: Thresholds = LIMITS) -> tuple[Share, ...]:
     """Return causes that are not named where structure remains: the form of the others is wrong.
 
     Each removes less of the base's excess than a form may miss, and less than `enough` of what the
     largest does: that one is always named.
     """
-    least = least_share([c.share for c in causes], limits)
+    most = max((c.share for c in causes), default=0.0)
+    least = min(limits.form, limits.enough * most if most > 0.0 else most)
     return tuple(c for c in causes if c.share < least)
 
 
-def least_share(shares: Collection[float], limits: Thresholds = LIMITS) -> float:
-    """Return the share of the base's excess from which on a cause is named beside others."""
-    most = max(shares, default=0.0)
-    return min(limits.form, limits.enough * most if most > 0.0 else most)
+class Judge:
+    """What is said of the steps of a search, each from what they hold and when it is asked.
 
-
-def withdrawn_names(
-    steps: Sequence[Step],
-    weighed: Weighed,
-    beaten: Correction | None,
-    vague: Mapping[str, Correction],
-    doubt: Note | None,
-) -> tuple[Note, ...]:
-    """Return which names were found but not told, and why: `doubt` is that of held-out samples.
-
-    An unnamed correction has `beaten` all of them, or some have beaten each of them (`vague`).
+    Of records whose output is not `driven` by the input nothing is named. What depends on the kind
+    of device are the methods of the first part; a stack has its own.
     """
-    names = tuple(s.cause.name for s in steps if s.chosen is not None)
-    if not names:
-        return ()
-    kept = False
-    if doubt is not None:
-        why = doubt
-    elif beaten is not None:
-        share = weighed.shares[list(weighed.corrections).index(beaten)]
-        why = note("beaten", by=beaten.kind.name, port=beaten.kind.port,
-                   evidence=beaten.evidence, share=share)  # fmt: skip
-    elif vague:
-        why = _each(vague)
-    else:
-        why, kept = note("little", least=weighed.limits.enough), weighed.adds
-    return (
-        note("withdrawn", names=names, evidence=weighed.evidence, share=max(0.0, weighed.share),
-             kept=kept, why=why),
-    )  # fmt: skip
 
+    def __init__(self, steps: Sequence[Step], task: Task, *, driven: bool = True) -> None:
+        self.steps, self.task, self.driven = tuple(steps), task, driven
+        self.first, self.last = self.steps[0], self.steps[-1]
+        self.experiments, self.limits = task.experiments, task.limits
+        self._left: dict[Step, Remaining] = {}
 
-def vague_note(vague: Mapping[str, Correction]) -> tuple[Note, ...]:
-    """Return which causes stay in the model without a name, as corrections describe them better."""
-    return (note("vague", names=tuple(vague), why=_each(vague)),) if vague else ()
+    # What depends on the kind of device
 
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """The rms of the noise of every channel that judges, the first ones."""
+        raise NotImplementedError
 
-def _each(vague: Mapping[str, Correction]) -> Note:
-    each = tuple((c.kind.name, c.kind.port, n) for n, c in vague.items())
-    return note("better_unnamed", each=each)
+    @property
+    def doubt(self) -> Note | None:
+        """Why held-out samples cannot confirm a cause."""
+        raise NotImplementedError
 
+    @property
+    def model(self) -> Model:
+        """The extended model with what stands behind it."""
+        raise NotImplementedError
 
-@dataclass(frozen=True, eq=False)
-class Balance:
-    """What hypotheses of one search are weighed with: records, score, rms of the noise [m]."""
+    def corrections(self, of: Hypothesis) -> Sequence[Correction]:
+        """Return the unnamed corrections beside a hypothesis."""
+        raise NotImplementedError
 
-    experiments: Sequence[Experiment]
-    scale: Scale
-    noise: float
+    def unseen(self, step: Step) -> tuple[Note, float] | None:
+        """Return what only held-out samples tell that a model misses, and its p value."""
+        raise NotImplementedError
+
+    def named(self, step: Step) -> Cause:
+        """Return a cause with where it sits and what it changes, beside what all causes have."""
+        raise NotImplementedError
+
+    # What is said of any
+
+    def left(self, step: Step) -> Remaining:
+        """Return what the model of a step leaves, in fitted samples or in held-out ones."""
+        if step not in self._left:
+            test, beyond = step.test, self.unseen(step)
+            p = test.p_value if beyond is None else min(test.p_value, beyond[1])
+            if test.alarm:
+                found = Remaining(False, p, test.finding)
+            else:
+                found = Remaining(True, p) if beyond is None else Remaining(False, p, beyond[0])
+            self._left[step] = found
+        return self._left[step]
+
+    @property
+    def missing(self) -> bool:
+        """Whether the base lacks something."""
+        return self.first.chosen is not None or not self.left(self.first).white
 
     def weigh(self, before: Hypothesis, after: Hypothesis, *, beside: bool = True) -> Weighed:
         """Weigh the causes that one hypothesis has more than another against corrections of that.
 
-        Without any corrections where it is not `beside` them.
+        Without any corrections where it is not `beside` them. A channel counts by itself where
+        there are several, and the other's held-out rms is above `MISSED` times the noise:
+
+            share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
-        found = corrections(before.fit, self.experiments, self.scale.colour) if beside else ()
-        removed = removed_from(self.experiments, before.predicted, self.noise)
+        found = self.corrections(before) if beside else ()
+        removed = removed_from(self.experiments, before.shown, self.noise)
+        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
+        rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
+        each = {
+            f.column: (base**2 - left**2) / (base**2 - floor**2)
+            for f, base, left, floor in rows
+            if len(rows) > 1 and base > MISSED * floor
+        }
         return Weighed(
-            evidence=self.scale.evidence(after) - self.scale.evidence(before),
+            evidence=scale.evidence(after) - scale.evidence(before),
             causes=len(after.causes) - len(before.causes),
-            share=removed.from_base(after.predicted),
+            share=removed.from_base(after.shown),
+            each=each,
             corrections=found,
             shares=[removed.from_base(c.predicted) for c in found],
-            limits=self.scale.limits,
+            limits=self.limits,
         )
 
-    def vague(self, steps: Sequence[Step]) -> dict[str, Correction]:
-        """Return those of several causes that an unnamed correction describes better, by name.
+    @cached_property
+    def weighed(self) -> Weighed:
+        """All causes together, against corrections of the base."""
+        both = self.first.view.of, self.last.view.of
+        return self.weigh(*both, beside=self.missing and self.driven)
+
+    @cached_property
+    def stands(self) -> bool:
+        """Whether neither a correction nor a doubt takes all names away."""
+        return self.weighed.beaten_by() is None and self.doubt is None
+
+    @cached_property
+    def vague(self) -> dict[str, Correction]:
+        """Those of several causes that an unnamed correction describes better, by name.
 
         Each is weighed beside the model without it, all others kept.
         """
-        if len(steps) < 3:
-            return {}
-        last, found = steps[-1].view.of, {}
-        for s in steps:
+        last, found = self.last.view.of, {}
+        for s in self.steps if self.stands and len(self.steps) > 2 else ():
             if s.chosen is not None and s.without is not None:
                 better = self.weigh(s.without, last).beaten_by()
                 if better is not None:
-                    found[s.cause.name] = better
+                    found[s.cause.name] = better[0]
         return found
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The verdict."""
+        if not self.driven:
+            return "not_driven"
+        found = [s for s in self.steps if s.chosen is not None and s.cause.name not in self.vague]
+        little = self.last.test.alarm and self.weighed.least[1] < self.limits.enough
+        return verdict_by(
+            missing=self.missing,
+            withdrawn=not self.stands or not found or little,
+            ambiguous=bool(found and told_from(found[0], self.limits)),
+            more=bool(self.vague) or not self.left(self.last).white,
+        )
+
+    @cached_property
+    def kept(self) -> tuple[Step, ...]:
+        """The steps to the causes that the extended model holds, named or not."""
+        weak = self.verdict == "unexplained" and self.stands and not self.vague
+        if self.verdict in NAMING or (weak and self.weighed.adds):
+            return tuple(s for s in self.steps if s.chosen is not None)
+        return ()
+
+    @property
+    def final(self) -> Step:
+        """The step whose model is the extended one."""
+        return self.last if self.kept else self.first
+
+    @cached_property
+    def best_correction(self) -> Correction | None:
+        """The unnamed correction that would remove most of what the extended model leaves."""
+        of, colour = self.final.view.of, self.last.screening.colour
+        found = self.corrections(of) if self.kept else self.weighed.corrections
+        return best_of(found, self.experiments, of.errors, colour, self.limits)
+
+    @cached_property
+    def budget(self) -> Budget:
+        """Where the base's held-out error goes."""
+        unnamed = self.best_correction
+        return budget(
+            removed_from(self.experiments, self.first.view.of.shown, self.noise),
+            self.final.view.of.shown,
+            [(s.cause.name, s.without.shown) for s in self.kept if s.without is not None],
+            None if unnamed is None else (unnamed.name, unnamed.predicted),
+        )
+
+    @cached_property
+    def small(self) -> tuple[Share, ...]:
+        """Causes that remove too little to be named where structure remains."""
+        if not self.last.test.alarm or len(self.steps) < 2 or self.verdict not in NAMING:
+            return ()
+        return too_small([c for c in self.budget.causes if c.what not in self.vague], self.limits)
+
+    @cached_property
+    def causes(self) -> tuple[Cause, ...]:
+        """The causes that are named."""
+        unnamed = {*self.vague, *(c.what for c in self.small)}
+        steps = self.kept if self.verdict in NAMING else ()
+        return tuple(self.named(s) for s in steps if s.cause.name not in unnamed)
+
+    def cause(self, step: Step, sizes: Sequence[Size], port: str = "") -> Cause:
+        """Return a cause: its probability, the share of the error that it removes."""
+        shares = {c.what: c for c in self.budget.causes}
+        own = shares.get(step.cause.name)
+        return Cause(
+            effect=step.cause.name,
+            belongs_to=step.cause.belongs_to,
+            confidence=float(min(0.99, step.probability[step.cause.name])),
+            parameters=estimates(step.cause, self.model),
+            cannot_be_told_from=told_from(step, self.limits),
+            explained_share=0.0 if own is None else own.shown[0],
+            remedy=step.cause.what_now.code,
+            sizes=tuple(sizes),
+            port=port,
+            description=step.cause.description,
+        )
+
+    def withdrawn(self) -> tuple[Note, ...]:
+        """Return which names were found but not told, and why.
+
+        An unnamed correction has beaten all of them, or some have beaten each of them.
+        """
+        names = tuple(s.cause.name for s in self.steps if s.chosen is not None)
+        if not names:
+            return ()
+        (output, share), kept = self.weighed.least, False
+        beaten = self.weighed.beaten_by()
+        if self.doubt is not None:
+            why = self.doubt
+        elif beaten is not None:
+            by, theirs = beaten
+            why = note("beaten", by=by.said, evidence=by.evidence, share=theirs)
+        elif self.vague:
+            why = self._better()
+        else:
+            why, kept = note("little", least=self.limits.enough), self.weighed.adds
+        return (
+            note("withdrawn", names=names, evidence=self.weighed.evidence, share=max(0.0, share),
+                 output=output, kept=kept, why=why),
+        )  # fmt: skip
+
+    def _better(self) -> Note:
+        return note("better_unnamed", each=tuple((c.said, n) for n, c in self.vague.items()))
+
+    @property
+    def said(self) -> tuple[Note | str, ...]:
+        """Which names were withdrawn, which causes are too vague or too small to be named."""
+        notes = self.withdrawn() if self.verdict == "unexplained" else ()
+        if self.vague and self.verdict != "unexplained":
+            # they stay in the model without a name
+            notes = (note("vague", names=tuple(self.vague), why=self._better()),)
+        small = (note("small", effect=c.what, share=max(c.share, 0.0)) for c in self.small)
+        return (*notes, *small)
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Every effect tried, with its share of the training excess; estimated if not fitted.
+
+        Where nothing is named no effect of the table has a probability.
+        """
+        first = self.first
+        fit, colour, level = first.fit, first.screening.colour, first.fit.channels[0].level
+        base = sum(
+            len(f.residuals) * max(f.rms**2 - floor**2, 0.0) * (level / f.level) ** 2
+            for f, floor in zip(fit.channels, self.noise, strict=False)
+        )
+        excess = max(base / len(fit.residuals), 1e-300)
+        power = colour.level**2 / len(fit.residuals)
+        gone = {n: s.decrease * power for n, s in first.screening.best_by_effect().items()}
+        gone |= {n: h.removes(first.view.of) for n, h in first.fitted.items()}
+        named = self.verdict in NAMING
+        rows = [
+            Candidate(
+                effect=name,
+                explained_share=float(np.clip(removed / excess, 0.0, 1.0)),
+                evidence=first.alone[name],
+                fitted=name in first.fitted,
+                probability=first.probability.get(name, 0.0) if named else 0.0,
+            )
+            for name, removed in gone.items()
+        ]
+        return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What the diagnosis of every kind of device holds."""
+        best = self.best_correction
+        share = 0.0 if self.budget.unnamed is None else self.budget.unnamed.share
+        return {
+            "verdict": self.verdict,
+            "causes": self.causes,
+            "candidates": self.candidates,
+            "missed": self.left(self.first),
+            "remaining": self.left(self.final),
+            "base_fit": self.first.fit,
+            "extended_fit": self.final.fit,
+            "model": self.model,
+            "doubted": self.doubt if self.verdict in ("adequate", "unexplained") else None,
+            "budget": self.budget,
+            "patch": None if best is None else replace(best, share=share),
+        }
+
+
+class ModelJudge(Judge):
+    """The judge of any model: `base` as it was before the search, `table` effects at its ports."""
+
+    def __init__(self, known: Known, base: Model, table: Mapping[str, Attached]) -> None:
+        super().__init__(steps_of(known, known.task), known.task)
+        self.known, self.base, self.table = known, base, table
+        self.views = {s.view.of.names: s.view for s in self.steps}
+        self.views |= {s.beside.of.names: s.beside for s in self.steps if s.beside is not None}
+
+    @cached_property
+    def noise(self) -> tuple[float, ...]:
+        """The rms of the noise in what the best model leaves of every output."""
+        return tuple(noise_left(self.last.fit, self.last.screening.colour))
+
+    @cached_property
+    def doubt(self) -> Note | None:
+        """Whether too few samples are held out."""
+        return too_few_held_out(self.experiments)
+
+    @cached_property
+    def model(self) -> Model:
+        """The extended model, open at the ports that it needs alone."""
+        model = extended(self.base, [self.table[s.cause.name] for s in self.kept])
+        values = self.final.fit.model.values
+        model = model.with_values({n: v for n, v in values.items() if n in model.values})
+        sure, given = (
+            determinacy(self.final.fit, self.experiments),
+            [e.record for e in self.experiments],
+        )
+        return with_told(model, given, sure.names, sure.intervals, force_scale="given")
+
+    def corrections(self, of: Hypothesis) -> Sequence[Correction]:
+        """Fit free functions beside a hypothesis; none beside causes that leave no structure."""
+        view = self.views[of.names]
+        if of.causes and not view.test.alarm:
+            return ()
+        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
+        return free_functions(view, self.task, self.base, scale)
+
+    def unseen(self, step: Step) -> tuple[Note, float] | None:
+        """Return which output's held-out samples are unlike the fitted ones."""
+        for o, noise in zip(step.fit.channels, self._noise(step)[1], strict=True):
+            held = any(e.at(o.number, e.held_out).any() for e in self.experiments)
+            rms = missed_rms(self.experiments, step.view.of.shown, o.number)
+            least = self.limits.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
+            if held and rms > least:
+                told = note("held_out_unlike", output=o.column, ratio=rms / noise)
+                return told, step.test.p_value
+        return None
+
+    def _noise(self, step: Step) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
+        return noise_told(step.fit, step.screening.colour, self.experiments)
+
+    def named(self, step: Step) -> Cause:
+        """Return a cause with its port, and what it changes of every output."""
+        sizes = changes(step.cause, self.final.fit, self.experiments)
+        return self.cause(step, sizes, self.table[step.cause.name].port.words)
+
+    @property
+    def said(self) -> tuple[Note | str, ...]:
+        """What is said of any, and which causes add too little to be told."""
+        return (*super().said, *(() if self.doubt else self._left_out()))
+
+    def _left_out(self) -> tuple[Note, ...]:
+        """Return which causes are clearly likelier than the best, but may only correct its form.
+
+        Only where structure remains beside the best.
+        """
+        known, best = self.known, self.last.view.of
+        if not best.causes or not self.last.test.alarm:
+            return ()
+        clearly = self.limits.clearly * temperature(known.scale.evidence(best))
+        least = known.scale.score(best) + clearly
+        better = [h for h in known.found.values() if known.scale.score(h) > least]
+        better = [h for h in better if known.slight(h) and known.worth(h, form=False)]
+        top = max(better, key=known.scale.score, default=None)
+        if top is None:
+            return ()
+        names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
+        more = known.scale.evidence(top) - known.scale.evidence(best)
+        return (note("slight", names=names, more=more, small=small, least=self.limits.further),)
+
+    @stage("judging")
+    def conclude(self) -> OdeDiagnosis:
+        """Return the diagnosis."""
+        first, final = self.first, self.final
+        experiments, noise = self._noise(final)
+        errors = tuple(
+            OutputError(
+                o.column,
+                o.channel.unit,
+                level,
+                *(missed_rms(self.experiments, s.view.of.shown, o.number) for s in (first, final)),
+            )
+            for o, level in zip(final.fit.channels, noise, strict=True)
+        )
+        base, extended = (tuple(s.fit.outputs(self.experiments)) for s in (first, final))
+        return OdeDiagnosis(
+            errors=errors, remarks=self.said, experiments=experiments, base=base,
+            extended=extended, **self.common,
+        )  # fmt: skip

@@ -12,7 +12,8 @@ chi-square variable of as many degrees of freedom as (W'W + I/s^2)^-1 W'W has tr
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -34,10 +35,21 @@ from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.noise import peaks as highest_peaks
+from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.exact.run import NotExact, time_steps
 from psa_casadi.simulation.side_by_side import compiled, side_by_side
-from psa_casadi.simulation.simulate import Way
+from psa_casadi.simulation.simulate import Way, record_inputs
 from psa_casadi.simulation.start import is_stack, memory_names
+from psa_casadi.simulation.tangent import (
+    Answer,
+    Course,
+    Law,
+    answer,
+    course_of,
+    law_of,
+    opened,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -133,6 +145,9 @@ def _binned(
 
 
 _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
+#: A column along the course of a fit counts where the fitted parameters leave so many times of it
+#: what it may err by; else the effect is simulated.
+_CLEAR = 3.0
 #: A difference below this share of the readings is rounding, which looks like the residual's.
 _ROUNDING = 1e-12
 
@@ -180,15 +195,95 @@ def directions(
         peaks[DISPLACEMENT_STEPS] = residual_jumps(fit, experiments)
     tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
     composed = {e.name: fit.model.with_effect(e) for e in effects}
+    # else all cores wait for the first one's model, of which there are several tasks
+    fitted = [e.record for e in experiments if e.stop]
+    laws = laws_of(fit.model, fitted, effects, finite_steps=finite_steps)
+    compiled(screened_with(fit.model, effects, laws))
+    beside = _Beside(fit, experiments, laws)
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
         effect, values = task
         model = composed[effect.name].with_values(values)
-        return list(_directions_at(fit, experiments, effect, model, values, finite_steps))
+        return list(_directions_at(fit, experiments, effect, model, values, finite_steps, beside))
 
-    # else all cores wait for the first one's model, of which there are several tasks
-    compiled(fit.model.with_effect(e) for e in effects)
     return [d for found in side_by_side(one, tasks) for d in found]
+
+
+def laws_of(
+    model: Model,
+    records: Sequence[Record],
+    effects: Sequence[Component],
+    *,
+    finite_steps: bool = True,
+) -> dict[str, Law]:
+    """Return the laws of the effects that are not simulated in full, by name.
+
+    Of records on even times with straight lines between the samples alone; of effects that are
+    looked for with finite gains those that read nothing of what they move.
+    """
+    found = {}
+    with suppress(NotExact):
+        for r in records:
+            time_steps(r.time)
+        for e in effects if all(r.hold == "linear" for r in records) else ():
+            law = law_of(model.with_effect(e).structure, e)
+            steps = finite_steps and any(e.finite_step)
+            if law is not None and (law.forward or not steps):
+                found[e.name] = law
+    return found
+
+
+def screened_with(
+    model: Model, effects: Sequence[Component], laws: Mapping[str, Law]
+) -> list[Model]:
+    """Return the models that a screening simulates, beside the one that it is of."""
+    added = opened(model, laws.values())
+    whole = [model.with_effect(e) for e in effects if e.name not in laws]
+    return [added, *whole] if added is not model else whole
+
+
+class _Beside:
+    """What effects add along the course of a fit, those of the `laws` without a model of theirs."""
+
+    def __init__(
+        self, fit: Fit, experiments: Sequence[Experiment], laws: Mapping[str, Law]
+    ) -> None:
+        self.laws, self.opened = laws, opened(fit.model, laws.values())
+        self.outputs, starts = outputs_of(experiments[0].channels), fit.starts()
+        jacobian = fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300)
+        self.fitted = np.linalg.qr(jacobian)[0]
+
+        def course(k: int) -> Course | None:
+            e = experiments[k]
+            if not e.stop or not laws:
+                return None
+            t, u = e.record.time[: e.stop], record_inputs(fit.model, e.record, e.stop)
+            return course_of(
+                fit.model, t - t[0], u, starts[k],
+                way=fit.way, hold=e.record.hold, outputs=self.outputs,
+            )  # fmt: skip
+
+        self.courses = side_by_side(course, range(len(experiments)))
+
+    def answer(
+        self, model: Model, e: Experiment, k: int, memory: Mapping[str, float], way: Way,
+        *, finite: bool,
+    ) -> Answer:  # fmt: skip
+        """Return what the last effect of a model makes of one record's outputs."""
+        course = self.courses[k]
+        if course is None:
+            raise ValueError("a record that is held out whole has no course")
+        law = self.laws[model.components[-1].name]
+        return answer(
+            self.opened, law, model, course, record_inputs(model, e.record, e.stop), memory,
+            finite=finite, way=way, outputs=self.outputs,
+        )  # fmt: skip
+
+    def tells(self, columns: FloatArray, error: float) -> bool:
+        """Whether what the fitted parameters leave of every column is clear of its error."""
+        left = columns - self.fitted @ (self.fitted.T @ columns)
+        sizes = np.linalg.norm(left, axis=0) - _CLEAR * error * np.linalg.norm(columns, axis=0)
+        return bool(np.all(sizes >= 0.0))
 
 
 def _probe_values(
@@ -220,6 +315,7 @@ def _directions_at(
     model: Model,
     values: dict[str, float],
     finite_steps: bool,
+    beside: _Beside,
 ) -> Iterator[Direction]:
     gain = effect.gain or ""
     parameter = model.parameter(gain)
@@ -233,7 +329,13 @@ def _directions_at(
     for memory in _histories(fit, experiments, effect, model):
         for step in steps:
             try:
-                columns, further = changes(fit, experiments, model, moved, memory, step)
+                found = None
+                if effect.name in beside.laws:
+                    columns, further, error = _changes(
+                        fit, experiments, model, moved, memory, step, beside
+                    )
+                    found = (columns, further) if beside.tells(columns, error) else None
+                columns, further = found or changes(fit, experiments, model, moved, memory, step)
             except PsaError:
                 continue
             for k, (name, size) in enumerate(moved.items()):
@@ -283,21 +385,37 @@ def changes(
     their sizes, or the one by a finite `step`. With it comes what each changes in every further
     channel, beyond offsets and factors.
     """
+    columns, further, _ = _changes(fit, experiments, model, moved, memory, step)
+    return columns, further
+
+
+def _changes(
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    model: Model,
+    moved: Mapping[str, float],
+    memory: tuple[dict[str, float], ...],
+    step: float,
+    beside: _Beside | None = None,
+) -> tuple[FloatArray, tuple[FloatArray, ...], float]:
+    """Return the same with the share that they may err by, where `beside` has the effect's law."""
     stepped = model.with_values(dict.fromkeys(moved, step)) if step else model
     rtol = fit.way.rtol if step else _RTOL
     rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
 
-    def changed(k: int) -> FloatArray:
+    def changed(k: int) -> Answer:
         """Return outputs after the step, or their changes along the derivatives (n, outputs, m)."""
-        e = experiments[k]
+        e, way = experiments[k], Way(rtol, rtol)
         if not e.stop:
-            return np.zeros((0, len(outputs), len(moved)))
+            return Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
+        if beside is not None:
+            own = beside.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
+            return own if step else replace(own, y=own.y * sizes)
         found = trace_record(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
-            stop=e.stop, way=Way(rtol, rtol), by_start=False, outputs=outputs,
+            stop=e.stop, way=way, by_start=False, outputs=outputs,
         )  # fmt: skip
-        own: FloatArray = found.y[:, :, None] if step else found.sensitivity * sizes
-        return own
+        return Answer(found.y[:, :, None] if step else found.sensitivity * sizes, 0.0)
 
     outputs = outputs_of(experiments[0].channels)
     every, columns = [changed(k) for k in range(len(experiments))], []
@@ -307,7 +425,7 @@ def changes(
             e, at = experiments[k], experiments[k].at(f.number)
             rows = zip(f.factors, f.channel.outputs, strict=True)
             total = sum(
-                factor * every[k][at[: e.stop], outputs.index(name)] for factor, name in rows
+                factor * every[k].y[at[: e.stop], outputs.index(name)] for factor, name in rows
             )
             if step:  # what is shown beyond what the fit shows
                 offset = 0.0 if f.number else fit.offset(k)
@@ -319,7 +437,7 @@ def changes(
             else:
                 parts.append(total / e.share(f.number))
         columns.append(f.left_of(np.concatenate(parts)))
-    return columns[0], tuple(columns[1:])
+    return columns[0], tuple(columns[1:]), max(a.error for a in every)
 
 
 def spans(trials: Sequence[Direction]) -> list[list[int]]:

@@ -25,9 +25,11 @@ import numpy.typing as npt
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.signature import STACK, standard_voltage
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
+from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import accurate, input_samples, output_of, record_inputs
 from psa_casadi.simulation.start import linear_part, start_on
 
@@ -263,6 +265,26 @@ def sizes(
         )
         for f, within in zip(found, interval, strict=True)
     )  # fmt: skip
+
+
+def changes(effect: Component, fit: Fit, experiments: Sequence[Experiment]) -> tuple[Size, ...]:
+    """Return by how much an effect of any model changes each measured output within a record.
+
+    It is the range of the difference of two runs from the same start, with the effect and with its
+    gain at 0; nothing where the latter cannot be simulated.
+    """
+    columns = [fit.model.output_names.index(o.channel.outputs[0]) for o in fit.channels]
+    without = fit.at({effect.gain or "": 0.0})
+    try:
+        pairs = zip(fit.outputs(experiments), without.outputs(experiments), strict=True)
+        most = np.max([np.ptp(a - b, axis=0)[columns] for a, b in pairs], axis=0)
+    except PsaError:
+        return ()
+    longest = max(e.record.duration for e in experiments)
+    return tuple(
+        Size("record", float(size), o.channel.unit, None, longest, "s", None, output=o.column)
+        for size, o in zip(most, fit.channels, strict=True)
+    )
 
 
 def example(effect: Component, stack: Model | None = None) -> tuple[Model, tuple[Size, ...]]:

@@ -1,7 +1,7 @@
-"""What a diagnosis says, as frozen records, and DIAGNOSIS.json."""
+"""What a diagnosis says of any model, and what more of a stack; DIAGNOSIS.json."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -9,24 +9,25 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
+from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
+from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
-from psa_casadi.diagnosis.patch import Patch
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.split import Experiment
-from psa_casadi.shown import Reported, frame, with_units
+from psa_casadi.shown import Reported, frame, made, with_units
 
 FloatArray = npt.NDArray[np.float64]
 Verdict = Literal[
     "adequate", "cause_named", "partly_explained", "ambiguous", "unexplained", "not_driven"
 ]
 
-FORMAT = "psa_casadi.diagnosis/1"
+#: The formats of a stack's DIAGNOSIS.json, and of any other model's.
+FORMAT, ANY_MODEL = "psa_casadi.diagnosis/1", "psa_casadi.own_model_diagnosis/1"
 #: What remains is noise.
 NOISE = note("noise_only")
 
@@ -54,8 +55,9 @@ def estimates(effect: Component, model: Model) -> dict[str, Estimate]:
 class Cause:
     """A named cause: where it sits, how sure, how large, and what else it may be.
 
+    `explained_share` is what it removes of the held-out error above the noise, beside the others.
     `remedy` says as a code what to do about it, `sizes` what it changes in the tests that the
-    effect declares.
+    effect declares. Of any model, `port` is where it adds to the equations.
     """
 
     effect: str
@@ -66,6 +68,22 @@ class Cause:
     explained_share: float
     remedy: str = ""
     sizes: tuple[Size, ...] = ()
+    port: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class OutputError:
+    """The errors of one output in its unit: noise, and rms in held-out samples.
+
+    Of the base and of the extended model; of the used samples where none is held out.
+    """
+
+    output: str
+    unit: str
+    noise: float
+    base: float
+    extended: float
 
 
 @dataclass(frozen=True)
@@ -192,32 +210,25 @@ class Decision:
         return str(self.outcome)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Reported):
-    """A diagnosis: verdict, causes, the base and the extended model, errors, and what remains.
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class OdeDiagnosis(Reported):
+    """A diagnosis of any model: verdict, causes, the base and the extended model, what remains.
 
-    `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` are the
-    predictions [m] of every record in full, in the order of `experiments`. `noise` is the floor of
-    every record; `misfit` and `remainder` are what base and extended model get wrong in it, for
-    records with enough samples. `contenders` are the fitted rivals of an ambiguous verdict.
+    `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` (n, ny)
+    are the predictions of every record in full, in the order of `experiments`. `candidates` are all
+    effects tried, `errors` those of every measured output. `missed` is what the base leaves,
+    `remaining` what the extended model does. `budget` says where the base's held-out error goes,
+    `patch` is the unnamed correction that would remove most of what the named causes leave.
     `doubted` says why held-out samples cannot confirm a cause, None where they can; `remarks` what
     else there is to say.
-    `budget` says where the base's held-out error goes, `patch` the unnamed correction that would
-    remove most of what the named causes leave. `alternatives` are models for causes of which the
-    records do not tell whether an exported plant holds them. `columns` say what each further column
-    of the records decided.
     """
 
     verdict: Verdict
     causes: tuple[Cause, ...]
     candidates: tuple[Candidate, ...]
-    noise_floor_rms_m: float
-    base_errors: Errors
-    extended_errors: Errors
-    gain: Gain
-    blind_to: tuple[BlindSpot, ...]
+    errors: tuple[OutputError, ...] = ()
+    missed: Remaining = Remaining(True, 1.0)
     remaining: Remaining
-    next_experiment: NextExperiment
     remarks: tuple[Note | str, ...]
     experiments: tuple[Experiment, ...]
     base_fit: Fit
@@ -225,15 +236,9 @@ class Diagnosis(Reported):
     base: tuple[FloatArray, ...]
     extended: tuple[FloatArray, ...]
     model: Model
-    noise: tuple[NoiseFloor, ...] = ()
-    misfit: tuple[Misfit, ...] = ()
-    remainder: tuple[Misfit, ...] = ()
-    contenders: tuple[Contender, ...] = ()
     doubted: Note | None = None
-    budget: Budget | None = None
-    patch: Patch | None = None
-    alternatives: tuple[Alternative, ...] = ()
-    columns: tuple[Decision, ...] = ()
+    budget: Budget
+    patch: Correction | None = None
 
     @property
     def doubt(self) -> str:
@@ -250,21 +255,146 @@ class Diagnosis(Reported):
         """Effects that the extended model holds and that are not named as causes."""
         return unnamed_causes(self.budget, self.causes)
 
+    @property
+    def explained_share(self) -> float:
+        """The share of the base's held-out error above the noise that all causes remove."""
+        return self.budget.together.share
+
+    @property
+    def correction(self) -> FreeFunction | None:
+        """The unnamed correction, where it is a free function of any model."""
+        return self.patch if isinstance(self.patch, FreeFunction) else None
+
+    @property
+    def unnamed(self) -> str:
+        """Where an unnamed correction would remove most of what is left, "" if none does."""
+        if self.patch is None:
+            return ""
+        return str(note("would_remove", what=self.patch.said, share=self.patch.share))
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """What the base model's parameters became where the causes move them out of intervals."""
+        before, after = self.base_fit.model.values, self.model.values
+        return tuple(
+            str(note("moved", name=n, estimate=(after[n], i.low, i.high), without=before[n],
+                     unit=self.model.parameter(n).unit, causes=len(self.causes)))
+            for n, i in self.model.provenance.intervals.items()
+            if self.causes and n in before and not i.low <= before[n] <= i.high
+        )  # fmt: skip
+
+    def shown(self, channel: int) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
+        """Return what base and extended model predict of a channel along every record (n,)."""
+        (output,) = self.experiments[0].channels[channel].outputs
+        k = self.model.output_names.index(output)
+        base, extended = ([y[:, k] for y in model] for model in (self.base, self.extended))
+        return base, extended
+
+    def __repr__(self) -> str:
+        """Return the verdict, the causes with their sizes, the errors and what remains."""
+        return str(made("told", self))
+
+    def to_frame(self) -> Any:
+        """Return the samples as a pandas DataFrame: measured, base and extended by output.
+
+        Names carry units: `speed [m/s]`, `speed_base [m/s]`, `speed_extended [m/s]`.
+        """
+        columns, units = self._about_records(), {"time": "s"}
+        records = [e.record for e in self.experiments]
+        for k, o in enumerate(self.model.structure.outputs):
+            units |= dict.fromkeys((o.name, f"{o.name}_base", f"{o.name}_extended"), o.unit)
+            columns[o.name] = np.concatenate(
+                [np.full(r.n, np.nan) if (y := r.column(o.name)) is None else y for r in records]
+            )
+            columns[f"{o.name}_base"] = np.concatenate([y[:, k] for y in self.base])
+            columns[f"{o.name}_extended"] = np.concatenate([y[:, k] for y in self.extended])
+        return frame(with_units(columns, units))
+
+    def _about_records(self) -> dict[str, Any]:
+        records = [e.record for e in self.experiments]
+        return {
+            "record": np.repeat([r.name for r in records], [r.n for r in records]),
+            "time": np.concatenate([r.time for r in records]),
+            "held_out": np.concatenate([e.held_out for e in self.experiments]),
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of DIAGNOSIS.json."""
+        correction = self.correction
+        return {
+            "format": ANY_MODEL,
+            **self._common(),
+            "errors": [asdict(e) for e in self.errors],
+            "correction": None if correction is None else correction.to_dict(),
+        }
+
+    def _common(self) -> dict[str, Any]:
+        """Return what the file of every diagnosis has."""
+        return {
+            "verdict": self.verdict,
+            "doubt": self.doubt,
+            "causes": [asdict(c) for c in self.causes],
+            "candidates": [asdict(c) for c in self.candidates],
+            "budget": asdict(self.budget),
+            "missed": told(self.missed, "seen", "where"),
+            "remaining": told(self.remaining, "seen", "where"),
+            "unnamed": self.unnamed,
+            "notes": list(self.notes),
+            "values": dict(self.model.values),
+            "records": [
+                {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments
+            ],
+        }
+
+    def to_json(self) -> str:
+        """Return the text of DIAGNOSIS.json."""
+        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Diagnosis(OdeDiagnosis):
+    """A diagnosis of a stack, whose one output is its displacement.
+
+    `base` and `extended` (n,) are its predictions [m]. `noise` is the floor of every record;
+    `misfit` and `remainder` are what base and extended model get wrong in it, for records with
+    enough samples. `contenders` are the fitted rivals of an ambiguous verdict. `alternatives` are
+    models for causes of which the records do not tell whether an exported plant holds them.
+    `columns` say what each further column of the records decided.
+    """
+
+    noise_floor_rms_m: float
+    base_errors: Errors
+    extended_errors: Errors
+    gain: Gain
+    blind_to: tuple[BlindSpot, ...]
+    next_experiment: NextExperiment
+    noise: tuple[NoiseFloor, ...] = ()
+    misfit: tuple[Misfit, ...] = ()
+    remainder: tuple[Misfit, ...] = ()
+    contenders: tuple[Contender, ...] = ()
+    budget: StackBudget
+    patch: Patch | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    columns: tuple[Decision, ...] = ()
+
+    __repr__ = Reported.__repr__
+
+    def shown(self, channel: int) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
+        """Return what base and extended model predict of the displacement, channel 0 [m]."""
+        return self.base, self.extended
+
     def to_frame(self) -> Any:
         """Return the samples as a pandas DataFrame: `time [s]`, `measured [m]`, `base [m]`, ..."""
-        rows = list(zip(self.experiments, self.base, self.extended, strict=True))
-        columns = {
-            "record": np.repeat(
-                [e.record.name for e, _, _ in rows], [e.record.n for e, _, _ in rows]
-            ),
-            "time": np.concatenate([e.record.time for e, _, _ in rows]),
-            "voltage": np.concatenate([e.record.voltage for e, _, _ in rows]),
-            "measured": np.concatenate([measured(e.record) for e, _, _ in rows]),
-            "base": np.concatenate([base for _, base, _ in rows]),
-            "extended": np.concatenate([extended for _, _, extended in rows]),
-            "held_out": np.concatenate([e.held_out for e, _, _ in rows]),
+        columns = self._about_records()
+        held_out, records = columns.pop("held_out"), [e.record for e in self.experiments]
+        columns |= {
+            "voltage": np.concatenate([r.voltage for r in records]),
+            "measured": np.concatenate([measured(r) for r in records]),
+            "base": np.concatenate(self.base),
+            "extended": np.concatenate(self.extended),
+            "held_out": held_out,
         }
-        length = self.experiments[0].record.displacement_unit
+        length = records[0].displacement_unit
         units = {"time": "s", "voltage": "V"} | dict.fromkeys(
             ("measured", "base", "extended"), length
         )
@@ -274,38 +404,25 @@ class Diagnosis(Reported):
         """Return the content of DIAGNOSIS.json."""
         return {
             "format": FORMAT,
-            "verdict": self.verdict,
-            "doubt": self.doubt,
-            "causes": [asdict(c) for c in self.causes],
-            "candidates": [asdict(c) for c in self.candidates],
+            **self._common(),
             "errors": {
                 "noise_floor_rms_m": self.noise_floor_rms_m,
                 "base": asdict(self.base_errors),
                 "extended": asdict(self.extended_errors),
             },
             "gain": asdict(self.gain),
-            "budget": None if self.budget is None else asdict(self.budget),
             "patch": None if self.patch is None else self.patch.to_dict(),
             "alternatives": [a.to_dict() for a in self.alternatives],
             "columns": [told(c, "outcome", "sentence") for c in self.columns],
             "blind_to": [told(b, "reason", "why") for b in self.blind_to],
-            "remaining": told(self.remaining, "seen", "where"),
             "next_experiment": told(self.next_experiment, "reasons", "why"),
-            "notes": list(self.notes),
             "noise": [
                 {"record": n.record, "rms": n.level, "source": n.source, "sentence": n.sentence}
                 for n in self.noise
             ],
             "misfit": [_misfit(m) for m in self.misfit],
             "remainder": [_misfit(m) for m in self.remainder],
-            "records": [
-                {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments
-            ],
         }
-
-    def to_json(self) -> str:
-        """Return the text of DIAGNOSIS.json."""
-        return json.dumps(self.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def told(part: Any, code: str, text: str) -> dict[str, Any]:

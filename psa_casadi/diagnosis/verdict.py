@@ -1,4 +1,4 @@
-"""From the steps of a search to the diagnosis: verdict, blind spots, rivals, next record.
+"""What is said of a stack more than of any model: blind spots, rivals, the next record.
 
 What belongs to the sensor or the environment stays out of an exported plant. Where the records
 cannot tell such a cause from one of the plant, which of the two is exported is not theirs to say.
@@ -7,50 +7,42 @@ So there are two models, and the difference of their plants' displacements is to
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.confirmation import Excess, coverage_notes, held_out_excess, unconfirmed
-from psa_casadi.diagnosis.corrections import corrections
+from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
+from psa_casadi.diagnosis.corrections import Correction, corrections
 from psa_casadi.diagnosis.held_out import (
-    Budget,
     Share,
-    budget,
+    StackBudget,
     errors_of,
     gain_of,
     held_out_parts,
     jackknife,
     lost_elsewhere,
+    stack_budget,
     whole_residuals,
 )
-from psa_casadi.diagnosis.judgement import (
-    Balance,
-    told_from,
-    too_small,
-    vague_note,
-    verdict_by,
-    withdrawn_names,
-)
+from psa_casadi.diagnosis.judgement import Judge, told_from
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.patch import patch_of, with_patch
+from psa_casadi.diagnosis.patch import with_patch
 from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
     Alternative,
     BlindSpot,
-    Candidate,
     Cause,
     Diagnosis,
     NextExperiment,
-    Remaining,
+    OutputError,
     Verdict,
-    estimates,
 )
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.steps import Step, contenders
 from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError, PsaError
@@ -206,16 +198,13 @@ def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tupl
 
 FloatArray = npt.NDArray[np.float64]
 
-#: Verdicts that name causes.
-NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
-
 
 def diagnosed_model(
     fit: Fit,
     experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     stiffness_given: bool,
-    spent: Budget | None = None,
+    spent: StackBudget | None = None,
 ) -> Model:
     """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
     found = determinacy(fit, experiments)
@@ -263,122 +252,113 @@ def _share(s: Share) -> ErrorShare:
     return ErrorShare(s.what, s.share, Interval(*s.interval))
 
 
-@stage("judging")
-def conclude(
-    steps: Sequence[Step], task: Task, stiffness_given: bool, *, driven: bool = True
-) -> Diagnosis:
-    """Judge the steps of a search and return the diagnosis.
+class StackJudge(Judge):
+    """The judge of a stack: repeats tell its noise, its one output is its displacement."""
 
-    Of records whose displacement is not `driven` by the voltage nothing more is said.
-    """
-    experiments, table, limits = task.experiments, task.table, task.limits
-    first, last = steps[0], steps[-1]
-    colour = last.screening.colour
-    errors = whole_residuals(experiments, last.predicted)
-    base_errors = whole_residuals(experiments, first.predicted)
-    noise = noise_floor([e.record for e in experiments], errors)
-    floor = pooled_level(noise, errors, colour)
-    beyond = held_out_excess(
-        first.fit, experiments, first.predicted, first.screening.colour, noise, limits
-    )
-    unseen = (
-        Excess()
-        if last is first
-        else held_out_excess(last.fit, experiments, last.predicted, colour, noise, limits)
-    )
-    missing = first.test.alarm or first.chosen is not None or bool(beyond)
-    balance = Balance(experiments, Scale(first.view.of, colour, limits), floor)
-    weighed = balance.weigh(first.view.of, last.view.of, beside=missing and driven)
-    beaten = weighed.beaten_by()
-    gain = gain_of(experiments, first.predicted, last.predicted)
-    partly = last.test.alarm and len(steps) > 1
-    whole = 100.0 * (1.0 - floor / max(first.view.of.holdout_rms, 1e-300))
-    lost = lost_elsewhere(experiments, first.predicted, last.predicted, colour.inflation)
-    doubt = unconfirmed(
-        experiments, gain, whole=whole, lost=lost, partly=partly, hidden=task.hidden, limits=limits
-    )
-    stands = beaten is None and doubt is None
-    vague = balance.vague(steps) if stands else {}
-    found = [s for s in steps if s.chosen is not None and s.cause.name not in vague]
-    little = last.test.alarm and weighed.share < limits.enough
-    verdict: Verdict = "not_driven"
-    if driven:
-        verdict = verdict_by(
-            missing=missing,
-            withdrawn=not stands or not found or little,
-            ambiguous=bool(found and told_from(found[0], limits)),
-            more=last.test.alarm or bool(unseen) or bool(vague),
+    def __init__(
+        self, steps: Sequence[Step], task: Task, *, scale_given: bool, driven: bool = True
+    ) -> None:
+        super().__init__(steps, task, driven=driven)
+        self.scale_given = scale_given
+        self.errors, self.missed_errors = (
+            whole_residuals(self.experiments, s.predicted) for s in (self.last, self.first)
         )
-    weak = verdict == "unexplained" and stands and not vague and weighed.adds
-    kept = [s for s in steps if s.chosen] if verdict in NAMING or weak else []
-    final = last if kept else first
-    patch = patch_of(
-        corrections(last.fit, experiments, colour) if kept else weighed.corrections,
-        experiments,
-        final.view.of.holdout_rms,
-        colour,
-        limits,
-    )
-    missed = _misfits(experiments, base_errors, noise)
-    spent = budget(
-        experiments,
-        first.predicted,
-        final.predicted,
-        [(s.cause.name, s.without.predicted) for s in kept if s.without is not None],
-        None if patch is None else (patch.name, patch.predicted),
-        floor,
-    )
-    model = diagnosed_model(final.fit, experiments, final.predicted, stiffness_given, spent)
-    named = kept if verdict in NAMING else []
-    small = (
-        too_small([c for c in spent.causes if c.what not in vague], limits)
-        if partly and named
-        else ()
-    )
-    unnamed = {*vague, *(c.what for c in small)}
-    causes = tuple(_cause(s, model, spent, task) for s in named if s.cause.name not in unnamed)
-    return Diagnosis(
-        verdict=verdict,
-        causes=causes,
-        candidates=_candidates(first, floor, named=bool(named)),
-        noise_floor_rms_m=floor,
-        base_errors=errors_of(experiments, first.predicted),
-        extended_errors=errors_of(experiments, final.predicted),
-        gain=gain if kept else gain_of(experiments, first.predicted, final.predicted),
-        blind_to=blind_spots(steps, final, table, limits),
-        remaining=_remaining(final, unseen if kept else beyond),
-        next_experiment=next_experiment(
-            causes,
-            verdict,
-            same_curves(experiments, table, first.fit),
-            [e.record for e in experiments],
-            doubted=doubt is not None,
-        ),
-        doubted=doubt if verdict in ("adequate", "unexplained") else None,
-        remarks=(
-            *model.provenance.notes,
-            *(
-                withdrawn_names(steps, weighed, beaten, vague, doubt)
-                if verdict == "unexplained"
-                else vague_note(vague)
+        self.floors = noise_floor([e.record for e in self.experiments], self.errors)
+        self.floor = pooled_level(self.floors, self.errors, self.last.screening.colour)
+
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """The noise floor of the displacement."""
+        return (self.floor,)
+
+    @cached_property
+    def doubt(self) -> Note | None:
+        """Why the records do not confirm the causes."""
+        experiments, both = self.experiments, (self.first.predicted, self.last.predicted)
+        whole = 100.0 * (1.0 - self.floor / max(self.first.view.of.holdout_rms, 1e-300))
+        return unconfirmed(
+            experiments,
+            gain_of(experiments, *both),
+            whole=whole,
+            lost=lost_elsewhere(experiments, *both, self.last.screening.colour.inflation),
+            partly=self.last.test.alarm and len(self.steps) > 1,
+            hidden=self.task.hidden,
+            limits=self.limits,
+        )
+
+    @cached_property
+    def model(self) -> Model:
+        """The extended model, with where its error goes."""
+        final = self.final
+        return diagnosed_model(
+            final.fit, self.experiments, final.predicted, self.scale_given, self.spent
+        )
+
+    @cached_property
+    def spent(self) -> StackBudget:
+        """The error budget in lengths."""
+        both = self.first.predicted, self.final.predicted
+        return stack_budget(self.budget, self.experiments, *both, self.floor)
+
+    def corrections(self, of: Hypothesis) -> Sequence[Correction]:
+        """Return the corrections beside a hypothesis, by columns at the stack's ports."""
+        return corrections(of.fit, self.experiments, self.last.screening.colour)
+
+    def unseen(self, step: Step) -> tuple[Note, float] | None:
+        """Return by which factor held-out errors exceed those of the fit."""
+        found = held_out_excess(
+            step.fit, self.experiments, step.predicted, step.screening.colour, self.floors,
+            self.limits,
+        )  # fmt: skip
+        return (note("held_out_error", factor=found.factor), found.p_value) if found else None
+
+    def named(self, step: Step) -> Cause:
+        """Return a cause with what it changes in the tests that its effect declares."""
+        records = [e.record for e in self.experiments]
+        unit = records[0].displacement_unit
+        return self.cause(step, sizes(step.cause, self.model, records, unit=unit))
+
+    @stage("judging")
+    def conclude(self) -> Diagnosis:
+        """Return the diagnosis."""
+        experiments, final, limits = self.experiments, self.final, self.limits
+        both = self.first.predicted, final.predicted
+        missed = _misfits(experiments, self.missed_errors, self.floors)
+        records = [e.record for e in experiments]
+        alike = same_curves(experiments, self.task.table, self.first.fit)
+        ambiguous = self.verdict == "ambiguous"
+        base, extended = (errors_of(experiments, p) for p in both)
+        rms = base.holdout_rms_m, extended.holdout_rms_m
+        shown = OutputError("displacement", records[0].displacement_unit, self.floor, *rms)
+        held = (s.view.of.held[1:] for s in (self.first, final))
+        further = zip(final.fit.further, final.screening.colour.further, *held, strict=True)
+        common = self.common | {"budget": self.spent}
+        return Diagnosis(
+            **common,
+            errors=(
+                shown,
+                *(OutputError(f.column, f.channel.unit, c.rms, *e) for f, c, *e in further),
             ),
-            *(note("small", effect=c.what, share=max(c.share, 0.0)) for c in small),
-            *coverage_notes(experiments),
-        ),
-        experiments=tuple(experiments),
-        base_fit=first.fit,
-        extended_fit=final.fit,
-        base=first.predicted,
-        extended=final.predicted,
-        model=model,
-        noise=noise,
-        misfit=missed,
-        remainder=_misfits(experiments, errors, noise) if kept else missed,
-        contenders=contenders(first, experiments, limits) if verdict == "ambiguous" else (),
-        budget=spent,
-        patch=patch,
-        alternatives=alternatives(kept, final.fit, task, stiffness_given=stiffness_given),
-    )
+            noise_floor_rms_m=self.floor,
+            base_errors=base,
+            extended_errors=extended,
+            gain=gain_of(experiments, *both),
+            blind_to=blind_spots(self.steps, final, self.task.table, limits),
+            next_experiment=next_experiment(
+                self.causes, self.verdict, alike, records, doubted=self.doubt is not None
+            ),
+            remarks=(*self.model.provenance.notes, *self.said, *coverage_notes(experiments)),
+            experiments=tuple(experiments),
+            base=both[0],
+            extended=both[1],
+            noise=self.floors,
+            misfit=missed,
+            remainder=_misfits(experiments, self.errors, self.floors) if self.kept else missed,
+            contenders=contenders(self.first, experiments, limits) if ambiguous else (),
+            alternatives=alternatives(
+                self.kept, final.fit, self.task, stiffness_given=self.scale_given
+            ),
+        )
 
 
 def patched_model(d: Diagnosis) -> Model:
@@ -402,52 +382,3 @@ def _misfits(
         for e, error, floor in zip(experiments, errors, noise, strict=True)
         if np.count_nonzero(np.isfinite(error)) >= FEWEST
     )
-
-
-def _cause(s: Step, model: Model, spent: Budget, task: Task) -> Cause:
-    """State a cause: its probability, the share of the error that it removes, what it changes."""
-    records = [e.record for e in task.experiments]
-    own = next((c for c in spent.causes if c.what == s.cause.name), None)
-    return Cause(
-        effect=s.cause.name,
-        belongs_to=s.cause.belongs_to,
-        confidence=float(min(0.99, s.probability[s.cause.name])),
-        parameters=estimates(s.cause, model),
-        cannot_be_told_from=told_from(s, task.limits),
-        explained_share=0.0 if own is None else float(np.clip(own.share, 0.0, 1.0)),
-        remedy=s.cause.what_now.code,
-        sizes=sizes(s.cause, model, records, unit=records[0].displacement_unit),
-    )
-
-
-def _candidates(first: Step, floor: float, *, named: bool) -> tuple[Candidate, ...]:
-    """Every effect tried, with its share of the training excess; estimated if not fitted.
-
-    Where nothing is named no effect of the table has a probability.
-    """
-    base = float(np.mean(first.fit.residuals**2))
-    excess = max(base - floor**2, 1e-300)
-    power = first.screening.colour.level**2 / len(first.fit.residuals)
-    gone = {n: s.decrease * power for n, s in first.screening.best_by_effect().items()}
-    gone |= {n: h.removes(first.view.of) for n, h in first.fitted.items()}
-    rows = [
-        Candidate(
-            effect=name,
-            explained_share=float(np.clip(removed / excess, 0.0, 1.0)),
-            evidence=first.alone[name],
-            fitted=name in first.fitted,
-            probability=first.probability.get(name, 0.0) if named else 0.0,
-        )
-        for name, removed in gone.items()
-    ]
-    return tuple(sorted(rows, key=lambda c: (-c.fitted, -c.evidence)))
-
-
-def _remaining(r: Step, beyond: Excess) -> Remaining:
-    """Return what is left; `beyond` the fit where that leaves nothing to be seen."""
-    p_value = min(r.test.p_value, beyond.p_value)
-    if r.test.alarm:
-        return Remaining(False, p_value, r.test.finding)
-    if beyond:
-        return Remaining(False, p_value, note("held_out_error", factor=beyond.factor))
-    return Remaining(True, p_value)

@@ -75,7 +75,7 @@ def begun_module(model: Model) -> "Future[bytes | None]":
     """
     nothing: Future[bytes | None] = Future()
     nothing.set_result(None)
-    if not has_zig() or model.sampled_names:
+    if not has_zig() or model.sampled_names or model.structure.foreign:
         return nothing
     compiled = _compiled(model.structure)  # the text is CasADi's, which takes one thread
 

@@ -282,7 +282,7 @@ class _Adviser:
                 self._names,
                 fit.sigma[r],
                 start=fit.start(r),
-                start_sizes=fit.unknowns.start_scale[r].tolist(),
+                sizes=dict(zip(fit.start(r), fit.unknowns.start_scale[r].tolist(), strict=True)),
                 used=e.used,
             )
             for r, e in enumerate(self._experiments)

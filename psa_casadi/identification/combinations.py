@@ -154,25 +154,18 @@ def free_combinations(
     """
     judge = _Judge(model, found)
     results: list[Combination] = []
-    candidates = [judge.known(f) for f in physical_formulas(model.values, found.names)]
+    candidates = [c for f in physical_formulas(model.values, found.names) if (c := judge.known(f))]
     open_ones = {n for n in found.names if judge.relative(n) > WEAK}
-    while True:
-        news = [c for c in candidates if c and open_ones & set(c.parts)]
-        if not news:
-            break
-        ranks = []  # the smallest for a formula that is sure, short, and explains much
-        for c in news:
-            free = sum(n in found.names for n in c.formula.names)
-            ranks.append(c.cancelled * 2.0**free / len(open_ones & set(c.parts)))
-        best = news[int(np.argmin(ranks))]
-        results.append(judge.combination(best))
-        open_ones -= set(best.parts)
+    while news := [c for c in candidates if open_ones & set(c[0].parameters)]:
+        best, _ = min(news, key=lambda c: c[1] / len(open_ones & set(c[0].parameters)))
+        results.append(best)
+        open_ones -= set(best.parameters)
     left = [n for n in found.undetermined if n in open_ones]
     for formula in monomials(model.values, found.names):
         simple = judge.known(formula) if set(left) & set(formula.names) else None
         if simple:
-            results.append(judge.combination(simple))
-            left = [n for n in left if n not in simple.parts]
+            results.append(simple[0])
+            left = [n for n in left if n not in simple[0].parameters]
     results += judge.rest(left)
     if "R_s" in found.names and "C_p" in model.values and "C_p" not in found.names:
         results.append(Combination("product", ("R_s", "C_p"), "R_s C_p"))
@@ -182,27 +175,18 @@ def free_combinations(
     return tuple(results)
 
 
-@dataclass(frozen=True)
-class _Known:
-    """A formula, the parameters that trade off in it, and its standard error.
-
-    `relative` is that over its value, `cancelled` over what one of the parameters would make it.
-    """
-
-    formula: Formula
-    parts: tuple[str, ...]
-    relative: float
-    cancelled: float
-
-
 class _Judge:
     """Standard errors of formulas, from the covariance of the values."""
 
     def __init__(self, model: Model, found: Determinacy) -> None:
         self._model, self._found = model, found
 
-    def known(self, formula: Formula) -> _Known | None:
-        """Return a formula that is known far better than its parameters, else None."""
+    def known(self, formula: Formula) -> tuple[Combination, float] | None:
+        """Return what is known far better than its parameters, else None.
+
+        With it comes a rank, the smallest for a formula that is sure and short: its standard error
+        over what one of the parameters would make it, doubled by each parameter that is free.
+        """
         found, names = self._found, self._found.names
         order = formula.names if formula.physical else names
         free = [n for n in order if n in names and n in formula.names]
@@ -217,14 +201,12 @@ class _Judge:
         parts = tuple(n for n in free if alone[n] >= SURER * error)
         if error > KNOWN * value or len(parts) < (2 if formula.physical else len(free)):
             return None
-        return _Known(formula, parts, error / value, error / max(alone.values()))
-
-    def combination(self, c: _Known) -> Combination:
-        """Return what is known and what trades off."""
-        only = any(n in self._found.undetermined for n in c.parts)
-        alone = () if only else tuple(self.relative(n) for n in c.parts)
-        kind: Literal["only", "traded"] = "only" if only else "traded"
-        return Combination(kind, c.parts, c.formula.text, c.relative, c.formula.meaning, alone)
+        only = any(n in found.undetermined for n in parts)
+        told = Combination(
+            "only" if only else "traded", parts, formula.text, error / value, formula.meaning,
+            () if only else tuple(self.relative(n) for n in parts),
+        )  # fmt: skip
+        return told, error / max(alone.values()) * 2.0 ** len(free)
 
     def rest(self, names: Sequence[str]) -> Iterator[Combination]:
         """Yield undetermined parameters that no formula explains, with what they are tied to."""

@@ -112,25 +112,31 @@ def weighted_rows(
     return [row for row in rows if len(row[1])]
 
 
-def covariance_of(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray:
+def covariance_of(
+    fit: Fit, experiments: Sequence[Experiment], *, white: bool = False
+) -> FloatArray:
     """Return the covariance (size, size) of theta, for residuals that may be coloured.
 
     The sandwich H^-1 (sum_r J_r^T C_r J_r / w_r^4 + P) H^-1 with H = sum_r J_r^T J_r / w_r^2 + P:
     w_r is the level that weighted record r or a further column, P the precision of the priors, C_r
     the Toeplitz matrix of the residual's autocovariance there, which `autocovariance` estimates.
-    White residuals at the level w_r give H^-1. Source: White, Maximum likelihood estimation of
-    misspecified models, Econometrica 50 (1982), with the stationary colour of Newey and West
-    (1987).
+    White residuals at the level w_r give H^-1, which is that if `white`. Source: White, Maximum
+    likelihood estimation of misspecified models, Econometrica 50 (1982), with the stationary colour
+    of Newey and West (1987).
     """
     precision = np.diag(1.0 / fit.unknowns.prior**2)
     curvature, spread = precision.copy(), precision.copy()
     for scaled, residuals in weighted_rows(fit, experiments):
         curvature += scaled.T @ scaled
+        if white:
+            continue
         lags = autocovariance(residuals)
         if lags[0] > 2.0 * np.sum(lags) - lags[0]:
             lags = lags[:1]  # colour never makes intervals shorter than white residuals do
         spread += scaled.T @ convolved(scaled, np.concatenate([lags[:0:-1], lags]))
     inverse = np.linalg.pinv(curvature, hermitian=True)
+    if white:
+        return np.asarray(inverse)
     sandwich: FloatArray = inverse @ spread @ inverse
     sandwich = 0.5 * (sandwich + sandwich.T)
     sizes = np.linalg.eigvalsh(sandwich)
@@ -200,29 +206,25 @@ def record_information(
     sigma: float,
     *,
     start: Mapping[str, float] | None = None,
-    start_sizes: Sequence[float] | None = None,
+    sizes: Mapping[str, float] | None = None,
     used: npt.NDArray[np.bool_] | None = None,
-    rtol: float = FIT_RTOL,
 ) -> FloatArray:
     """Return J^T (1 - Q Q^T) J / sigma^2 (k, k) for parameter changes in units of `sizes_of`.
 
     J is the derivative of the predicted displacement at the `used` samples, Q spans what the
-    unknown initial states (memories at rest unless `start` and `start_sizes` name others, which a
-    fit would estimate with their weak priors) and the sensor's offset can imitate; sigma [m] is the
-    white noise. The record needs no displacement. A loose `rtol` would make information: errors of
-    a large derivative look like a direction of their own. Raises SimulationError.
+    unknown initial states of usual `sizes` (memories unless others are named; at rest without a
+    `start`), which a fit would estimate with their weak priors, and the sensor's offset can
+    imitate; sigma [m] is the white noise. The record needs no displacement. Raises SimulationError.
     """
-    if start is None or start_sizes is None:
-        start, start_sizes = (
-            dict.fromkeys(memory_sizes(model), 0.0),
-            [*memory_sizes(model).values()],
-        )
+    sizes = memory_sizes(model) if sizes is None else sizes
+    start = dict.fromkeys(sizes, 0.0) if start is None else start
+    # loose steps would make information: errors of a large derivative look like a direction
     _, by_parameter, by_start = predict_record(
-        model, record, start, names, stop=record.n, rtol=rtol
+        model, record, start, names, stop=record.n, rtol=FIT_RTOL
     )
     chosen = slice(None) if used is None else used
     wanted = by_parameter[chosen] * sizes_of(model, names) / sigma
-    nuisance = by_start[chosen] * np.array(start_sizes) / sigma
+    nuisance = by_start[chosen] * np.array([sizes[n] for n in start]) / sigma
     count = len(start)
     priors = {s.name: memory_prior(s) for s in model.structure.states}
     held = np.vstack([nuisance, np.diag([1.0 / priors[n] for n in start])])

@@ -11,7 +11,6 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import (
-    Progress,
     refit,
     relevelled,
     reweighted,
@@ -28,6 +27,7 @@ from psa_casadi.identification.result import (
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized
@@ -54,7 +54,7 @@ def identify_ode(
     zeros: Sequence[str] = (),
     known_start: bool = False,
     hold: Hold | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Identification:
     """Fit the parameters of a model to all samples of all its records.
 
@@ -66,6 +66,7 @@ def identify_ode(
     of every record is estimated too, unless it is known to be the declared one (`known_start`).
     `zeros` names outputs whose zero is unknown in each record. The search begins at the declared
     values and at `starts` - 1 random ones within the bounds, and follows the best two to their end.
+    `progress` gets what is done in words, by default a terminal.
 
     Raises InputError for records or names that do not fit, SimulationError where the model cannot
     be simulated at its values.
@@ -75,6 +76,7 @@ def identify_ode(
         model, given_to(model, records, hold), judged=False, zeros=known_zeros(model, zeros),
         known_start=known_start,
     )  # fmt: skip
+    progress("fitting from several starts")
     best, runs, outcomes = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts, progress=progress
     )

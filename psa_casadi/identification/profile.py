@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.determinacy import covariance_of, weighted_rows
-from psa_casadi.identification.fitting.fit import Fit, Objective
-from psa_casadi.identification.fitting.levenberg_marquardt import minimise
+from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
 
@@ -26,32 +25,22 @@ _CLOSE = 3e-3
 #: Where a step raised the level by less, the cost levels off: the next step is twice as long.
 _FLAT = 0.05
 _RETRIES = 3
-_NEWTON_STEPS = 30
-
-
-@dataclass(frozen=True, eq=False)
-class Point:
-    """A value's coordinate with the fit of all other unknowns there."""
-
-    z: float
-    theta: FloatArray
-    cost: float
 
 
 class _HeldFits:
     """The fits of all other unknowns while one parameter is held; z is its logarithm or itself."""
 
     def __init__(
-        self, fit: Fit, experiments: Sequence[Experiment], name: str, limit: float,
+        self, best: Fit, experiments: Sequence[Experiment], name: str, limit: float,
         progress: Progress,
     ) -> None:  # fmt: skip
-        self.name, self.limit, self._progress = name, limit, progress
-        self.unknowns, self._fitted = fit.unknowns, fit.theta
-        self.k = self.unknowns.names.index(name)
-        self.log = fit.model.parameter(name).log
-        self._evaluate = Objective(fit.model, experiments, self.unknowns, fit.sigma, fit.way)
-        self._tolerance = float(np.clip(_CLOSE * limit / fit.cost, 1e-9, 1e-5))
-        low, high = (float(edge[self.k]) for edge in (self.unknowns.low, self.unknowns.high))
+        self.best, self.experiments, self.name, self.limit = best, experiments, name, limit
+        self._progress, parameter = progress, best.model.parameter(name)
+        self.log = parameter.log
+        self._tolerance = float(np.clip(_CLOSE * limit / best.cost, 1e-9, 1e-5))
+        self._free = [n for n in best.unknowns.names if n != name]
+        k = best.unknowns.names.index(name)
+        low, high = (float(edge[k]) for edge in (best.unknowns.low, best.unknowns.high))
         self.edges = (self.coordinate(low), self.coordinate(high))
 
     def coordinate(self, value: float) -> float:
@@ -62,73 +51,40 @@ class _HeldFits:
         """Return the value at a coordinate."""
         return float(np.exp(z)) if self.log else z
 
-    def minimum(self, z: float, before: Sequence[Point]) -> Point | None:
-        """Fit all other unknowns at z from the points before it; None if that cannot be simulated.
+    def z(self, found: Fit) -> float:
+        """Return the coordinate of a fit."""
+        return self.coordinate(found.model.values[self.name])
 
-        Starts on the line through the last two points, else at the last.
-        """
-        self._progress(f"profile of {self.name}, {self.value(z):.4g}")
-        starts = [p.theta for p in before[-1:]] or [self._fitted]
-        if len(before) > 1:
-            last, other = before[-1], before[-2]
-            along = (last.theta - other.theta) * (z - last.z) / (last.z - other.z)
-            starts.insert(0, last.theta + along)
-
-        def evaluate(others: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-            theta, by_others = self._whole(z, others)
-            found = self._evaluate(theta)
-            if found is None:
-                return None
-            residual, jacobian = found
-            along = np.delete(jacobian, self.k, 1) + np.outer(jacobian[:, self.k], by_others)
-            row = len(residual) - self.unknowns.size + self.k  # the parameter's own prior
-            return np.delete(residual, row), np.delete(along, row, 0)
-
-        low, high = (np.delete(edge, self.k) for edge in self.unknowns.bounds())
-        for start in starts:
-            found = minimise(
-                evaluate, np.delete(start, self.k), (low, high),
-                tolerance=self._tolerance, evaluations=_EVALUATIONS,
+    def minimum(self, z: float, before: Fit) -> Fit | None:
+        """Fit all other unknowns at z from the fit before; None if that cannot be simulated."""
+        low, high = before.model.parameter(self.name).bounds
+        value = float(np.clip(self.value(z), low, high))
+        self._progress(f"profile of {self.name}, {value:.4g}")
+        try:
+            found = fit(
+                self.best.model.with_values({self.name: value}), self.experiments, self._free,
+                sigma=self.best.sigma, start={n: before.model.values[n] for n in self._free},
+                start_states=before.starts(), evaluations=_EVALUATIONS,
+                tolerance=self._tolerance,
             )  # fmt: skip
-            if found is None:
-                continue
-            if found.interrupted:
-                raise KeyboardInterrupt
-            return Point(z, self._whole(z, found.theta)[0], found.cost)
-        return None
+        except PsaError:
+            return None
+        if found.interrupted:
+            raise KeyboardInterrupt
+        return found
 
-    def _whole(self, z: float, others: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return theta with the parameter held at z, and d own coordinate / d others (size - 1,).
-
-        The own coordinate solves value(theta) = z given the others, by Newton's method from what
-        `coordinates` says: where the loop has coordinates of its own, a parameter depends on
-        several of them.
-        """
-        u, value = self.unknowns, self.value(z)
-        theta: FloatArray = np.insert(others, self.k, self._fitted[self.k])
-        theta[self.k] = u.coordinates({**u.values(theta), self.name: value})[self.k]
-        slopes = u.slopes(theta)[self.k]
-        for _ in range(_NEWTON_STEPS):
-            missing = value - u.values(theta)[self.name]
-            if abs(missing) <= 1e-12 * abs(value):
-                break
-            theta[self.k] += float(np.clip(missing / slopes[self.k], -1.0, 1.0))
-            slopes = u.slopes(theta)[self.k]
-        own = np.zeros(len(theta))
-        own[: len(u.names)] = -slopes / slopes[self.k]
-        return theta, np.delete(own, self.k)
-
-    def side(self, centre: Point, step: float, points: int) -> list[Point]:
-        """Return points outwards from the centre until the limit is crossed or a bound is met."""
+    def side(self, centre: Fit, step: float, points: int) -> list[Fit]:
+        """Return fits outwards from the centre until the limit is crossed or a bound is met."""
         found, failures = [centre], 0
         edge = self.edges[1] if step > 0 else self.edges[0]
         while len(found) <= points and failures < _RETRIES:
             last = found[-1]
-            outside = (last.z + step - edge) * step > 0
-            z = edge if outside else last.z + step
-            if abs(z - last.z) <= 1e-9 * max(abs(z), abs(step)):
+            here = self.z(last)
+            outside = (here + step - edge) * step > 0
+            z = edge if outside else here + step
+            if abs(z - here) <= 1e-9 * max(abs(z), abs(step)):
                 break
-            point = self.minimum(z, found)
+            point = self.minimum(z, last)
             if point is None:
                 failures, step = failures + 1, 0.3 * step
                 continue
@@ -136,20 +92,20 @@ class _HeldFits:
             level = self._level(point, found)
             if level > 1.0:
                 return self._refined(found)[1:]
-            distance = abs(z - centre.z)  # the next level should be reached by proportion
+            distance = abs(z - self.z(centre))  # the next level should be reached by proportion
             aim = _BEFORE if level < 0.5 * _BEFORE else _AT
             flat = len(found) > 2 and level - self._level(last, found) < _FLAT
             least, most = (2.0 if flat else 0.1) * abs(step), _GROWTH * distance
             wanted = distance * (aim / max(level, 1e-9) - 1.0)
-            step = float(np.copysign(np.clip(wanted, min(least, most), most), z - centre.z))
+            step = float(np.copysign(np.clip(wanted, min(least, most), most), z - self.z(centre)))
         return found[1:]
 
-    def _level(self, point: Point, found: Sequence[Point]) -> float:
+    def _level(self, point: Fit, found: Sequence[Fit]) -> float:
         """Return sqrt(increase / limit), which grows in proportion to the distance at first."""
         least = min(p.cost for p in found)
         return float(np.sqrt(max(point.cost - least, 0.0) / self.limit))
 
-    def _refined(self, found: list[Point]) -> list[Point]:
+    def _refined(self, found: list[Fit]) -> list[Fit]:
         """Put points where the limit should be crossed, until those around it are close."""
         outer = found.pop()
         beyond = [outer]
@@ -160,7 +116,8 @@ class _HeldFits:
                 break
             # a cost that turns steep all at once would hold an interpolation back at the inside
             share = max((1.0 - levels[0]) / (levels[1] - levels[0]), 0.25)
-            middle = self.minimum(inner.z + share * (outer.z - inner.z), found)
+            here = self.z(inner)
+            middle = self.minimum(here + share * (self.z(outer) - here), inner)
             if middle is None:
                 break
             if self._level(middle, found) > 1.0:
@@ -228,15 +185,15 @@ def profile(
     spread, ratio = _spread(fit, experiments, name)
     held = _HeldFits(fit, experiments, name, ratio * PROFILE_LIMIT, progress)
     parameter, estimate = fit.model.parameter(name), fit.model.values[name]
-    centre = held.minimum(held.coordinate(estimate), [])
+    centre = held.minimum(held.coordinate(estimate), fit)
     if centre is None:
         raise InputError([f"The fit cannot be simulated where it ended; fit again before '{name}'"])
-    ordinary = 1.0 if held.log else abs(float(fit.unknowns.scale[held.k]))
+    ordinary = 1.0 if held.log else abs(float(fit.unknowns.scale[fit.unknowns.names.index(name)]))
     first = spread / estimate if held.log else spread  # one standard error
     first = float(np.clip(first, 1e-6 * ordinary, ordinary))
     below, above = (held.side(centre, sign * first, points) for sign in (-1.0, 1.0))
     found = [*below[::-1], centre, *above]
-    z, cost = np.array([p.z for p in found]), np.array([p.cost for p in found])
+    z, cost = (np.array([of(p) for p in found]) for of in (held.z, lambda p: p.cost))
     level: FloatArray = np.sqrt((cost - cost.min()) / held.limit)
     least = int(np.argmin(cost))
     ends = [
@@ -269,19 +226,17 @@ def _crossing(z: FloatArray, level: FloatArray) -> float | None:
     return float(z[last - 1] + (1.0 - inner) / (outer - inner) * (z[last] - z[last - 1]))
 
 
-def _spread(fit: Fit, experiments: Sequence[Experiment], name: str) -> tuple[float, float]:
+def _spread(best: Fit, experiments: Sequence[Experiment], name: str) -> tuple[float, float]:
     """Return a parameter's standard error, and its variance over that at white residuals."""
-    unknowns = fit.unknowns
+    unknowns = best.unknowns
     count = len(unknowns.names)
     gradient = np.zeros(unknowns.size)
-    gradient[:count] = unknowns.slopes(fit.theta)[unknowns.names.index(name)]
-    curvature = np.diag(1.0 / unknowns.prior**2)
-    variance, samples = 0.0, 0
-    for scaled, residuals in weighted_rows(fit, experiments):
-        curvature += scaled.T @ scaled
-        variance += float(np.sum(residuals**2))
-        samples += len(residuals)
-    white = float(gradient @ np.linalg.pinv(curvature, hermitian=True) @ gradient)
-    found = max(float(gradient @ covariance_of(fit, experiments) @ gradient), 1e-12 * white)
+    gradient[:count] = unknowns.slopes(best.theta)[unknowns.names.index(name)]
+    white, coloured = (
+        float(gradient @ covariance_of(best, experiments, white=w) @ gradient)
+        for w in (True, False)
+    )
+    found = max(coloured, 1e-12 * white)
     # a parameter that the prior holds has no ratio of its own: the residuals' variance stands in
-    return float(np.sqrt(found)), max(found / white, variance / samples)
+    rows = np.concatenate([residuals for _, residuals in weighted_rows(best, experiments)])
+    return float(np.sqrt(found)), max(found / white, float(np.mean(rows**2)))

@@ -277,7 +277,9 @@ def _problems(
             problems.append(f"{shown(name)} is listed {count} times; list it once.")
     if isinstance(stated := content.get("publication"), dict):
         extra = [n for n in stated if n not in _STATED]
-        problems += [f"'publication.{n}' is unknown; give {', '.join(_STATED)}." for n in extra]
+        problems += [
+            f"'publication.{n[:80]}' is unknown; give {', '.join(_STATED)}." for n in extra
+        ]
     if isinstance(given := content.get("parameters"), dict):
         problems += _parameter_problems(given, known)
         declared = {p.name for c in known for p in c.parameters}

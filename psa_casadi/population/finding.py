@@ -51,13 +51,18 @@ class BudgetShare:
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """Held-out rms [m] of base and extended model, of the noise, and the base's in % of range."""
+    """Held-out rms of an output in its unit: base and extended model, and the noise.
+
+    Of a stack's displacement both models' in % of the range, too.
+    """
 
     base: float
     extended: float
     noise: float
-    base_percent: float
-    extended_percent: float
+    base_percent: float | None = None
+    extended_percent: float | None = None
+    output: str = "displacement"
+    unit: str = "m"
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,7 @@ class Finding:
     verdict: str = ""
     doubt: str = ""
     causes: tuple[NamedCause, ...] = ()
-    errors: HeldOutErrors | None = None
+    errors: tuple[HeldOutErrors, ...] = ()
     budget: tuple[BudgetShare, ...] = ()
     rms_m: float | None = None
     rms_percent: float | None = None

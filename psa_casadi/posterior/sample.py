@@ -22,6 +22,7 @@ from psa_casadi.posterior.chains import (
     sampler_and_arviz,
 )
 from psa_casadi.posterior.task import Task, own_task_of, task_of
+from psa_casadi.progress import on_a_terminal
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import DISPLACEMENT
 from psa_casadi.shown import Reported, frame
@@ -173,6 +174,7 @@ Progress = Callable[[str], None]
 _PREDICTED = 100
 
 
+@on_a_terminal
 @interruptible_work()
 @one_thread_of_algebra()
 def sample(

@@ -102,7 +102,8 @@ class Density:
     has Jeffreys' prior 1 / sigma and is integrated out. r_p are the rows outside the blocks: weak
     priors and a stack's further columns, whose levels are known. theta lies within its bounds
     (`Within`), and z = z_0 + L u, with the factor L of the covariance at the fit, so that u has
-    nearly the covariance 1. The gradient is that of J^T r, with the sensitivities' exact Jacobian.
+    nearly the covariance 1; coordinates that no record moves stay at z_0. The gradient is that of
+    J^T r, with the sensitivities' exact Jacobian.
     """
 
     evaluate: Evaluate
@@ -114,7 +115,7 @@ class Density:
     @property
     def size(self) -> int:
         """Number of coordinates."""
-        return len(self.centre)
+        return int(self.factor.shape[1])
 
     def theta(self, u: FloatArray) -> FloatArray:
         """Return the fit's coordinates (size,) at u."""
@@ -349,7 +350,10 @@ def _task(
     precision += rest.T @ rest
     within = Within(low, high)
     covariance: FloatArray = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=np.float64)
-    centre, factor = _whitening(within, found.theta, precision, covariance)
+    moving = np.ones(unknowns.size, dtype=bool)
+    if not unknowns.offset_scale:  # without an unknown zero, offsets stay at 0
+        moving[list(unknowns.offsets)] = False
+    centre, factor = _whitening(within, found.theta, precision, covariance, moving)
     return Task(
         model=model,
         experiments=experiments,
@@ -364,9 +368,16 @@ def _task(
 
 
 def _whitening(
-    within: Within, theta: FloatArray, precision: FloatArray, covariance: FloatArray
+    within: Within,
+    theta: FloatArray,
+    precision: FloatArray,
+    covariance: FloatArray,
+    moving: npt.NDArray[np.bool_],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return z at the fit, a little inside the bounds, and a factor of the covariance of z."""
+    """Return z at the fit, a little inside the bounds, and a factor of the covariance of z.
+
+    A column of the factor for each of the coordinates that are `moving`.
+    """
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     room = np.where(within.bounded, 0.25 * (within.high - within.low), np.inf)
     edge = np.where(within.bounded, np.minimum(_INSIDE * spread, room), 0.0)
@@ -377,6 +388,8 @@ def _whitening(
     both = np.isfinite(within.low) & np.isfinite(within.high)
     own = np.where(both, 0.5 * (1.0 - bend**2), 0.0)
     curvature += np.diag(own + np.where(inside != theta, _TAIL, 0.0))
-    sizes, directions = np.linalg.eigh(curvature)
+    sizes, directions = np.linalg.eigh(curvature[np.ix_(moving, moving)])
     sizes = np.maximum(sizes, 1e-12 * sizes[-1])
-    return z, directions / np.sqrt(sizes)
+    factor = np.zeros((len(z), len(sizes)))
+    factor[moving] = directions / np.sqrt(sizes)
+    return z, factor

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psa_casadi.any_model.result import OdeDiagnosis
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
@@ -17,7 +16,7 @@ from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Population
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import Signals
-from psa_casadi.report.documents.files import DiagnosisFile, OwnModelFile
+from psa_casadi.report.documents.files import AnyDiagnosisFile, DiagnosisFile
 from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
 from psa_casadi.report.page.results import write_fit_report, write_posterior, write_report
@@ -32,8 +31,8 @@ _WORDS: dict[type, Callable[..., str]] = {
     StackIdentification: identification_text,
     Posterior: posterior_text,
 }
-Told = DiagnosisFile | OwnModelFile
-Reported = Diagnosis | OdeDiagnosis | Identification | Posterior | Population | Sequence[Finding]
+Told = AnyDiagnosisFile
+Reported = OdeDiagnosis | Identification | Posterior | Population | Sequence[Finding]
 
 
 def report(result: Reported, path: str | os.PathLike[str], *, still: bool = False) -> None:
@@ -45,7 +44,7 @@ def report(result: Reported, path: str | os.PathLike[str], *, still: bool = Fals
     Raises:
         InputError: `path` cannot be written to.
     """
-    if isinstance(result, Diagnosis | OdeDiagnosis):
+    if isinstance(result, OdeDiagnosis):
         write_report(result, path, still=still)
     elif isinstance(result, Identification):
         write_fit_report(result, path, still=still)
@@ -68,8 +67,6 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
 
 def line(result: Plotted | Told) -> str:
     """Return a result in one line."""
-    if isinstance(result, OwnModelFile | OdeDiagnosis):
-        return f"<Diagnosis of an own model {result.verdict}{_causes(result)}>"
     if isinstance(result, Diagnosis | DiagnosisFile):
         before, after = (
             e.holdout_nrmse_percent for e in (result.base_errors, result.extended_errors)
@@ -77,6 +74,8 @@ def line(result: Plotted | Told) -> str:
         first = f"{number(before, 2)} -> " if before != after else ""
         errors = f"{first}{number(after, 2)} % of range rms"
         return f"<Diagnosis {result.verdict}{_causes(result)}; held-out error {errors}>"
+    if isinstance(result, OdeDiagnosis | AnyDiagnosisFile):
+        return f"<Diagnosis of an own model {result.verdict}{_causes(result)}>"
     if isinstance(result, StackIdentification):
         count = len(result.experiments)
         span = max(e.record.range_m for e in result.experiments)
@@ -94,7 +93,7 @@ def line(result: Plotted | Told) -> str:
     return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
 
 
-def _causes(d: Diagnosis | OdeDiagnosis | Told) -> str:
+def _causes(d: OdeDiagnosis | Told) -> str:
     causes = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
     return f": {causes}" if causes else ""
 
@@ -103,7 +102,7 @@ def cell(result: Plotted | Model | Told) -> str:
     """Return a result as a notebook shows it: its words, and its picture or table."""
     if isinstance(result, Model):
         return filled("cell.html", lines=[repr(result)], table=parameter_table(result))
-    if isinstance(result, DiagnosisFile | OwnModelFile):
+    if isinstance(result, AnyDiagnosisFile):
         return filled("cell.html", lines=[line(result), result.remaining.where, *result.notes])
     buffer = io.BytesIO()
     plot(result).savefig(buffer, format="png", dpi=60)

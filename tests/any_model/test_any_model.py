@@ -19,7 +19,7 @@ from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Signals
-from psa_casadi.report.words.own_words import own_verdict_sentence
+from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.sizes import Sizes, sizes_of
 from tests.any_model import own_plants as plants
@@ -97,7 +97,7 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert f"extended model {rms:.2f} µm" in page.text
     rival = replace(d.causes[0], confidence=0.6, cannot_be_told_from=("stop_of_x",))
     said = "(the rate of v, confidence 60 %: more likely than not; or stop of x)"
-    assert said in own_verdict_sentence(replace(d, causes=(rival,)))
+    assert said in verdict_sentence(replace(d, causes=(rival,)))
     assert re.search(r"hysteresis_of_x_in_v_n 0\.99\d+ 0\.99\d+ to 1\.0\d+ 1 fit", page.text)
     assert page.loaded == []
     assert page.targets <= page.names
@@ -165,7 +165,7 @@ def test_an_oscillator_is_sampled_and_compared(
     (mu,) = names["drawn"].figures
     assert abs(mu.mean - 1.0) < 4.0 * mu.sd < 0.05
     page = Page((tmp_path / "both.html").read_text("utf-8"))
-    assert "Beyond noise, mu differs (1 parameters compared)." in page.text
+    assert "Beyond noise, mu differs (1 parameter compared)." in page.text
 
 
 @pytest.mark.slow
@@ -191,7 +191,7 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     )
     assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
     assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
-    assert f"it removes {share.text} of the held-out error" in " ".join(repr(d).split())
+    assert f"friction in speed removes {share.text}." in " ".join(repr(d).split())
     _run(effect, names)
     assert [c.effect for c in names["worn_result"].causes] == ["brush_drop"]
     _run(posterior, names)

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import binom
 
-from psa_casadi.any_model.result import removed_from
-from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.diagnosis.held_out import Share, removed_from
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Channel, Experiment
 

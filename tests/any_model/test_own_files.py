@@ -142,6 +142,7 @@ def test_tables_and_signals_are_read_in_the_units_of_the_model() -> None:
     _assert_is_the_record(signals)
     _assert_is_the_record(signals.to_frame())
     assert signals.plot(output="flow").axes[0].get_ylabel() == "flow [l/min]"
+    assert len(signals.plot().axes) == len(signals.columns)
 
 
 def test_the_same_record_in_other_units_is_the_same_identification(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import fromstring
@@ -24,7 +23,6 @@ from psa_casadi.cli.app import app
 from psa_casadi.cli.screen import show_table, working
 from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, Course, Told
 from psa_casadi.datasets import DATASETS
-from psa_casadi.diagnosis import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
 from psa_casadi.export.check.check import CheckReport, CheckRow
@@ -41,7 +39,7 @@ from psa_casadi.report.words.tables import Table, effects_table
 from tests.contract.helpers import command, done
 from tests.identification.identified_plants import same_as_the_named_stack
 from tests.records.record_files import HEADER, ROWS, write
-from tests.report.report_cases import diagnosis, identification
+from tests.report.report_cases import identification
 from tests.tiers import slow
 
 
@@ -137,45 +135,6 @@ def cases_of(text: str) -> dict[str, str | None]:
     """Return each case of a file with its failure."""
     failures = ((c.attrib["name"], c.find("failure")) for c in fromstring(text).iter("testcase"))
     return {name: None if f is None else f.attrib["message"] for name, f in failures}
-
-
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str | Path]:
-    """The command on a record whose diagnosis is known: its cause is named, 0.5 % is left."""
-    known = diagnosis("cause_named")
-    known = replace(
-        known, extended_errors=replace(known.extended_errors, holdout_nrmse_percent=0.5)
-    )
-    monkeypatch.setattr(diagnose, "diagnose", lambda *_, **__: known)
-    return ["diagnose", write(tmp_path / "a.csv", HEADER, *ROWS), "--quiet"]
-
-
-@pytest.mark.parametrize(
-    ("options", "wrong"),
-    [
-        ((), ""),
-        (("--expect", "adequate,cause_named", "--max-error", "0.5%"), ""),
-        (("--expect", "Cause named", "--max-error", "1 %"), ""),
-        (
-            ("--expect", "adequate,unexplained"),
-            "The verdict is cause_named; expected adequate or unexplained.",
-        ),
-        (
-            ("--max-error", ".4%"),
-            "The extended model's held-out error is 0.500 % of the range; expected 0.4 % at most.",
-        ),
-    ],
-)
-def test_a_result_that_is_not_as_expected_ends_with_1(
-    asked: list[str | Path], options: tuple[str, ...], wrong: str, tmp_path: Path
-) -> None:
-    file = tmp_path / "tests.xml"
-    result = command(*asked, *options, "--junit", file)
-    assert result.code == bool(wrong), result.words
-    assert result.out + result.err == (f"Not as expected: {wrong}\n" if wrong else "")
-    cases = cases_of(file.read_text(encoding="utf-8"))
-    assert list(cases) == ["verdict", "held-out error"]
-    assert [f for f in cases.values() if f] == [wrong] * bool(wrong)
 
 
 def test_the_checks_of_an_fmu_are_tests() -> None:

@@ -154,6 +154,18 @@ def test_a_fault_of_the_package_is_called_one(
     assert ended_by(error) == (1, "")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="a folder that is used cannot be removed")
+def test_a_working_folder_that_was_removed_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    told = refused("simulate", "--stack", "demo", "--input", "v.csv", "-o", "out.csv")
+    assert "The folder that this runs in is not there any more; change to another" in told
+
+
 @pytest.fixture
 def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))

@@ -7,9 +7,9 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.corrections import corrections
-from psa_casadi.diagnosis.held_out import budget, held_out_rms
-from psa_casadi.diagnosis.patch import patch_of, with_patch
+from psa_casadi.diagnosis.corrections import Patch, best_of, corrections
+from psa_casadi.diagnosis.held_out import budget, held_out_rms, removed_from, stack_budget
+from psa_casadi.diagnosis.patch import with_patch
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
@@ -81,10 +81,11 @@ def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> 
     found, experiments, colour = _fitted(y)
     seen = corrections(found, experiments, colour)
     base = (np.asarray(found.predicted(experiments)[0]),)
-    patch = patch_of(seen, experiments, _held(found, experiments), colour)
+    patch = best_of(seen, experiments, [_held(found, experiments)], colour)
     assert patch is not None
     assert hidden in (patch.name, *patch.open_to)
-    spent = budget(experiments, base, base, [], (patch.name, patch.predicted), NOISE)
+    removed = removed_from(experiments, base, [NOISE])
+    spent = budget(removed, base, [], (patch.name, patch.predicted))
     assert spent.unnamed is not None
     assert spent.unnamed.share > 0.7
     assert spent.unnamed.interval[0] > 0.0
@@ -97,10 +98,10 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
     predicted = found.predicted(experiments)
     held = held_out_rms(experiments, predicted)
     kind, port = hidden.split(" at the ")
-    seen = [c for c in corrections(found, experiments, colour) if c.kind.name == kind]
-    seen = [c for c in seen if c.kind.port == port]
-    patch = patch_of(seen, experiments, held, colour)
-    assert patch is not None
+    seen = [c for c in corrections(found, experiments, colour) if c.kind == kind]
+    seen = [c for c in seen if c.port == port]
+    patch = best_of(seen, experiments, [held], colour)
+    assert isinstance(patch, Patch)
     again = with_patch(found, patch, experiments, predicted)
     after = held_out_rms(experiments, again.predicted(experiments))
     assert after**2 - NOISE**2 < 0.3 * (held**2 - NOISE**2)
@@ -112,9 +113,9 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
 
 def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
     found, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
-    modes = [c for c in corrections(found, experiments, colour) if c.kind.name == "modes"]
-    patch = patch_of(modes, experiments, 1.0, colour)
-    assert patch is not None
+    modes = [c for c in corrections(found, experiments, colour) if c.kind == "modes"]
+    patch = best_of(modes, experiments, [1.0], colour)
+    assert isinstance(patch, Patch)
     with pytest.raises(InputError, match="no form that a model could hold"):
         with_patch(found, patch, experiments, found.predicted(experiments))
 
@@ -124,7 +125,7 @@ def test_noise_gets_no_correction(clean: FloatArray) -> None:
     found, experiments, colour = _fitted(clean + noise)
     seen = corrections(found, experiments, colour)
     assert max(c.evidence for c in seen) < 3.0
-    assert patch_of(seen, experiments, _held(found, experiments), colour) is None
+    assert best_of(seen, experiments, [_held(found, experiments)], colour) is None
 
 
 def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
@@ -141,7 +142,9 @@ def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
     )
     one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))
     without = [("one", (truth + one,)), ("other", (truth + other,))]
-    spent = budget(experiments, (truth + one + other,), (truth,), without, None, NOISE)
+    base, extended = (truth + one + other,), (truth,)
+    found = budget(removed_from(experiments, base, [NOISE]), extended, without, None)
+    spent = stack_budget(found, experiments, base, extended, NOISE)
     assert spent.excess_rms_m == pytest.approx(5.0 * NOISE, rel=0.05)
     assert [s.share for s in spent.causes] == pytest.approx([9 / 25, 16 / 25], abs=0.04)
     assert spent.together.share == pytest.approx(1.0, abs=0.02)

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from psa_casadi.cli.app import app
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
+from tests.contract.helpers import refused
 
 #: Coordinates along which physics says that an effect is to be seen.
 TOLD = {
@@ -69,19 +68,6 @@ def test_creep_grows_during_holds_and_hum_is_a_line_at_its_frequency() -> None:
     assert slope == pytest.approx(-delay.size * gain, rel=0.25)
 
 
-def test_the_command_draws_one_effect_and_says_what_it_cannot_draw(tmp_path: Path) -> None:
-    path = tmp_path / "delay.png"
-    drawn = CliRunner().invoke(app, ["effects", "sensor-delay", "--figure", str(path)])
-    assert drawn.exit_code == 0, drawn.output
-    assert path.read_bytes().startswith(b"\x89PNG")
-    assert "phase linear in frequency" in " ".join(drawn.stdout.split())
-    assert f"written: {path}" in drawn.stdout
-    nameless = CliRunner().invoke(app, ["effects", "--figure", str(tmp_path / "x.png")])
-    assert nameless.exit_code == 2
-    assert "none is named" in nameless.stderr
-    absent = str(tmp_path / "absent" / "x.png")
-    both = CliRunner().invoke(app, ["effects", "slow_crep", "--figure", absent])
-    assert both.exit_code == 2
-    assert "did you mean slow_creep" in both.stderr
-    assert "does not exist" in " ".join(both.stderr.split())
-    assert [p.name for p in tmp_path.iterdir()] == ["delay.png"]
+def test_a_picture_is_of_one_effect(tmp_path: Path) -> None:
+    assert "none is named" in refused("effects", "--figure", tmp_path / "x.png")
+    assert not list(tmp_path.iterdir())

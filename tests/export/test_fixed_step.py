@@ -18,9 +18,15 @@ from fmpy.validation import validate_fmu
 import psa_casadi as psa
 from psa_casadi.cli.inputs import step_seconds
 from psa_casadi.examples.linearisation_trial import DriftingStack
-from psa_casadi.export.fixed_step.export import GOOD, FixedStep, fixed_step
-from psa_casadi.export.fixed_step.expressions import PRECISIONS
-from psa_casadi.export.fixed_step.probe import VOLTAGES, Probe, played_inputs
+from psa_casadi.export.fixed_step.code import PRECISIONS
+from psa_casadi.export.fixed_step.export import (
+    GOOD,
+    VOLTAGES,
+    FixedStep,
+    Probe,
+    fixed_step,
+    played_inputs,
+)
 from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.sources import FIXED_ENTRY

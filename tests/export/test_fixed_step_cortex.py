@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
-from psa_casadi.export.fixed_step.probe import Probe, played_inputs
+from psa_casadi.export.fixed_step.export import FixedStep, Probe, fixed_step, played_inputs
 from psa_casadi.simulation.compiler import run_compiler, zig_command
 from tests.export.c_host.build import FloatArray, tool
 from tests.model.stack_models import stack

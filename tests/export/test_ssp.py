@@ -13,10 +13,16 @@ from lxml import etree  # type: ignore[import-untyped]
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.export.ssp.archive import export_ssp, layout_of, save_wiring, wiring_of
-from psa_casadi.export.ssp.drawing import OUTSIDE, Port
-from psa_casadi.export.ssp.steps import stable_step
-from psa_casadi.export.ssp.structure import shared_parameters
+from psa_casadi.export.ssp import (
+    OUTSIDE,
+    Port,
+    export_ssp,
+    layout_of,
+    save_wiring,
+    shared_parameters,
+    stable_step,
+    wiring_of,
+)
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.system import System
 from tests.export.fmu_models import assert_valid, model_named

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from psa_casadi import reference
+from psa_casadi.identification.start.linear_response import mechanics_poles, numerator_time
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, sine, time_grid
 
@@ -115,3 +116,13 @@ def noisy(record: Record, share: float) -> Record:
     x = np.asarray(record.displacement)
     draw = np.random.default_rng(1).standard_normal(record.n)
     return changed(record, x + share * record.range_m * draw)
+
+
+def transfer(theta: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return X/U at the frequencies [Hz], shape (k,), gain 1 at rest."""
+    s = 2j * np.pi * frequency
+    whole = np.append(mechanics_poles(theta), -np.exp(-theta[0]))
+    found: NDArray[np.complex128] = (1.0 + numerator_time(theta) * s) / np.prod(
+        1.0 - s[:, None] / whole, axis=1
+    )
+    return found

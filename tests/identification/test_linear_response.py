@@ -10,10 +10,10 @@ from psa_casadi.identification.start.linear_response import (
     numerator_time,
     plays,
     respond,
-    transfer,
     vector_fit,
 )
 from psa_casadi.identification.start.starting_points import arrangements
+from tests.identification.paper_cases import transfer
 
 
 def test_the_response_is_exact_between_samples() -> None:

@@ -11,6 +11,7 @@ from psa_casadi.report.documents.files import identification_file
 from psa_casadi.strict_json import json_text
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
+from tests.contract.helpers import done
 from tests.report.html_page import Page
 from tests.report.test_schemas import valid
 
@@ -24,6 +25,7 @@ def test_identifications_of_an_own_model_are_compared(tmp_path: Path) -> None:
     """The third of three motors is heavier by a hundredth; all else is the same."""
     given = [device("first", 1), device("second", 2), device("third", 3, inertia=3.03e-5)]
     results = [psa.identify(motor(), record, starts=1) for record in given]
+    assert len(results[0].plot().axes) == 4  # both outputs, and what is left of each
     path = tmp_path / "second.json"
     path.write_text(json_text(identification_file(results[1])), encoding="utf-8")
     content = valid("identification", path.read_text("utf-8"))
@@ -59,3 +61,15 @@ def test_diagnoses_of_an_own_model_are_compared(tmp_path: Path) -> None:
     page = Page((tmp_path / "page.html").read_text("utf-8"))
     assert "Verdicts differ (dry: cause named and oiled: adequate)" in page.text
     assert "friction in speed" in page.text
+    errors = {e.output: e for e in found[0].errors}
+    assert errors["w"].unit == "rad/s"
+    assert errors["w"].extended == pytest.approx(0.3, rel=0.1)
+    assert errors["i"].base > 2.0 * errors["i"].extended
+    assert "w, base, held out [rad/s]" in page.text
+    # a result at hand has all parameters of its model, a file those of its causes
+    assert set(found[1].parameters) == {"R", "k", "J", "b"}
+    plain = tmp_path / "oiled.json"
+    plain.write_text(oiled.to_json(), encoding="utf-8")
+    words = done("compare", path, plain, "-o", tmp_path / "two.html").words
+    assert "cause named" in words
+    assert "held out" in words

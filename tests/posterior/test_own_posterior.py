@@ -39,6 +39,7 @@ def test_every_output_of_every_record_has_a_noise_level_of_its_own() -> None:
     assert [(b.record, task().channel(b).column) for b in blocks] == [(0, "w"), (1, "w"), (0, "i")]
     assert [b.count for b in blocks] == [600.0, 600.0, 599.0]  # the zero of i is integrated out
     np.testing.assert_allclose([b.level for b in blocks], [0.3, 1.2, 0.005], rtol=0.1)
+    assert task().density.size == 4 + 2 * 2  # parameters, both states of both records: no offset
 
 
 def test_the_gradient_is_that_of_the_density() -> None:

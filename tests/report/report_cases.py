@@ -8,7 +8,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.diagnosis import result
-from psa_casadi.diagnosis.held_out import Errors, Gain
+from psa_casadi.diagnosis.held_out import Errors, Gain, Share, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.remedy import Size
@@ -111,6 +111,8 @@ def diagnosis(
                   (Size("hold", 4e-8, "m", (3.7e-8, 4.3e-8), 10.0, "s", (0.0, 100.0)),
                    Size("hold", 9e-8, "m", None, 600.0, "s", (0.0, 100.0), True)))  # fmt: skip
     errors = Errors(4e-8, 5e-8, 1.5e-7, 0.31)
+    removes = Share("slow_creep", 0.97 if added else 0.0, (0.95, 0.98) if added else (0.0, 0.0))
+    left = (7e-9, 0.04) if added else (4.97e-8, 0.31)
     seen = [misfits(n, samples) for n in names]
     return result.Diagnosis(
         verdict=verdict,
@@ -123,6 +125,9 @@ def diagnosis(
         noise_floor_rms_m=NOISE,
         base_errors=errors,
         extended_errors=Errors(5.1e-9, 8.5e-9, 2e-8, 0.052) if added else errors,
+        budget=StackBudget(
+            replace(removes, what="together"), (removes,) * added, None, 4.97e-8, NOISE, *left
+        ),
         gain=Gain(83.0, (79.0, 86.0)) if added else Gain(0.0, (0.0, 0.0)),
         blind_to=(
             result.BlindSpot("sensor_delay", 0.002, "s", "The record is slow <and> short."),

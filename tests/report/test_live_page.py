@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,14 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.design.tracking.targets import respond
 from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
 from psa_casadi.report.page import live
 from psa_casadi.report.page.designs import write_design_page
-from psa_casadi.report.page.live import live_data, live_design, thinned
+from psa_casadi.report.page.live import LiveModel, live_data, live_design, thinned
 from psa_casadi.variables import Interval, Provenance
+from tests.any_model import own_models
+from tests.any_model import own_plants as plants
 from tests.report.browser import DARK, SCRIPTS, Browser, driven
 from tests.report.html_page import Page
 from tests.report.report_cases import diagnosis
@@ -220,11 +224,46 @@ def test_what_json_cannot_hold_stays_out_of_a_page() -> None:
 def test_a_long_record_is_thinned_only_where_the_voltage_stays_the_same() -> None:
     t = np.linspace(0.0, 1.0, 10_001)
     slow_voltage, quick_voltage = np.sin(2 * np.pi * t), np.sin(2 * np.pi * 900 * t)
-    part, note = thinned(t, slow_voltage, 1000)
+    part, note = thinned(t, [slow_voltage], 1000)
     assert len(part) <= 1000
     assert part[1] == 11
     assert "each 11th" in note
-    part, note = thinned(t, quick_voltage, 1000)
+    part, note = thinned(t, [quick_voltage], 1000)
     assert part.tolist() == list(range(1000))
     assert "the first 1000" in note
-    assert thinned(t, quick_voltage, 20_000)[1] == ""
+    assert thinned(t, [quick_voltage], 20_000)[1] == ""
+
+
+@slow
+def test_a_model_of_ones_own_runs_in_its_page(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every output of a record beside the model, at values that are moved, as Python has them."""
+    record = plants.motor(1, friction=0.0)
+    found = psa.identify(own_models.motor(), record, starts=1)
+    psa.write_fit_report(found, tmp_path / "page.html")
+    script = (
+        "var box = document.querySelector('.live'), list = box.querySelector('select');"
+        "function text() { return box.querySelector('output').textContent; }"
+        "var rows = Array.prototype.map.call(list.options, function (o) {"
+        "  list.value = o.value; list.dispatchEvent(new Event('change'));"
+        f"  box.psa.set('R', {1.1 * found.model.values['R']!r});"
+        "  return [o.textContent, text(), box.querySelector('figcaption').textContent]; });"
+        "tell(rows);"
+    )
+    rows = driven(browser, tmp_path / "page.html", script)
+    model = found.model.with_values({"R": 1.1 * found.model.values["R"]})
+    time, u = record.time - record.time[0], record.columns["voltage"][:, None]
+    x0 = np.array([found.fit.start(0).get(s.name, 0.0) for s in model.structure.states])
+    y = dict(zip(model.output_names, psa.run(model, time, u, x0).y.T, strict=True))
+    assert {row[2] for row in rows} == {"w over time", "i over time"}
+    for _, text, caption in rows:
+        name = caption.split()[0]
+        told = re.search(r"^Error: ([\d.e+-]+) (m?)", text)
+        assert told is not None, text
+        missed = float(np.sqrt(np.mean((record.columns[name] - y[name]) ** 2)))
+        assert float(told[1]) * (1e-3 if told[2] else 1.0) == pytest.approx(missed, rel=6e-3)
+    psa.write_fit_report(found, tmp_path / "still.html", still=True)
+    assert "Change the model and see" not in (tmp_path / "still.html").read_text("utf-8")
+    monkeypatch.setattr(Model, "sampled_names", ("held",))
+    assert "sampled states" in LiveModel(found.model, Future(), []).cure()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.patch import Patch
+from psa_casadi.diagnosis.corrections import Patch
 from psa_casadi.diagnosis.result import Alternative
 from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.identification.profile import Profile
@@ -70,7 +70,10 @@ def test_diagnoses_are_as_their_schema_says(verdict: Any) -> None:
     content = valid("diagnosis", d.to_json())
     assert content["misfit"][0]["views"]
     none = np.zeros(1)
-    patch = Patch("curve", "reading", 9.0, ("lag at the drive",), (), (), none, none)
+    patch = Patch(
+        kind="curve", port="reading", evidence=9.0, open_to=("lag at the drive",), held=(),
+        predicted=(), added=(), weights=none, moved=none,
+    )  # fmt: skip
     other = Alternative("slow_creep", "offset_drift", d.model, 1.01, 1e-9, 0.1)
     assert valid("diagnosis", replace(d, patch=patch, alternatives=(other,)).to_json())["patch"]
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.held_out import Budget, Errors, Share
+from psa_casadi.diagnosis.held_out import Errors, Share, StackBudget
 from psa_casadi.diagnosis.result import BlindSpot, Cause, Estimate
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
@@ -29,12 +29,12 @@ FOLDER = Path(__file__).parent / "told"
 Result = psa.Diagnosis | StackIdentification
 
 
-def shares(*each: float, together: float = 0.97) -> Budget:
+def shares(*each: float, together: float = 0.97) -> StackBudget:
     """Return an error budget of slow creep, hysteresis memory and hum, in this order."""
     names = ("slow_creep", "hysteresis_memory", "mains_hum")
     rows = tuple(Share(n, s, (s - 0.05, s + 0.05)) for n, s in zip(names, each, strict=False))
     whole = Share("together", together, (0.92, 1.0)) if len(rows) > 1 else rows[0]
-    return Budget(4e-8, 5e-9, whole, rows, None, 7e-9, 0.04)
+    return StackBudget(whole, rows, None, 4e-8, 5e-9, 7e-9, 0.04)
 
 
 def with_memory() -> psa.Diagnosis:

@@ -2,9 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
@@ -17,14 +20,13 @@ from psa_casadi.simulation import device
 from psa_casadi.simulation.simulate import EXACT, STEPPER
 from tests.datasets.test_datasets_one_axis import N as PERIOD
 from tests.datasets.test_datasets_one_axis import driven, voltages
-from tests.simulation.cuda_host import lend
 from tests.studies.__main__ import app
-from tests.studies.benchmarks import changed, fits, floors, mirror, peers
+from tests.studies.benchmarks import changed, fits, floors, mirror, peers, sampling
 from tests.studies.benchmarks import diagnose as study
 from tests.studies.benchmarks import verification as paper
 from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
 from tests.studies.benchmarks.hidden_cases import Case, Found, Kind
-from tests.studies.benchmarks.table import BENCHES, FloatArray, bench, least_times
+from tests.studies.benchmarks.table import BENCHES, FloatArray, bench
 from tests.tiers import slow
 from tests.voltages import steps
 
@@ -47,54 +49,19 @@ def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
             run(silent, False, folder=tmp_path)
 
 
-def test_works_are_timed_in_turns_and_a_slow_one_is_not_repeated() -> None:
-    calls: list[str] = []
-
-    def slow_one() -> None:
-        calls.append("b" if sum(range(10**6)) else "")
-
-    least = least_times([lambda: calls.append("a"), slow_one], 3, slow=1e-3)
-    assert "".join(calls) == "abaa"
-    assert all(0.0 <= s < 1.0 for times in least for s in times)
-
-
 # ---- ensembles
 
 
-@pytest.fixture
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent() -> None:
-        raise psa.InputError("there is none.")
-
-    monkeypatch.setattr(device, "device_module", absent)
-
-
-def short() -> psa.Record:
-    """Return 40 samples of the sine, up and down in 8 ms."""
-    voltage = 50.0 - 50.0 * np.cos(2.0 * np.pi * np.arange(40) / 39.0)
-    return replace(peers.cases(40)[0], voltage=voltage)
-
-
-def test_the_loosest_tolerance_is_the_first_that_is_accurate() -> None:
-    """The first set errs by 10 times the tolerance over its range, the second by 50 times."""
-    truth = np.array([[0.0, 1.0], [0.0, 2.0]])
-
-    def at(tolerance: float) -> peers.Solve:
-        return lambda: np.array([[0.0, 1.0 + 10.0 * tolerance], [0.0, 2.0 + 100.0 * tolerance]])
-
-    tolerance, error, _ = peers.loosest(at, truth)
-    assert tolerance == pytest.approx(1e-7)
-    assert error == pytest.approx(5e-6, rel=1e-6)
-    assert peers.loosest(lambda _: lambda: np.array([[0, 1], [0, np.nan]]), truth)[1] == np.inf
-
-
 @slow
-@pytest.mark.usefixtures("no_gpu")
 def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight sets of 40 samples, scipy and CVODES beside `simulate_many`."""
+    """Eight sets of 40 samples of a sine, scipy and CVODES beside `simulate_many`."""
+    none = Mock(side_effect=psa.InputError("there is none."))
+    monkeypatch.setattr(device, "device_module", none)
     monkeypatch.setattr(peers, "find_spec", lambda _: None)
     monkeypatch.setattr(peers, "_REPEATS", 1)
-    (table,) = peers.measured(silent, [short()], 8).tables
+    voltage = 50.0 - 50.0 * np.cos(2.0 * np.pi * np.arange(40) / 39.0)
+    short = replace(peers.cases(40)[0], voltage=voltage)
+    (table,) = peers.measured(silent, [short], 8).tables
     assert [(r["sets"], r["samples"]) for r in table.rows] == [(8, 40), (4, 40), (4, 40)]
     assert [r["way"] for r in table.rows] == [peers.OURS, *list(peers.PEERS)[:2]]
     assert all(float(str(r["largest error / range"])) <= 1e-5 for r in table.rows)
@@ -103,37 +70,7 @@ def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPa
     assert table.note.endswith("No rows of a GPU: there is none.")
 
 
-def test_a_gpu_has_rows_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twelve sets, on this processor in the place of a GPU."""
-    host = lend(monkeypatch, 10**9)
-    model = psa.stack_model("P-885.51")
-    tables, missing = peers.on_gpu(silent, model, [(short(), 1e-6)], 12)
-    assert not missing
-    (row,) = tables[0].table.rows
-    assert row[:5] == ("sine of 10 Hz", "12", "40", "1e-06", "0.0e+00")
-    assert "this processor" in tables[0].note
-    assert host.launches == [1, 128, 1, 128]
-
-
 # ---- fits
-
-POINTS = [
-    fits.Point(EXACT, 1e-5, 2e-5, 1.5, 0.7, 1.4),
-    fits.Point(EXACT, 1e-6, 5e-6, 2.0, 0.8, 1.9),
-    fits.Point(EXACT, 1e-7, 2e-6, 3.0, 1.2, 2.8),
-    fits.Point(STEPPER, 1e-6, 2e-5, 16.0, 7.0, 1.9),
-    fits.Point(STEPPER, 1e-7, 1e-6, 22.0, 10.0, 2.8),
-]
-
-
-def test_of_each_way_the_cheapest_run_below_the_error_counts() -> None:
-    assert fits.cheapest(POINTS, EXACT, "differentiated").tolerance == 1e-6
-    assert fits.cheapest(POINTS, STEPPER, "plain").tolerance == 1e-7
-    with pytest.raises(psa.PsaError, match="No tolerance"):
-        fits.cheapest(POINTS, STEPPER, "plain", 1e-9)
-    note = fits.run_table(POINTS, 5248).note
-    assert "with 12 sensitivities 1/11 of the stepper's time" in note
-    assert "without 1/12 of the stepper's time" in note
 
 
 def test_exact_steps_are_left_out_only_within() -> None:
@@ -344,6 +281,41 @@ def test_a_settled_model_repeats_itself_and_has_no_mean() -> None:
     assert abs(np.mean(shown)) < 1e-6 * np.ptp(shown)
     assert np.ptp(shown) > 1e-7
     assert mirror.RATE == 6400.0
+
+
+# ---- sampling: the one equation that PyMC gets shows what the whole stack shows
+
+#: NumPy under the names of PyMC's symbols.
+NUMPY = SimpleNamespace(
+    floor=np.floor, mod=np.mod, eq=np.equal, lt=np.less, switch=np.where, sqrt=np.sqrt
+)
+
+
+def test_the_reduced_equation_shows_the_stack_at_other_values() -> None:
+    model = sampling.stack().with_values({"k_L": 7.9, "A": -1.5, "delta": -0.2, "n": 1.7})
+    v, given = model.values, sampling.record()
+    p = [v["A"], v["delta"], v["n"]]
+    found = solve_ivp(
+        lambda t, y: [sampling.hysteresis_rate(y[0], t, p, v, NUMPY)], (0.0, given.time[-1]),
+        [30.0], t_eval=given.time, method="LSODA", rtol=1e-9, atol=1e-6,
+        max_step=sampling.LEG / 20,
+    )  # fmt: skip
+    compliance = 1.0 / v["k_P"] + 1.0 / v["k_B"]
+    reduced = compliance * (v["k_L"] * given.voltage + found.y[0])
+    whole = psa.simulate(model, given.time, given.voltage, memory={"f_H": 30.0}, rtol=1e-9)
+    miss = reduced - whole.displacement
+    assert np.max(np.abs(miss - np.mean(miss))) < 1e-4 * np.ptp(whole.displacement)
+    assert np.ptp(found.y[0]) > 50.0  # it is the hysteresis that is compared
+
+
+def test_the_table_states_effective_samples_per_processor_time() -> None:
+    draws = np.random.default_rng(0).standard_normal((20000, 2))
+    fast, slow = (sampling.Drawn(n, draws, 8000.0, s) for n, s in (("a", 2.0), ("b", 500.0)))
+    told = sampling.speed([fast, slow])
+    assert "250 times" in told.note
+    for row, seconds in zip(told.table.rows, (2.0, 500.0), strict=True):
+        assert float(row[4]) == pytest.approx(20000, rel=0.1)
+        assert float(row[6]) == pytest.approx(float(row[4]) / seconds, rel=0.01)
 
 
 # ---- verification: what it judges was not fitted, its figures are what they say

@@ -41,6 +41,7 @@ from psa_casadi.identification.search import CORE
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
+from psa_casadi.progress import on_a_terminal
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.sizes import sized, sizes_of
@@ -51,6 +52,7 @@ NOISE_SHARE = 1e-3
 _RAMP = 100
 
 
+@on_a_terminal
 @interruptible_work()
 def design_experiment(
     model: Model,

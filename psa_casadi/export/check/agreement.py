@@ -15,7 +15,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import BREAKDOWNS
 from psa_casadi.export.common.markup import time_scale
 from psa_casadi.export.common.variable_table import starts_at_voltage
-from psa_casadi.export.fixed_step.probe import STEPS, VOLTAGES, played_inputs, shown_output
+from psa_casadi.export.fixed_step.export import STEPS, VOLTAGES, played_inputs, shown_output
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model

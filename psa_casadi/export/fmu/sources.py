@@ -23,8 +23,7 @@ from psa_casadi.export.common.markup import at_rest, xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
 from psa_casadi.export.common.variable_table import starts_at_voltage, variable_table
 from psa_casadi.export.fixed_step.code import bounded, function_code, limit_words
-from psa_casadi.export.fixed_step.export import FixedStep
-from psa_casadi.export.fixed_step.probe import STEPS, shown_output
+from psa_casadi.export.fixed_step.export import STEPS, FixedStep, shown_output
 from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.evidence import seen_inputs
 from psa_casadi.model.compose import Model, Structure

@@ -125,16 +125,6 @@ def respond(poles: ComplexArray, b: float, x: FloatArray, h: float) -> FloatArra
     return total
 
 
-def transfer(theta: FloatArray, frequency: FloatArray) -> ComplexArray:
-    """Return X/U at the frequencies [Hz], shape (k,), gain 1 at rest."""
-    s = 2j * np.pi * frequency
-    whole = np.append(mechanics_poles(theta), -np.exp(-theta[0]))
-    found: ComplexArray = (1.0 + numerator_time(theta) * s) / np.prod(
-        1.0 - s[:, None] / whole, axis=1
-    )
-    return found
-
-
 def plays(u: FloatArray, radii: npt.ArrayLike) -> FloatArray:
     """Return play operators (n, k) of the radii on u (n,), all of them centred at the first sample.
 

@@ -447,11 +447,10 @@ class LinearCandidate:
 
 @dataclass(frozen=True)
 class LinearStart:
-    """Candidates, the best first; the records they come from; the misfit without any dynamics."""
+    """Candidates, the best first, and the records they come from."""
 
     candidates: tuple[LinearCandidate, ...]
     records: tuple[str, ...]
-    static_misfit: float
 
 
 def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> LinearStart | None:
@@ -477,7 +476,6 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
     return LinearStart(
         candidates=tuple(_candidate(f, values, _share(parts, f.left)) for f in kept),
         records=tuple(e.name for e in parts),
-        static_misfit=_share(parts, [e.static for e in parts]),
     )
 
 

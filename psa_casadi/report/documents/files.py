@@ -13,9 +13,16 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from psa_casadi.any_model.result import OdeBudget, OutputError, PortCause
-from psa_casadi.diagnosis.held_out import Budget, Errors, Gain
-from psa_casadi.diagnosis.result import Candidate, Cause, Verdict, unnamed_causes
+from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
+from psa_casadi.diagnosis.result import (
+    ANY_MODEL,
+    FORMAT,
+    Candidate,
+    Cause,
+    OutputError,
+    Verdict,
+    unnamed_causes,
+)
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport
 from psa_casadi.identification.identify import StackIdentification
@@ -250,32 +257,70 @@ class RecordUsed:
     sha256: str
 
 
-@dataclass(frozen=True, repr=False)
-class DiagnosisFile(Told):
-    """A diagnosis: verdict, causes, errors before and after, and what remains.
+@dataclass(frozen=True)
+class FreeCorrection:
+    """A free function of some variables at a port that would remove most of what is left."""
 
-    It answers by the names of a `Diagnosis` what needs no samples and no model.
+    port: str
+    of: str
+    evidence: float
+    share: float
+    unit: str
+    variable: str
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class AnyDiagnosisFile(Told):
+    """A diagnosis: verdict, causes, what the base misses and what remains.
+
+    It answers by the names of a result what needs no samples and no model. `values` are the
+    parameters of the extended model. Files of older versions lack what has a default.
     """
 
-    format: Literal["psa_casadi.diagnosis/1"]
+    format: str
     verdict: Verdict
-    doubt: str
+    doubt: str = ""
     causes: tuple[Cause, ...]
     candidates: tuple[Candidate, ...]
+    budget: Budget | None = None
+    missed: Remaining | None = None
+    remaining: Remaining
+    unnamed: str = ""
+    notes: tuple[str, ...]
+    values: Mapping[str, float] = field(default_factory=dict)
+    records: tuple[RecordUsed, ...]
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Effects that the extended model holds and that are not named as causes."""
+        return unnamed_causes(self.budget, self.causes)
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class OwnModelFile(AnyDiagnosisFile):
+    """A diagnosis of a model of one's own: with the errors of every output."""
+
+    format: Literal["psa_casadi.own_model_diagnosis/1"]
+    errors: tuple[OutputError, ...]
+    correction: FreeCorrection | None
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class DiagnosisFile(AnyDiagnosisFile):
+    """A diagnosis of a stack: errors before and after, blind spots, what to record next."""
+
+    format: Literal["psa_casadi.diagnosis/1"]
+    budget: StackBudget | None = None
     errors: BothErrors
     gain: Gain
-    budget: Budget | None
     patch: UnnamedCorrection | None
     alternatives: tuple[OtherModel, ...]
     columns: tuple[Decision, ...]
     blind_to: tuple[BlindSpot, ...]
-    remaining: Remaining
     next_experiment: NextExperiment
-    notes: tuple[str, ...]
     noise: tuple[RecordNoise, ...]
     misfit: tuple[RecordMisfit, ...]
     remainder: tuple[RecordMisfit, ...]
-    records: tuple[RecordUsed, ...]
 
     @property
     def noise_floor_rms_m(self) -> float:
@@ -291,11 +336,6 @@ class DiagnosisFile(Told):
     def extended_errors(self) -> Errors:
         """The errors of the extended model."""
         return self.errors.extended
-
-    @property
-    def kept(self) -> tuple[str, ...]:
-        """Effects that the extended model holds and that are not named as causes."""
-        return unnamed_causes(self.budget, self.causes)
 
 
 IDENTIFICATION_FORMAT: Literal["psa_casadi.identification/1"] = "psa_casadi.identification/1"
@@ -512,45 +552,10 @@ def _finite(figure: float) -> float | None:
     return figure if math.isfinite(figure) else None
 
 
-@dataclass(frozen=True)
-class FreeCorrection:
-    """A free function of some variables at a port that would remove most of what is left."""
-
-    port: str
-    of: str
-    evidence: float
-    share: float
-    unit: str
-    variable: str
-
-
-@dataclass(frozen=True, repr=False)
-class OwnModelFile(Told):
-    """A diagnosis of a model of one's own: verdict, causes, errors of every output, what remains.
-
-    `values` are the parameters of the extended model in the model's units. Files of older versions
-    have no `budget`.
-    """
-
-    format: Literal["psa_casadi.own_model_diagnosis/1"]
-    verdict: Verdict
-    causes: tuple[PortCause, ...]
-    candidates: tuple[Candidate, ...]
-    errors: tuple[OutputError, ...]
-    missed: Remaining
-    remaining: Remaining
-    unnamed: str
-    correction: FreeCorrection | None
-    notes: tuple[str, ...]
-    values: Mapping[str, float]
-    records: tuple[RecordUsed, ...]
-    budget: OdeBudget | None = None
-
-
 _READ_ADVICE = "give a file that `psa diagnose --json` or `Diagnosis.to_json` wrote"
-_KINDS: dict[str, type[DiagnosisFile | OwnModelFile]] = {
-    "psa_casadi.diagnosis/1": DiagnosisFile,
-    "psa_casadi.own_model_diagnosis/1": OwnModelFile,
+DIAGNOSES: dict[Any, type[DiagnosisFile | OwnModelFile]] = {
+    FORMAT: DiagnosisFile,
+    ANY_MODEL: OwnModelFile,
 }
 
 
@@ -564,10 +569,17 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
     """
     source = os.fspath(path)
     content = read_json(source, f"{_READ_ADVICE}.")
-    found = content.get("format") if isinstance(content, dict) else None
-    if found not in _KINDS:
+    told, found = diagnosis_in(content, source)
+    if told is None:
         raise InputError(f"{source}: its format is {shown(found)}, no diagnosis; {_READ_ADVICE}.")
-    return decode(_KINDS[found], content, source)
+    return told
+
+
+def diagnosis_in(content: Any, source: str) -> tuple[DiagnosisFile | OwnModelFile | None, Any]:
+    """Return the diagnosis that a file's content is, None if it is none, and its format."""
+    found = content.get("format") if isinstance(content, dict) else None
+    kind = DIAGNOSES.get(found) if isinstance(found, str) else None
+    return None if kind is None else decode(kind, content, source), found
 
 
 #: The record of each file that is written as JSON, by the name of its schema.

@@ -8,10 +8,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from psa_casadi.any_model.result import FORMAT as OWN_DIAGNOSIS
-from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import OdeDiagnosis
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
@@ -26,23 +24,25 @@ from psa_casadi.population.finding import (
     replayed,
 )
 from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
-from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.report.documents.files import (
+    DIAGNOSES,
+    AnyDiagnosisFile,
     DeviceFile,
     DiagnosisFile,
     IdentificationFile,
     OwnModelFile,
     damage,
+    diagnosis_in,
     identification_file,
 )
+from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
 from psa_casadi.strict_json import decode, read_json
 
 #: The file in a device's folder that says how its work ended.
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
-_DIAGNOSIS = "psa_casadi.diagnosis/1"
 #: What `identify` and `diagnose` return.
-Result = Diagnosis | OdeDiagnosis | Identification
+Result = OdeDiagnosis | Identification
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
@@ -97,24 +97,24 @@ def _read(
     if isinstance(given, Identification):
         path, source = Path(given.experiments[0].record.name), "identification"
         content = identification_file(given)
-    elif isinstance(given, Diagnosis | OdeDiagnosis):
-        path, source = Path(given.experiments[0].record.name), "diagnosis"
+    elif isinstance(given, OdeDiagnosis):
+        path = Path(given.experiments[0].record.name)
         content = given.to_dict()
+        finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))
+        return [(path, _with_model(finding, _model(given.model, traces)))]
     else:
         path = Path(given) / DEVICE_FILE if Path(given).is_dir() else Path(given)
         source = str(path)
         content = read_json(path, _ADVICE)
-    kind = content.get("format") if isinstance(content, dict) else None
+    diagnosis, kind = diagnosis_in(content, source)
+    if diagnosis is not None:
+        return [(path, _diagnosis(diagnosis))]
     if kind == DEVICE:
         told = decode(DeviceFile, content, source)
         if told.status != "done":
             why = " ".join(told.problems)
             raise InputError(f"{path}: the work on this device was {told.status}: {why}")
         return [(path, device_finding(path.parent, told, effects, traces=traces))]
-    if kind == _DIAGNOSIS:
-        return [(path, _diagnosis(decode(DiagnosisFile, content, source)))]
-    if kind == OWN_DIAGNOSIS:
-        return [(path, _any_diagnosis(decode(OwnModelFile, content, source)))]
     if kind == IDENTIFICATION:
         return [(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
@@ -122,9 +122,26 @@ def _read(
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
 
 
-def _any_diagnosis(d: DiagnosisFile | OwnModelFile) -> Finding:
+def _diagnosis(d: AnyDiagnosisFile) -> Finding:
     b = d.budget
     shares = [] if b is None else [*b.causes, *([b.unnamed] if b.unnamed else [])]
+    errors = []
+    if isinstance(d, DiagnosisFile):
+        base, extended = d.base_errors, d.extended_errors
+        errors = [
+            HeldOutErrors(
+                base.holdout_rms_m,
+                extended.holdout_rms_m,
+                d.noise_floor_rms_m,
+                base.holdout_nrmse_percent,
+                extended.holdout_nrmse_percent,
+            )
+        ]
+    elif isinstance(d, OwnModelFile):
+        errors = [
+            HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
+            for e in d.errors
+        ]
     return Finding(
         device="",
         kind="diagnosis",
@@ -133,26 +150,14 @@ def _any_diagnosis(d: DiagnosisFile | OwnModelFile) -> Finding:
         },
         records=tuple((r.name, r.sha256) for r in d.records),
         verdict=d.verdict,
+        doubt=d.doubt,
+        errors=tuple(errors),
         causes=tuple(
             NamedCause(c.effect, c.confidence, c.explained_share, c.cannot_be_told_from)
             for c in d.causes
         ),
         budget=tuple(BudgetShare(s.what, s.share, s.interval) for s in shares),
         notes=d.notes,
-    )
-
-
-def _diagnosis(d: DiagnosisFile) -> Finding:
-    return replace(
-        _any_diagnosis(d),
-        doubt=d.doubt,
-        errors=HeldOutErrors(
-            d.errors.base.holdout_rms_m,
-            d.errors.extended.holdout_rms_m,
-            d.errors.noise_floor_rms_m,
-            d.errors.base.holdout_nrmse_percent,
-            d.errors.extended.holdout_nrmse_percent,
-        ),
     )
 
 
@@ -199,10 +204,7 @@ def _model(model: Model, traces: bool) -> Finding:
 
 
 def _joined(found: Sequence[_Read]) -> list[_Read]:
-    """Join every model to the first finding of the same records that has none yet.
-
-    That gets all that the model holds: all parameters, and the record that it carries.
-    """
+    """Join every model to the first finding of the same records that has none yet."""
     rows = dict(enumerate(found))
     full: set[int] = set()
     for k, (_, own) in enumerate(found):
@@ -215,14 +217,19 @@ def _joined(found: Sequence[_Read]) -> list[_Read]:
         if same:
             full.add(same[0])
             path, finding = rows[same[0]]
-            parameters = {**own.parameters}
-            for name, p in finding.parameters.items():
-                meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
-                parameters[name] = replace(p, meaning=meaning)
-            whole = replace(finding, parameters=parameters, trace=own.trace)
-            rows[same[0]] = path, replace(whole, force_scale=own.force_scale)
+            rows[same[0]] = path, _with_model(finding, own)
             del rows[k]
     return list(rows.values())
+
+
+def _with_model(finding: Finding, model: Finding) -> Finding:
+    """Return a finding with all that its model holds: all parameters, and the record it carries."""
+    parameters = {**model.parameters}
+    for name, p in finding.parameters.items():
+        meaning = p.meaning or (parameters[name].meaning if name in parameters else "")
+        parameters[name] = replace(p, meaning=meaning)
+    whole = replace(finding, parameters=parameters, trace=model.trace)
+    return replace(whole, force_scale=model.force_scale)
 
 
 def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
@@ -255,8 +262,10 @@ def finding_content(found: Finding) -> dict[str, Any]:
     causes = "; ".join(" or ".join((c.effect, *c.or_else)) for c in found.causes)
     row: dict[str, Any] = {"verdict": found.verdict, "cause": causes}
     row["confidence"] = found.causes[0].confidence if found.causes else None
-    for name in ("base", "extended", "noise"):
-        row[f"{name}_rms [m]"] = getattr(found.errors, name, None)
+    for e in found.errors or (None,):
+        output, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
+        for name in ("base", "extended", "noise"):
+            row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = found.rms_m, found.rms_percent
     for name, p in found.parameters.items():
         if p.told and p.interval is not None:

@@ -11,9 +11,9 @@ psaLive.report = function (box, told, run) {
     r.measured = psaLive.singles(r.measured);
     r.correction = r.correction ? psaLive.singles(r.correction) : null;
     Object.keys(r.inputs).forEach(function (n) { r.inputs[n] = psaLive.doubles(r.inputs[n]); });
-    r.voltage = r.inputs.voltage;
+    r.over = r.inputs[r.along] || null;
     r.time = r.t.map(function (t) { return told.time.factor * t; });
-    r.shown = r.measured.map(function (y) { return told.length.factor * y; });
+    r.shown = r.measured.map(function (y) { return r.length.factor * y; });
     r.judged = judged(r);
   });
 
@@ -41,9 +41,11 @@ psaLive.report = function (box, told, run) {
   }
 
   function simulate(r, at, quick, corrects) {
-    var found = run({values: at, t: r.t, inputs: r.inputs, deviation: r.deviation, settle: true, rest: r.rest, quick: quick});
+    var found = run({
+      values: at, t: r.t, inputs: r.inputs, deviation: r.deviation, start: r.start, hold: r.hold, settle: true, rest: r.rest, quick: quick
+    });
     if (found.status) { return found; }
-    var y = found.outputs[told.shown];
+    var y = found.outputs[r.output || told.shown];
     for (var k = 0; k < y.length; k += 1) { y[k] += corrects && r.correction ? r.correction[k] : 0; }
     return {status: 0, way: found.way, y: y};
   }
@@ -54,7 +56,7 @@ psaLive.report = function (box, told, run) {
   function answer(r, quick, at, corrects) {
     var now = simulate(r, at || values, quick, corrects === undefined ? corrected.checked : corrects);
     if (now.status) { return now; }
-    var shift = told.design ? 0 : mean(r, missed(r, now.y)) - r.center;
+    var shift = !r.offset ? 0 : mean(r, missed(r, now.y)) - r.center;
     now.y = now.y.map(function (y) { return y + shift; });
     now.residual = missed(r, now.y);
     r.fitted = r.fitted || now.y; // the first run is at the fitted values
@@ -62,12 +64,8 @@ psaLive.report = function (box, told, run) {
   }
 
   // --- what is seen
-  var plots = ['time', 'loop', 'residual'].map(function (name) {
-    return make('div', {className: 'plot', role: 'img', 'aria-label': told.captions[name]});
-  });
-  function figure(k) {
-    return make('figure', {}, [make('figcaption', {text: told.captions[['time', 'loop', 'residual'][k]]}), plots[k]]);
-  }
+  var plots = [0, 1, 2].map(function () { return make('div', {className: 'plot', role: 'img'}); });
+  var figures = plots.map(function (plot) { return make('figure', {}, [make('figcaption', {}), plot]); });
   var legend = make('div', {className: 'legend'});
   told.legend.forEach(function (row) {
     var span = make('span', {text: row[1]});
@@ -76,7 +74,7 @@ psaLive.report = function (box, told, run) {
   });
   var output = make('output', {}), budget = make('div', {className: 'budget'}), status = make('span', {role: 'status'});
 
-  function length(metres) { return +(told.error.factor * metres).toPrecision(3) + ' ' + told.error.unit; }
+  function length(size) { return +(record.error.factor * size).toPrecision(3) + ' ' + record.error.unit; }
 
   function say(now) {
     if (now.status) { output.textContent = 'With these values the model cannot be run: ' + now.reason + '.'; return; }
@@ -107,24 +105,26 @@ psaLive.report = function (box, told, run) {
 
   function draw(now) {
     if (now.status) { return; }
-    var f = told.length.factor, g = told.error.factor, r = record, model = now.y.map(function (y) { return f * y; });
+    var r = record, f = r.length.factor, g = r.error.factor, model = now.y.map(function (y) { return f * y; });
     var held = r.held.map(function (s) { return [r.time[s[0]], r.time[s[1]]]; });
     var was = r.fitted.map(function (y) { return f * y; });
     var moved = knobs.moved().length > 0 || corrected.checked;
     var part = psaLive.stretch(r.time, zoom.reach), time = part(r.time), measured = {colour: '--measured', width: 3};
     function curve(y, look) { return Object.assign({x: time, y: part(y)}, look); }
     psaLive.plot(plots[0], {
-      x: 'time [' + told.time.unit + ']', y: 'displacement [' + told.length.unit + ']', bands: held, reach: zoom.reach, zooms: true,
+      x: 'time [' + told.time.unit + ']', y: r.labels[0], bands: held, reach: zoom.reach, zooms: true,
       curves: [curve(r.shown, measured)].concat(moved ? [curve(was, {colour: '--fitted', width: 1})] : [])
         .concat([curve(model, {colour: '--model'})])
     });
-    psaLive.plot(plots[1], {
-      x: 'voltage [V]', y: 'displacement [' + told.length.unit + ']',
-      curves: [Object.assign({x: part(r.voltage), y: part(r.shown)}, measured), {x: part(r.voltage), y: part(model), colour: '--model', width: 1}]
-    });
+    if (r.over) {
+      psaLive.plot(plots[1], {
+        x: r.labels[1], y: r.labels[0],
+        curves: [Object.assign({x: part(r.over), y: part(r.shown)}, measured), {x: part(r.over), y: part(model), colour: '--model', width: 1}]
+      });
+    }
     var ends = [time[0], time[time.length - 1]];
     psaLive.plot(plots[2], {
-      x: 'time [' + told.time.unit + ']', y: 'difference [' + told.error.unit + ']', bands: held, reach: zoom.reach, zooms: true,
+      x: 'time [' + told.time.unit + ']', y: r.labels[2], bands: held, reach: zoom.reach, zooms: true,
       curves: [curve(now.residual.map(function (e) { return g * e; }), {colour: '--model', width: 1})]
         .concat((r.noise > 0 ? [2, -2] : []).map(function (k) {
           return {x: ends, y: [k * g * r.noise, k * g * r.noise], colour: '--measured', dash: 'dash', width: 1};
@@ -184,6 +184,11 @@ psaLive.report = function (box, told, run) {
     var now = values.slice(), corrects = corrected.checked;
     record = told.records[Number(chosen.value)];
     note.textContent = record.note;
+    figures.forEach(function (node, k) {
+      node.firstChild.textContent = record.captions[k];
+      plots[k].setAttribute('aria-label', record.captions[k]);
+      node.hidden = !record.captions[k];
+    });
     zoom.forget();
     if (!record.fitted) {
       corrected.checked = false;
@@ -223,7 +228,7 @@ psaLive.report = function (box, told, run) {
   [
     make('div', {className: 'bar'}, choice.concat(buttons, [status])), legend,
     psaLive.board([
-      make('div', {className: 'large'}, [figure(0)]), make('div', {className: 'pair'}, [figure(1), figure(2)]), output, budget, note
+      make('div', {className: 'large'}, [figures[0]]), make('div', {className: 'pair'}, [figures[1], figures[2]]), output, budget, note
     ], plots[2], knobs.nodes(function (p) { return p.determined; }, switches))
   ].forEach(function (n) { box.appendChild(n); });
   choose();

@@ -1,32 +1,44 @@
 """A model that runs in a page: its module and variables, the records that it runs on."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
 from psa_casadi.export.web import begun_module
+from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import record_start
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
+from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.fit_words import determined
-from psa_casadi.report.words.phrases import added, handy_scale, length_scale, plain, shown_in
+from psa_casadi.report.words.phrases import (
+    added,
+    handy_scale,
+    in_brackets,
+    length_scale,
+    plain,
+    shown_in,
+)
 from psa_casadi.report.words.series import Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
 from psa_casadi.simulation.simulate import output_of
+from psa_casadi.simulation.start import is_stack
 from psa_casadi.units import convert
 from psa_casadi.variables import Output, Parameter, State
 
@@ -49,11 +61,13 @@ _NO_BOUND = 1e300
 
 @dataclass(frozen=True, eq=False)
 class LiveRecord:
-    """A record that a model runs on, with the model's curve, as it was fitted, as its last.
+    """An output of a record that a model runs on, with the model's curve, as fitted, as its last.
 
-    `inputs` are arrays (n,) in SI units by name. `deviation` holds the start of states off where
-    the voltage puts them, `floor` the noise that errors are judged by, `correction` what an unnamed
-    correction adds. It begins in motion, or at `rest`.
+    `inputs` are arrays (n,) in SI units by name, between samples as `hold` says; a loop is drawn
+    over the one `along`. `deviation` holds the start of states off where a stack's voltage puts
+    them, any other model begins at the states `start` (nx,). A sensor with an `offset` has it found
+    again. `floor` is the noise that errors are judged by, `correction` what an unnamed correction
+    adds. It begins in motion, or at `rest`.
     """
 
     series: Series
@@ -62,10 +76,15 @@ class LiveRecord:
     floor: float = 0.0
     correction: FloatArray | None = None
     rest: bool = False
+    output: str = ""
+    along: str = "voltage"
+    start: FloatArray | None = None
+    hold: Hold = "linear"
+    offset: bool = True
 
     @property
     def residual(self) -> FloatArray:
-        """What the model leaves as it was fitted [m]."""
+        """What the model leaves as it was fitted."""
         return self.series.residual(self.series.curves[-1])
 
 
@@ -92,35 +111,54 @@ class LiveModel:
         shown = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
         first, counts = shown[0].series, any(r.series.counts for r in self.records)
         largest = max(float(np.nanmax(np.abs(r.residual))) for r in shown)
-        scales = {
-            "time": first.time_scale,
-            "length": handy_scale(first.span, counts=counts),
-            "error": length_scale(largest or 1e-2 * first.span, counts=counts),
-        }
+        length = handy_scale(first.span, counts=counts)
+        error = length_scale(largest or 1e-2 * first.span, counts=counts)
+        limit, rows = _SAMPLES // len(shown), []
+        for r in shown:
+            s = r.series  # of a stack all records have the same units
+            scales = {"length": length, "error": error}
+            if s.unit:
+                scales = {"length": s.scale, "error": s.residual_scale}
+            words = {
+                "captions": [
+                    f"{s.title} over time",
+                    f"{s.title} over {r.along}" if r.along else "",
+                    f"{self.aim} minus model".capitalize(),
+                ],
+                "labels": [
+                    in_brackets(s.quantity, scales["length"].unit),
+                    s.against,
+                    in_brackets("difference", scales["error"].unit),
+                ],
+            }
+            told = {n: {"unit": q.unit, "factor": q.factor} for n, q in scales.items()}
+            rows.append({**_record(r, limit, self.design), **told, **words})
         return {
             "kind": "report",
             **live_data(self.model, module),
-            "records": [_record(r, _SAMPLES // len(shown), self.design) for r in shown],
-            **{name: {"unit": s.unit, "factor": s.factor} for name, s in scales.items()},
+            "records": rows,
+            "time": {"unit": first.time_scale.unit, "factor": first.time_scale.factor},
             "extended": self.extended,
             "design": self.design,
             "aim": self.aim,
             "correction": self.correction,
             "legend": [["--measured", self.aim], ["--model", "model"], ["--fitted", "as it was"]],
-            "captions": {
-                "time": "Displacement over time",
-                "loop": "Displacement over voltage",
-                "residual": f"{self.aim} minus model".capitalize(),
-            },
         }
 
     def cure(self) -> str:
-        """Return what would make the model run in the page."""
+        """Return why the model does not run in the page, and what would make it."""
+        if self.model.structure.foreign:
+            return "It is an imported FMU, of which a page has no equations."
+        if self.model.sampled_names:
+            return "It has sampled states, which no page runs."
         return "" if has_zig() else f"It takes a compiler: {INSTALL_ZIG}"
 
 
-def live_diagnosis(d: Diagnosis, rows: Sequence[Series]) -> LiveModel:
-    """Begin what makes the model of a diagnosis alive; `rows` are its `series_of`."""
+def live_diagnosis(d: Diagnosis | OdeDiagnosis, rows: Sequence[Series]) -> LiveModel:
+    """Begin what makes the model of a diagnosis alive; `rows` are its series."""
+    if not isinstance(d, Diagnosis):
+        records = _fitted_records(d.model, d.extended_fit, d.experiments, rows)
+        return LiveModel(d.model, begun_module(d.model), records, extended=added(d))
     patch = d.patch
     beyond = (
         [] if patch is None else [p - x for p, x in zip(patch.predicted, d.extended, strict=True)]
@@ -137,7 +175,7 @@ def live_diagnosis(d: Diagnosis, rows: Sequence[Series]) -> LiveModel:
 
 
 def live_fit(found: Identification, rows: Sequence[Series]) -> LiveModel:
-    """Begin what makes the model of an identification alive; `rows` are its `series_of_fit`."""
+    """Begin what makes the model of an identification alive; `rows` are its series."""
     records = _fitted_records(found.model, found.fit, found.experiments, rows)
     return LiveModel(found.model, begun_module(found.model), records)
 
@@ -174,21 +212,41 @@ def _fitted_records(
 
     `share` is what counts of each record's noise where errors are judged.
     """
-    theta = fit.placed(experiments)
+    theta, stack = fit.placed(experiments), is_stack(model)
     rows = []
-    for k, (e, s) in enumerate(zip(experiments, series, strict=True)):
-        columns = {n: getattr(e.record, n, None) for n in model.input_names}
-        inputs = {n: v for n, v in columns.items() if v is not None}
+    places = [(k, 0) for k, _ in enumerate(series)] if stack else _places(experiments, series)
+    for n, ((k, j), s) in enumerate(zip(places, series, strict=True)):
+        e, channel = experiments[k], experiments[k].channels[j]
+        columns = {i: e.record.column(i) for i in model.input_names}
+        inputs = {i: v for i, v in columns.items() if v is not None}
         deviation = fit.unknowns.start(theta, k)
-        correction = beyond[k] if beyond else None
-        rows.append(LiveRecord(s, inputs, deviation, share * s.noise, correction))
+        row = LiveRecord(s, inputs, deviation, share * s.noise, beyond[n] if beyond else None)
+        if not stack:
+            row = replace(
+                row, deviation={}, start=record_start(model, e.record, deviation),
+                output=channel.outputs[0], along=varied(model, e) or "", hold=e.record.hold,
+                offset=channel.offset,
+            )  # fmt: skip
+        rows.append(row)
     return rows
+
+
+def _places(
+    experiments: Sequence[Experiment], series: Sequence[Series]
+) -> Iterator[tuple[int, int]]:
+    """Yield the numbers of experiment and channel of every series, which are in their order."""
+    left = iter(product(range(len(experiments)), range(len(experiments[0].channels))))
+    for s in series:
+        for k, j in left:
+            if np.array_equal(experiments[k].measured(j), s.measured, equal_nan=True):
+                yield k, j
+                break
 
 
 def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
     """Return a record as a page holds it, in SI units, its time from its own first sample on."""
     s = r.series
-    part, note = thinned(s.time, r.inputs["voltage"], limit)
+    part, note = thinned(s.time, [*r.inputs.values()], limit)
     t = s.time[part] - s.time[0]
     residual = r.residual[part]
     fitted = np.isfinite(residual) & ~s.held_out[part]
@@ -204,6 +262,11 @@ def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
         "held": spans(s.held_out[part]),
         "center": float(np.mean(residual[fitted])) if fitted.any() else 0.0,
         "deviation": dict(r.deviation),
+        "start": None if r.start is None else r.start.tolist(),
+        "hold": r.hold,
+        "output": r.output,
+        "along": r.along,
+        "offset": r.offset and not design,
         "noise": s.noise,
         "floor": r.floor or s.noise,
         "rest": r.rest,
@@ -213,10 +276,10 @@ def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
     }
 
 
-def thinned(t: FloatArray, v: FloatArray, limit: int) -> tuple[IndexArray, str]:
+def thinned(t: FloatArray, inputs: Sequence[FloatArray], limit: int) -> tuple[IndexArray, str]:
     """Return at most `limit` samples of a record and what must be said of them.
 
-    Every so-manieth one if the voltage is straight between them, else those of the beginning: a
+    Every so-manieth one if the inputs are straight between them, else those of the beginning: a
     model's answer to a voltage with its corners cut is that to another voltage.
     """
     n = len(t)
@@ -225,8 +288,8 @@ def thinned(t: FloatArray, v: FloatArray, limit: int) -> tuple[IndexArray, str]:
     every = -(-n // limit)
     part = np.arange(0, n, every)
     last = part[-1] + 1
-    off = np.abs(np.interp(t[:last], t[part], v[part]) - v[:last])
-    if float(np.max(off)) <= _BENT * float(np.ptp(v)):
+    off = [np.max(np.abs(np.interp(t[:last], t[part], v[part]) - v[:last])) for v in inputs]
+    if all(most <= _BENT * float(np.ptp(v)) for most, v in zip(off, inputs, strict=True)):
         return part, f"Of {n} samples each {every}th is here; the model runs on these."
     return np.arange(limit), f"Of {n} samples these are the first {limit}."
 

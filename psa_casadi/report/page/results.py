@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.any_model.result import OdeDiagnosis
+from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis, OdeDiagnosis
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import StackIdentification
@@ -22,7 +22,7 @@ from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
 from psa_casadi.report.plots import findings, records
 from psa_casadi.report.plots.figures import posterior_figure, record_figure, size_sentence
-from psa_casadi.report.words import fit_words, own_words, phrases, tables, text, verdict_words
+from psa_casadi.report.words import fit_words, phrases, tables, text, verdict_words
 from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.report.words.misfit_words import AXES, weight
 from psa_casadi.report.words.phrases import added, lowered, number, plain
@@ -42,8 +42,13 @@ _MOST_SAMPLES = 13_000
 MOST_RECORDS = 16
 #: Causes whose signatures are drawn, views of residuals, records and sentences that are listed.
 _SIGNATURES, _VIEWS, _TOLD_RECORDS, _TOLD = 3, 3, 4, 6
-#: Of an own model: outputs whose errors are drawn, series that are told, effects with bars.
-_OWN_OUTPUTS, _OWN_SERIES, _OWN_EFFECTS = 4, 4, 16
+#: Of any model: outputs whose errors are drawn, series that are told, effects with bars.
+_OUTPUTS, _SERIES, _EFFECTS = 4, 4, 16
+#: What a page shows of a stack, or of some diagnoses alone.
+_OF_STACK = (
+    "stack", "answers", "views", "splits", "signatures", "columns", "gained", "blind", "noise",
+    "moved", "most", "excess", "patch",
+)  # fmt: skip
 #: Views that say much the same: one of each family is drawn.
 _FAMILIES = {
     "displacement": "voltage",
@@ -66,7 +71,7 @@ _STATUSES = {
 
 
 def write_report(
-    diagnosis: Diagnosis | OdeDiagnosis,
+    diagnosis: OdeDiagnosis,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -78,16 +83,11 @@ def write_report(
     `origin`, "measured" or "synthetic", is what the page calls the records; `model_file` is where
     the extended model was written, which the commands of the page read. Unless it is to be
     `still`, the model runs in the page: sliders for its parameters, switches for its effects. The
-    page is below 3 MB; where scripts are off it has one still picture. That of a model of one's
-    own holds no model that runs.
+    page is below 3 MB; where scripts are off it has one still picture.
 
     Raises InputError when `path` cannot be written to.
     """
-    if isinstance(diagnosis, OdeDiagnosis):
-        page = _own_page(diagnosis)
-    else:
-        page = _diagnosis_page(diagnosis, origin, still, model_file)
-    atomic_write(path, page)
+    atomic_write(path, _diagnosis_page(diagnosis, origin, still, model_file))
 
 
 def write_fit_report(
@@ -102,77 +102,151 @@ def write_fit_report(
 
     It shows what the records determine, measured and model, and what the residual is.
     `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. Unless it is to be `still`, the model runs in the page; that of one's
-    own does not.
+    beside the determinacy. Unless it is to be `still`, the model runs in the page.
 
     Raises InputError when `path` cannot be written to.
     """
+    series = series_of_fit(found)
     if not isinstance(found, StackIdentification):
-        page = _own_fit_page(found)
+        page = render(
+            "fit.html",
+            f"Identification of {plain(found.model.name)}",
+            **_shared(found.model, series, found.experiments, origin),
+            found=found,
+            verdict=text.fit_sentence(found),
+            tiles=(),
+            live=None if still else live_fit(found, series),
+            determined=(),
+            profiles=(),
+            starts=(),
+            statuses={},
+            errors=tables.fit_error_table(
+                series, [residual_figures(s, s.curves[0]) for s in series]
+            ),
+        )
     else:
-        series = series_of_fit(found)
         live = None if still else live_fit(found, series)
         page = fit_page(found, series, origin=origin, profiles=profiles, live=live)
     atomic_write(path, page)
 
 
-def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | None) -> str:
-    scale = phrases.scale_of(d.experiments, d.base_errors.holdout_rms_m)
-    with phrases.one_unit(scale):
-        series = series_of(d)
-        live = None if still else live_diagnosis(d, series)  # compiles beside what follows
-        span = max(e.record.range_m for e in d.experiments)
-        answers = (("Remains", phrases.rest_sentence(d)), ("Next", d.next_experiment.why))
-        gained = (
-            verdict_words.gain_sentence(d) if added(d) else "nothing was added to the base model"
-        )
-        e, x = d.base_errors, d.extended_errors
-        return render(
-            "diagnosis.html",
-            f"Diagnosis: {verdict_words.VERDICTS[d.verdict]}",
-            **_shared(d.model, series, d.experiments, origin),
-            **_diagnosed(d),
-            verdict=verdict_words.verdict_sentence(d),
-            advice=what_now(d, model_file),
-            range=phrases.handy_scale(span, counts=scale.unit == "counts").text(span),
-            errors=_bars(d, e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m, scale.text),
-            sources=phrases.listing(list(dict.fromkeys(n.source for n in d.noise))),
-            answers=[f"{label}: {text}" for label, text in answers if text],
-            **_budget(d),
-            live=live,
-            wrong=[
-                [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -weight(m))]
-                for misfits in (d.misfit, d.remainder)
-            ],
-            most_records=_TOLD_RECORDS,
-            views=[p for m, name in drawn(d.misfit) if (p := _data_view(d, m, name)) is not None],
-            splits=[
-                (m.record, table)
-                for m in d.misfit[:_TOLD_RECORDS]
-                if (table := split_table(m, *_compared(d, m))) is not None
-            ],
-            evidence=findings.evidence_plot(d),
-            signatures=[s for c in d.causes[:_SIGNATURES] if (s := _signature(d, c.effect))],
-            causes=[
-                (
-                    c,
-                    verdict_words.cause_size(d, c),
-                    [
-                        f"{phrases.raised(verdict_words.alternative_sentence(d, a))}."
-                        for a in d.alternatives
-                        if a.cause == c.effect
-                    ],
-                )
-                for c in d.causes
-            ],
-            columns=tables.column_table(d),
-            gained=f"{phrases.raised(gained)}.",
-            own_voltages=(
-                verdict_words.OWN_VOLTAGES if added(d) and not d.gain.held_out_records else ""
-            ),
-            gain=tables.error_table(d, series[0].residual_scale),
-            blind=tables.blind_table(d),
-        )
+def _diagnosis_page(d: OdeDiagnosis, origin: str, still: bool, model_file: str | None) -> str:
+    stack = d if isinstance(d, Diagnosis) else None
+    if stack is None:
+        return _page(d, None, origin, still, model_file)
+    with phrases.one_unit(phrases.scale_of(d.experiments, stack.base_errors.holdout_rms_m)):
+        return _page(d, stack, origin, still, model_file)
+
+
+def _page(
+    d: OdeDiagnosis, stack: Diagnosis | None, origin: str, still: bool, model_file: str | None
+) -> str:
+    series, effects = series_of(d), {c.name: c for c in d.model.components}
+    live = None if still else live_diagnosis(d, series)  # compiles meanwhile
+    gain = tables.error_table(d, series[0].residual_scale)
+    by_record = len(d.experiments) > 1 and not stack
+    about = f" of {plain(d.model.name)}" if not stack else ""
+    none = dict.fromkeys(_OF_STACK, ())
+    return render(
+        "diagnosis.html",
+        f"Diagnosis{about}: {verdict_words.VERDICTS[d.verdict]}",
+        **_shared(d.model, series, d.experiments, origin),
+        **{**none, **_budget(d), **(_of_stack(stack) if stack else _of_any(d, series))},
+        d=d,
+        added=added(d),
+        verdict=verdict_words.verdict_sentence(d),
+        advice=what_now(d, model_file),
+        live=live,
+        most_records=_TOLD_RECORDS,
+        evidence=findings.evidence_plot(d, None if stack else _EFFECTS),
+        causes=[
+            {
+                "cause": c,
+                "effect": effects[c.effect],
+                "size": verdict_words.cause_size(d, c),
+                "parameters": tables.parameter_table(d.model, only=c.parameters),
+                "alternatives": _alternatives(stack, c) if stack else [],
+            }
+            for c in d.causes
+        ],
+        gain=[gain, tables.record_error_table(series)] if by_record else [gain],
+        rest=phrases.rest_sentence(d),
+        candidates=tables.candidate_table(d),
+    )
+
+
+def _alternatives(d: Diagnosis, cause: Cause) -> list[str]:
+    """Say which models have another effect in a cause's place."""
+    own = [a for a in d.alternatives if a.cause == cause.effect]
+    return [f"{phrases.raised(verdict_words.alternative_sentence(d, a))}." for a in own]
+
+
+def _of_any(d: OdeDiagnosis, series: Sequence[Series]) -> dict[str, Any]:
+    """Return what the page shows of a model that is no stack."""
+    rows = [(s, residual_figures(s, s.curves[0])) for s in series]
+    rows.sort(key=lambda row: -row[1].range_share)
+    wrong = [
+        f"{s.name}: {fit_words.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
+        for s, f in rows[:_SERIES]
+    ]
+    return {
+        "errors": [
+            {
+                "caption": f"{e.output}: error on held-out samples, rms",
+                "rows": _bars(
+                    d, e.base, e.extended, e.noise, partial(phrases.with_its_unit, unit=e.unit)
+                ),
+                "noise": e.noise,
+                "note": "",
+            }
+            for e in d.errors[:_OUTPUTS]
+        ],
+        "wrong": [[[d.missed.where, *wrong]], []],
+        "most": _EFFECTS,
+        "moved": d.moved,
+    }
+
+
+def _of_stack(d: Diagnosis) -> dict[str, Any]:
+    """Return what the page shows of a stack alone."""
+    span = max(e.record.range_m for e in d.experiments)
+    e, x = d.base_errors, d.extended_errors
+    scale = phrases.scale_of(d.experiments, e.holdout_rms_m)
+    reach = phrases.handy_scale(span, counts=scale.unit == "counts").text(span)
+    sources = phrases.listing(list(dict.fromkeys(n.source for n in d.noise)))
+    answers = (("Remains", phrases.rest_sentence(d)), ("Next", d.next_experiment.why))
+    gained = verdict_words.gain_sentence(d) if added(d) else "nothing was added to the base model"
+    own_voltages = added(d) and not d.gain.held_out_records
+    return {
+        "stack": True,
+        "errors": [
+            {
+                "caption": f"Error on held-out samples, rms; the displacement's range is {reach}",
+                "rows": _bars(d, e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m, scale.text),
+                "noise": d.noise_floor_rms_m,
+                "note": f" It is estimated from: {sources}." if sources else "",
+            }
+        ],
+        "answers": [f"{label}: {text}" for label, text in answers if text],
+        "wrong": [
+            [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -weight(m))]
+            for misfits in (d.misfit, d.remainder)
+        ],
+        "views": [p for m, name in drawn(d.misfit) if (p := _data_view(d, m, name)) is not None],
+        "splits": [
+            (m.record, table)
+            for m in d.misfit[:_TOLD_RECORDS]
+            if (table := split_table(m, *_compared(d, m))) is not None
+        ],
+        "signatures": [s for c in d.causes[:_SIGNATURES] if (s := _signature(d, c.effect))],
+        "columns": tables.column_table(d) if d.columns else None,
+        "gained": [
+            f"{phrases.raised(gained)}.",
+            *([verdict_words.OWN_VOLTAGES] if own_voltages else []),
+        ],
+        "blind": tables.blind_table(d),
+        "noise": [n.sentence for n in d.noise],
+    }
 
 
 def fit_page(
@@ -219,70 +293,10 @@ def fit_page(
                 )
                 for p in profiles
             ],
-            starts=tables.starts_table(found.starts, scale),
+            starts=tables.starts_table(found.starts, scale) if found.starts else (),
             statuses=_STATUSES,
-            errors=tables.fit_error_table(
-                [(s.name, f) for s, f in zip(series, figures, strict=True)], scale
-            ),
+            errors=tables.fit_error_table(series, figures),
         )
-
-
-def _own_page(d: OdeDiagnosis) -> str:
-    series = own_words.own_series(d)
-    rows = [(s, residual_figures(s, s.curves[0])) for s in series]
-    rows.sort(key=lambda row: -row[1].range_share)
-    free = d.correction
-    effects = {c.name: c for c in d.model.components}
-    gain, by_record = own_words.own_error_tables(d, series)
-    return render(
-        "own_diagnosis.html",
-        f"Diagnosis of {plain(d.model.name)}: {verdict_words.VERDICTS[d.verdict]}",
-        **_shared(d.model, series, d.experiments, "measured"),
-        **_diagnosed(d),
-        verdict=own_words.own_verdict_sentence(d),
-        advice=what_now(d),
-        errors=[
-            (
-                e.output,
-                _bars(
-                    d, e.base, e.extended, e.noise, partial(own_words.with_its_unit, unit=e.unit)
-                ),
-                e.noise,
-            )
-            for e in d.errors[:_OWN_OUTPUTS]
-        ],
-        budget=own_words.own_budget_table(d) if added(d) or free else None,
-        free=None
-        if free is None
-        else Picture(
-            f"Unnamed correction: what it adds to {free.port}, over {free.variable}",
-            findings.free_plot(free),
-        ),
-        wrong=[
-            f"{s.name}: {fit_words.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
-            for s, f in rows[:_OWN_SERIES]
-        ],
-        evidence=findings.evidence_plot(d, _OWN_EFFECTS),
-        most=_OWN_EFFECTS,
-        causes=[
-            (c, effects[c.effect], share.text, tables.parameter_table(d.model, only=c.parameters))
-            for c, share in zip(d.causes, d.budget.causes, strict=True)
-        ],
-        gain=gain,
-        by_record=by_record,
-    )
-
-
-def _own_fit_page(found: Identification) -> str:
-    series = own_words.own_fit_series(found)
-    return render(
-        "own_fit.html",
-        f"Identification of {plain(found.model.name)}",
-        **_shared(found.model, series, found.experiments, "measured"),
-        found=found,
-        verdict=own_words.own_fit_sentence(found),
-        errors=own_words.own_fit_table(found, series),
-    )
 
 
 def write_posterior(found: Posterior, path: str | os.PathLike[str]) -> None:
@@ -352,16 +366,6 @@ def _shared(
     }
 
 
-def _diagnosed(d: Diagnosis | OdeDiagnosis) -> dict[str, Any]:
-    """Return what both pages of diagnoses show."""
-    return {
-        "d": d,
-        "added": added(d),
-        "rest": phrases.rest_sentence(d),
-        "candidates": tables.candidate_table(d),
-    }
-
-
 def points_each(count: int) -> int:
     """Return how many samples of each record may be drawn, so that the page stays below 3 MB."""
     return _MOST_SAMPLES // min(MOST_RECORDS, max(1, count))
@@ -406,7 +410,7 @@ def _part(
 
 
 def _bars(
-    d: Diagnosis | OdeDiagnosis,
+    d: OdeDiagnosis,
     base: float,
     extended: float,
     noise: float,
@@ -418,25 +422,20 @@ def _bars(
     return [(*row, text(row[1])) for row in rows]
 
 
-# A diagnosis of a stack
-
-
-def _budget(d: Diagnosis) -> dict[str, Any]:
+def _budget(d: OdeDiagnosis) -> dict[str, Any]:
     """Return the error budget, and what the unnamed correction adds."""
-    b = d.budget
-    if b is None or b.excess_rms_m <= 0.0:
+    b, excess, patch = d.budget, None, None
+    if isinstance(b, StackBudget):
+        if b.excess_rms_m <= 0.0:
+            return {"budget": None}
+        excess = phrases.scale_of(d.experiments, b.excess_rms_m).text(b.excess_rms_m)
+    elif not added(d) and d.patch is None:
         return {"budget": None}
-    scale = phrases.scale_of(d.experiments, b.excess_rms_m)
-    patch = None
     if d.patch is not None:
-        coordinate, plot = findings.patch_plot(d, d.patch)
-        caption = f"Unnamed correction: {d.patch.name}, over the {coordinate}"
+        coordinate, plot = findings.correction_plot(d, d.patch)
+        caption = f"Unnamed correction: {d.patch.name}, over {coordinate}"
         patch = {"text": verdict_words.patch_text(d.patch), "picture": Picture(caption, plot)}
-    return {
-        "budget": verdict_words.budget_table(d, scale),
-        "excess": scale.text(b.excess_rms_m),
-        "patch": patch,
-    }
+    return {"budget": verdict_words.budget_table(d), "excess": excess, "patch": patch}
 
 
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:

@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
@@ -27,7 +26,6 @@ from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
 from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.misfit_words import AXES
-from psa_casadi.report.words.own_words import own_fit_series, own_series
 from psa_casadi.report.words.series import (
     FloatArray,
     Series,
@@ -41,7 +39,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
-Compared = Diagnosis | Identification | OdeDiagnosis
+Compared = OdeDiagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals
 
 #: What all pictures share.
@@ -58,6 +56,8 @@ _STILL_ROOM = {
 #: Samples of a record, bars of effects for which there is room, parameters and their bins.
 _MOST_POINTS, _MOST_BARS, _MOST_PARAMETERS, _BINS = 8000, 9, 12, 40
 _COLUMNS = 4
+#: Outputs or columns of a record in one picture.
+_MOST_ROWS = 8
 #: A legend above the plot, beside its title, and one over the curves.
 _ABOVE = {
     "fontsize": FONT - 1.5, "ncols": 4, "loc": "lower right", "bbox_to_anchor": (1.0, 0.98),
@@ -101,8 +101,11 @@ def figure_of(result: Plotted) -> Figure:
     if isinstance(result, Posterior):
         return posterior_figure(result)
     if isinstance(result, Signals):
-        return one_output(result, None, None)
-    return record_figure(most_telling(_series(result)))
+        return columns_figure(result)
+    series = _series(result)
+    worst = most_telling(series)
+    same = [s for s in series if s.record == worst.record]
+    return outputs_figure(same) if len(same) > 1 else record_figure(worst)
 
 
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
@@ -129,6 +132,30 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     if s.against:
         draw(figure.add_subplot(grid[0, 2]), records.loop_plot(s, origin, shown), "Loop")
     _draw_residual(figure.add_subplot(grid[1, :]), s, origin)
+    return figure
+
+
+def outputs_figure(outputs: Sequence[Series], *, origin: str = "measured") -> Figure:
+    """Return the picture of several outputs of one record: measured against model, residual."""
+    outputs = outputs[:_MOST_ROWS]
+    figure = sheet((12.0, 2.6 * len(outputs)), 80)
+    grid = figure.subplots(len(outputs), 2, width_ratios=(1.6, 1.0), squeeze=False)
+    for s, (left, right) in zip(outputs, grid, strict=True):
+        shown = records.samples(s, _MOST_POINTS)
+        draw(left, records.measured_plot(s, origin, shown), s.title, legend=_ABOVE)
+        left.margins(x=0.01)
+        draw(right, records.residual_plot(s, shown), f"Residual of {s.title}")
+        right.margins(x=0.01)
+    figure.suptitle(f"{origin} record: {outputs[0].record}", fontsize=FONT)
+    return figure
+
+
+def columns_figure(record: Signals) -> Figure:
+    """Return the picture of all columns of a record over time, the one to show first."""
+    names = [record.shown, *(n for n in record.columns if n != record.shown)][:_MOST_ROWS]
+    figure = sheet((9.0, max(4.5, 2.2 * len(names))), 100)
+    for name, axes in zip(names, np.ravel(figure.subplots(len(names), 1)), strict=True):
+        _curve(axes, record.time, record.columns[name], name, record.units.get(name, ""))
     return figure
 
 
@@ -260,11 +287,7 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
-    if isinstance(result, Diagnosis):
-        return series_of(result)
-    if isinstance(result, StackIdentification):
-        return series_of_fit(result)
-    return own_series(result) if isinstance(result, OdeDiagnosis) else own_fit_series(result)
+    return series_of(result) if isinstance(result, OdeDiagnosis) else series_of_fit(result)
 
 
 def _chosen(output: str | None, there: Collection[str], usual: str) -> str:

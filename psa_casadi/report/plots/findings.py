@@ -1,14 +1,13 @@
 """What is found: evidence of effects, views of a residual, signatures, what is determined."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from psa_casadi.any_model.result import FreeFunction
+from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
 from psa_casadi.diagnosis.misfit import Misfit, Spectrum
-from psa_casadi.diagnosis.patch import Patch
-from psa_casadi.diagnosis.result import Candidate, Diagnosis
+from psa_casadi.diagnosis.result import Candidate, OdeDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.diagnosis.views import View
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
@@ -19,9 +18,6 @@ from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.series import FloatArray, bar_colour
 from psa_casadi.units import convert
-
-if TYPE_CHECKING:  # which take long to load
-    from psa_casadi.any_model.result import OdeDiagnosis
 
 _DEGREE_COLOURS: dict[Degree, str] = {
     "determined": colours.EXTENDED,
@@ -44,7 +40,7 @@ _TOP = 2.5
 _PARABOLA_POINTS = 81
 
 
-def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Panel:
+def evidence_plot(d: OdeDiagnosis, most: int | None = None) -> Panel:
     """One bar for every effect that was tried; text says the share of the excess it explains.
 
     Named causes come first, with their confidence. Of many, the first and most telling ones where
@@ -72,7 +68,7 @@ def evidence_plot(d: "Diagnosis | OdeDiagnosis", most: int | None = None) -> Pan
     )
 
 
-def _figure(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
+def _figure(candidate: Candidate, d: OdeDiagnosis) -> str:
     """Return how sure a named cause is, the probability of others; else the share it explains."""
     named = next((c for c in d.causes if c.effect == candidate.effect), None)
     if named is not None:
@@ -158,43 +154,46 @@ def _ends(values: FloatArray) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def patch_plot(d: Diagnosis, patch: Patch) -> tuple[str, Panel]:
-    """Return the coordinate's name and what an unnamed correction adds over it.
+def correction_plot(d: OdeDiagnosis, c: Correction) -> tuple[str, Panel]:
+    """Return over what, and what an unnamed correction adds.
 
-    That is of the record to which most is added.
+    Of a stack it is that of the record to which most is added, of any other model that of all.
     """
-    k = max(range(len(patch.added)), key=lambda i: float(np.std(patch.added[i])))
-    e, added = d.experiments[k], patch.added[k] - np.mean(patch.added[k])
+    if isinstance(c, FreeFunction):
+        part = slice(None, None, max(1, len(c.along) // _SAMPLES))
+        seen = phrases.prefixed_scale(
+            float(np.max(np.abs(c.along), initial=0.0)), c.variable_unit or "1"
+        )
+        scale = phrases.prefixed_scale(float(np.max(np.abs(c.added), initial=0.0)), c.unit)
+        x, y = (
+            phrases.in_brackets(*row) for row in ((c.variable, seen.unit), ("added", scale.unit))
+        )
+        plot = Panel(x, y, 320)
+        return c.variable, plot.marks(
+            seen.factor * c.along[part], scale.factor * c.added[part], size=3
+        )
+    if not isinstance(c, Patch):
+        raise TypeError(type(c))
+    k = max(range(len(c.added)), key=lambda i: float(np.std(c.added[i])))
+    e, added = d.experiments[k], c.added[k] - np.mean(c.added[k])
     counts = e.record.displacement_unit == "counts"
     scale = phrases.length_scale(float(np.max(np.abs(added), initial=1e-12)), counts=counts)
-    curved = patch.kind in ("curve", "direction", "memory")
-    if patch.kind == "curve" and patch.port != "drive voltage":
+    curved = c.kind in ("curve", "direction", "memory")
+    if c.kind == "curve" and c.port != "drive voltage":
         unit, size = ("counts", 1.0) if counts else ("µm", 1e6)
-        x, name = size * d.extended[k], "predicted displacement"
+        at, name = size * d.extended[k], "predicted displacement"
     elif curved:
-        x, name, unit = e.record.voltage, "voltage", "V"
+        at, name, unit = e.record.voltage, "voltage", "V"
     else:
-        x, name, unit = e.record.time - e.record.time[0], "time", "s"
-    part = slice(None, None, max(1, len(x) // _SAMPLES))
+        at, name, unit = e.record.time - e.record.time[0], "time", "s"
+    part = slice(None, None, max(1, len(at) // _SAMPLES))
     plot, shown = (
         Panel(f"{name} [{unit}]", f"added [{scale.unit}]", 320),
         scale.factor * added[part],
     )
     if curved:
-        return name, plot.marks(x[part], shown, size=3)
-    return name, plot.line(x[part], shown, width=1.5)
-
-
-def free_plot(f: FreeFunction) -> Panel:
-    """Plot what a free function of a model's port adds, over the variable that it follows most."""
-    part = slice(None, None, max(1, len(f.along) // _SAMPLES))
-    x, y = f.along[part], f.added[part]
-    seen = phrases.prefixed_scale(float(np.max(np.abs(x), initial=0.0)), f.variable_unit or "1")
-    scale = phrases.prefixed_scale(float(np.max(np.abs(y), initial=0.0)), f.unit)
-    plot = Panel(
-        phrases.in_brackets(f.variable, seen.unit), phrases.in_brackets("added", scale.unit), 320
-    )
-    return plot.marks(seen.factor * x, scale.factor * y, size=3)
+        return f"the {name}", plot.marks(at[part], shown, size=3)
+    return f"the {name}", plot.line(at[part], shown, width=1.5)
 
 
 def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:

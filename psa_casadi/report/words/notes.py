@@ -1,13 +1,14 @@
 """The sentences of notes: what each code says, with the note's values in its places."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from string import Formatter
 from typing import Any
 
+from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
-from psa_casadi.report.words.own_words import OWN_MODELS
 from psa_casadi.report.words.phrases import (
     are,
     listing,
@@ -57,7 +58,9 @@ def correction(kind: str, port: str) -> str:
     return CORRECTIONS.get(kind) or CORRECTIONS.get(f"{kind} at {port}", kind)
 
 
-def _withdrawn(names: Sequence[str], evidence: float, share: float, kept: bool, why: Note) -> str:
+def _withdrawn(
+    names: Sequence[str], evidence: float, share: float, output: str, kept: bool, why: Note
+) -> str:
     remove = "would remove"
     if kept:
         they = "it removes" if len(names) == 1 else "they remove"
@@ -65,8 +68,8 @@ def _withdrawn(names: Sequence[str], evidence: float, share: float, kept: bool, 
     joint = ": " if why.code == "better_unnamed" else ", because "
     return (
         f"{', '.join(names)}: found with a ln of the Bayes factor over the base of {evidence:.0f},"
-        f" {remove} {100 * share:.0f} % of the held-out error above the noise; not"
-        f" named{joint}{why}."
+        f" {remove} {100 * share:.0f} % of the held-out error{f' of {output}' * bool(output)} above"
+        f" the noise; not named{joint}{why}."
     )
 
 
@@ -199,15 +202,16 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
     "vague": "{names}: in the extended model and not named: {why}.",
     "better_unnamed": lambda each: (
         "beside the model without it, an unnamed correction explains more ("
-        + "; ".join(f"{correction(kind, port)}, instead of {name}" for kind, port, name in each)
+        + "; ".join(f"{what}, instead of {name}" for what, name in each)
         + ")"
     ),
-    "beaten": lambda by, port, evidence, share: (
-        f"an unnamed correction explains more: {correction(by, port)}, with {evidence:.0f} and"
-        f" {100 * share:.0f} %"
-    ),
+    "beaten": ("an unnamed correction explains more: {by}, with {evidence:.0f} and {share:.0p} %"),
     "little": "that is less than {least:.0p} % and much remains",
     "correction": correction,
+    "free": "a free function of {of} in {port}",
+    "would_remove": lambda what, share: (
+        f"{raised(str(what))} would remove {100 * share:.0f}% of what is left above the noise."
+    ),
     "blind_spot": (
         "These records show {effect} only from {smallest:.3g} on ({gain}), while {ordinary:.3g} is"
         " an ordinary size."
@@ -255,6 +259,74 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " another. Measure the displacement with a second sensor (column displacement_2) or the"
         " load's force (load_force), elsewhere in the range of this sensor, or without the load;"
         " or sample fast enough to excite and see the resonances."
+    ),
+}
+
+
+def _identification(found: Identification) -> str:
+    """Return the parameters with their standard errors, and what is left of the outputs."""
+    model = found.model
+    rows = [
+        f"  {n} = {model.values[n]:.6g} +- {e:.2g} {model.parameter(n).unit}"
+        for n, e in found.errors.items()
+    ]
+    left = [f"  {n}: {v:.3g} rms left, noise {found.noise[n]:.3g}" for n, v in found.rms.items()]
+    said = [f"  {w}" for w in found.warnings]
+    return "\n".join([f"identified '{model.name}':", *rows, *left, *said])
+
+
+def _estimate(value: float, low: float, high: float) -> str:
+    """Return a value with its interval, in as many digits as tell them apart, four at least."""
+    half = max(high - value, value - low)
+    digits = 4
+    if 0.0 < half < abs(value):
+        digits = max(4, min(9, 1 + math.ceil(math.log10(abs(value) / half))))
+    return f"{value:.{digits}g} ({low:.{digits}g} to {high:.{digits}g})"
+
+
+OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
+    "own_identification": _identification,
+    "moved": lambda name, estimate, without, unit, causes: (
+        f"{name} = {with_unit(_estimate(*estimate), unit)}, without the cause{'s' * (causes > 1)}"
+        f" {without:.4g}"
+    ),
+    # the records
+    "stairs": (
+        "The input '{input}' stands still between jumps in {records}, and each jump is read as a"
+        " ramp of one sampling interval; if it is held between samples, as by a digital controller,"
+        ' say so of these records: psa.Signals(..., hold="zero").'
+    ),
+    "no_column": "No record has a column '{output}'; that output is not compared.",
+    "no_unit": lambda record, names: (
+        f"{record} states no unit of {listing(names)}; the model's are taken."
+    ),
+    # the fit
+    "own_interrupted": "The search was interrupted; these are the best values so far.",
+    "cut_off": "The fit was cut off before it converged; its values are not final.",
+    "one_start": (
+        "Of {starts} starts only one led to this minimum; it is the best found, and may not be the"
+        " best there is."
+    ),
+    "own_undetermined": "'{name}' is not determined by these records.",
+    "on_bound": "'{name}' sits on a bound of its range; its interval means nothing.",
+    "output_missed": (
+        "'{output}' is missed by {ratio:.2g} times its noise: the model lacks something, so that"
+        " the values bend to it, and their errors are too small; psa.diagnose looks for the cause."
+    ),
+    "output_not_followed": (
+        "'{output}' is left with {share:.0p} % of its own movement: see that its column, and those"
+        " of the inputs, are in the model's units."
+    ),
+    # the verdict
+    "held_out_unlike": (
+        "The fitted samples leave no more than noise, but the held-out ones of {output}"
+        " {ratio:.1f} times their noise: these records do not say the same, or their inputs are not"
+        " read alike (see `hold`)."
+    ),
+    "slight": (
+        "{names: and } together fit better (ln of the Bayes factor higher by {more:.0f}). Not"
+        " named, because {small: and } would remove less than {least:.0%} of what the rest does,"
+        " and so little may only correct its form."
     ),
 }
 

@@ -6,14 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from psa_casadi.diagnosis.result import Candidate, Diagnosis
+from psa_casadi.diagnosis.result import Candidate, Cause, OdeDiagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
-
-if TYPE_CHECKING:  # which take long to load
-    from psa_casadi.any_model.result import OdeDiagnosis
 
 #: A length in a sentence stays in its own unit where the page's would give a larger number.
 _LARGEST = 1000.0
@@ -64,7 +60,7 @@ def length_scale(largest: float, *, counts: bool = False) -> Scale:
 
 def scale_of(experiments: Iterable[Experiment], largest: float) -> Scale:
     """Return the unit of errors of size `largest` [m] of records, which may be in counts."""
-    counts = any(e.record.displacement_unit == "counts" for e in experiments)
+    counts = any(getattr(e.record, "displacement_unit", "m") == "counts" for e in experiments)
     return length_scale(largest, counts=counts)
 
 
@@ -183,7 +179,7 @@ def confidence_text(confidence: float) -> str:
     return f"confidence {percent(confidence)}: {words}"
 
 
-def share_text(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
+def share_text(candidate: Candidate, d: OdeDiagnosis) -> str:
     """Return the share of the excess that an effect explains alone, or that it was only screened.
 
     Of one of several named causes also what it removes beside the others.
@@ -195,14 +191,14 @@ def share_text(candidate: Candidate, d: "Diagnosis | OdeDiagnosis") -> str:
     else:
         screened = "" if candidate.fitted else " (screened)"
         alone = f"{percent(candidate.explained_share)}{screened}"
-    if not isinstance(d, Diagnosis) or d.budget is None or len(d.causes) < 2:
+    if len(d.causes) < 2:
         return alone
     named = {c.effect for c in d.causes}
     own = next((c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None)
     return alone if own is None else f"{alone}; with others {own.percents[0]} %"
 
 
-def rest_sentence(d: "Diagnosis | OdeDiagnosis") -> str:
+def rest_sentence(d: OdeDiagnosis) -> str:
     """Say what remains, with the p value of the test of the rest."""
     p = d.remaining.p_value
     return f"{d.remaining.where.rstrip('.')} ({f'p = {number(p, 2)}' if p > 1e-6 else 'p < 1e-6'})."
@@ -243,6 +239,12 @@ def with_unit(text: str, unit: str) -> str:
     return text if unit in ("", "1") else f"{text} {unit}"
 
 
+def with_its_unit(value: float, unit: str) -> str:
+    """Return a figure of an output with its unit, with a prefix where that has one."""
+    scale = prefixed_scale(value, unit or "1")
+    return with_unit(number(scale.factor * value), scale.unit or "1")
+
+
 def shown_in(model: Model, name: str) -> tuple[str, str]:
     """Return the SI unit of a parameter and the unit it is shown in."""
     parameter = model.parameter(name)
@@ -257,6 +259,11 @@ def interval_text(low: float, high: float) -> str:
     return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def added(d: "Diagnosis | OdeDiagnosis") -> bool:
+def added(d: OdeDiagnosis) -> bool:
     """Say whether the extended model differs from the base."""
-    return bool(d.causes or (isinstance(d, Diagnosis) and d.kept))
+    return bool(d.causes or d.kept)
+
+
+def place_of(cause: Cause) -> str:
+    """Say where a cause sits: the port of a model, or the part of a stack's rig."""
+    return cause.port or cause.belongs_to

@@ -11,16 +11,20 @@ from psa_casadi.report.words.phrases import (
     Scale,
     either,
     handy_scale,
+    in_brackets,
     listing,
     number,
     percent,
     plain,
+    prefixed_scale,
     with_unit,
 )
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import VERDICTS
 from psa_casadi.units import convert
 
+#: The output of a stack.
+_LENGTH = "displacement"
 #: So many names stand in a sentence; the table has all.
 _MOST_NAMED = 6
 METHOD = (
@@ -183,7 +187,11 @@ def difference_sentence(
         sentence = "The files share no parameter that two devices determine."
     elif differing:
         verb = "differ" if len(differing) > 1 else "differs"
-        sentence = f"Beyond noise, {listing(differing)} {verb} ({len(rows)} parameters compared)."
+        compared = f"{len(rows)} parameter{'s' * (len(rows) > 1)} compared"
+        sentence = f"Beyond noise, {listing(differing)} {verb} ({compared})."
+    elif len(rows) == 1:
+        sentence = f"The one parameter that they share, {rows[0].estimates.name}, does not differ"
+        sentence += " beyond noise."
     else:
         sentence = f"None of the {len(rows)} parameters differs beyond noise."
     if len({f.verdict for f in findings if f.verdict}) > 1:
@@ -193,29 +201,38 @@ def difference_sentence(
 
 
 def error_scale(findings: Sequence[Finding]) -> Scale:
-    """Return the unit in which the errors of all devices are handy numbers."""
-    errors = [f.errors.base for f in findings if f.errors]
+    """Return the unit in which the errors of all displacements are handy numbers."""
+    errors = [e.base for f in findings for e in f.errors if e.output == _LENGTH]
     errors += [f.rms_m for f in findings if f.rms_m is not None]
     return handy_scale(max(errors, default=1e-9))
 
 
 def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
     """Return verdict, causes with confidence and errors, one device in a row."""
-    rms = [f"base, held out [{scale.unit}]", f"extended, held out [{scale.unit}]",
-           f"noise [{scale.unit}]", f"fitted, rms [{scale.unit}]"]  # fmt: skip
-    rows = [("device", "verdict", "cause (confidence)", *rms, "% of range")]
-    for f in findings:
-        e = f.errors
-        lengths = (e.base, e.extended, e.noise, f.rms_m) if e else (None, None, None, f.rms_m)
-        share = e.extended_percent if e else f.rms_percent
-        rows.append((
-            f.device, VERDICTS.get(f.verdict, f.verdict), causes_text(f),
-            *("" if x is None else number(scale.factor * x) for x in lengths),
-            "" if share is None else number(share, 2),
-        ))  # fmt: skip
-    filled = [column for column in zip(*rows, strict=True) if any(column[1:])]
-    head, *body = zip(*filled, strict=True)
-    return Table(head, tuple(body))
+    columns: list[tuple[str, ...]] = [
+        ("device", *(f.device for f in findings)),
+        ("verdict", *(VERDICTS.get(f.verdict, f.verdict) for f in findings)),
+        ("cause (confidence)", *(causes_text(f) for f in findings)),
+    ]
+    for output in dict.fromkeys(e.output for f in findings for e in f.errors):
+        found = [next((e for e in f.errors if e.output == output), None) for f in findings]
+        told = [e for e in found if e is not None]
+        own, name = scale, ""
+        if output != _LENGTH:
+            own, name = prefixed_scale(max(e.base for e in told), told[0].unit), f"{output}, "
+        for head, part in (
+            (f"{name}base, held out", "base"),
+            (f"{name}extended, held out", "extended"),
+            (f"{name}noise", "noise"),
+        ):
+            cells = ("" if e is None else number(own.factor * getattr(e, part)) for e in found)
+            columns.append((in_brackets(head, own.unit), *cells))
+    fitted = ("" if f.rms_m is None else number(scale.factor * f.rms_m) for f in findings)
+    columns.append((f"fitted, rms [{scale.unit}]", *fitted))
+    shares = (f.errors[0].extended_percent if f.errors else f.rms_percent for f in findings)
+    columns.append(("% of range", *("" if s is None else number(s, 2) for s in shares)))
+    top, *body = zip(*(c for c in columns if any(c[1:])), strict=True)
+    return Table(top, tuple(body))
 
 
 def causes_text(f: Finding) -> str:

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
-from psa_casadi.any_model.result import OdeDiagnosis, PortCause
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.diagnosis.result import Cause, Diagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis, OdeDiagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
@@ -26,6 +26,7 @@ from psa_casadi.report.words.phrases import (
     prefixed_scale,
     scale_of,
     shown_in,
+    with_its_unit,
     with_unit,
 )
 from psa_casadi.report.words.verdict_words import within
@@ -171,6 +172,10 @@ def _amount(size: Size, length: Scale) -> str:
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.
 _FILES = ("model.json", "extended.json")
+#: What a program does with an extended model of any kind.
+_IN_PYTHON = (
+    "`result.model` is the extended model: psa.export_fmu(result.model, PATH) exports it.",
+)
 #: Causes whose remedies are told, and rivals of each.
 _CAUSES, _RIVALS = 3, 2
 
@@ -184,33 +189,32 @@ class Advice:
     commands: tuple[str, ...] = ()
 
 
-def what_now(d: Diagnosis | OdeDiagnosis, model_file: str | None = None) -> Advice:
+def what_now(d: OdeDiagnosis, model_file: str | None = None) -> Advice:
     """Return what to do after a diagnosis; `model_file` is where its model was written."""
-    if isinstance(d, OdeDiagnosis):
-        return _of_own(d)
     if d.verdict == "not_driven":
         return Advice((
             "See that both columns are of one run and of one axis, that the amplifier was on, and"
             " that units and sign are right.",
         ))  # fmt: skip
-    scale = scale_of(d.experiments, d.extended_errors.holdout_rms_m)
-    error, noise = scale.text(d.extended_errors.holdout_rms_m), scale.text(d.noise_floor_rms_m)
-    commands, beside = _commands(d, model_file)
+    stack = d if isinstance(d, Diagnosis) else None
+    errors, noise = _sizes(d)
+    commands, beside = _commands(stack, model_file) if stack else ((), _IN_PYTHON)
     if d.verdict == "adequate" and d.doubt:
         said = "Use the model within these records only: their held-out samples cannot confirm it."
         return Advice((said,), beside, commands[:1])
     if d.verdict == "adequate":
         said = (
-            f"Use the model: it errs by {error} rms on samples that no fit has seen, at a noise of"
-            f" {noise}. Other voltages, rates and durations than these are untested."
+            f"Use the model: it errs by {errors} on samples that no fit has seen, at a noise of"
+            f" {noise}. Other {'voltages' if stack else 'inputs'}, rates and durations than these"
+            " are untested."
         )
         return Advice((said,), beside, commands)
     if not d.causes:
         said = (
-            f"Do not correct the device by a name: none is certain. Take {error} rms as the model's"
-            " error, and measure the next record."
+            f"Do not correct the device by a name: none is certain. Take {errors} as the model's"
+            f" error, and {'measure the next record' if stack else _further(d)}."
         )
-        if d.patch is not None and d.budget is not None and d.budget.unnamed is not None:
+        if stack and d.patch is not None and d.budget.unnamed is not None:
             patched = (
                 "To predict without a name, --patch patched.json writes the model with the unnamed"
                 f" correction, which removes {percent(within(d.budget.unnamed.share))} of the error"
@@ -218,11 +222,33 @@ def what_now(d: Diagnosis | OdeDiagnosis, model_file: str | None = None) -> Advi
             )
             beside = (patched, *beside)
         return Advice((said,), beside, commands)
-    if d.verdict == "partly_explained" and d.budget is not None:
+    if d.verdict == "partly_explained" and isinstance(d.budget, StackBudget):
         left = scale_of(d.experiments, d.budget.remains_rms_m).text(d.budget.remains_rms_m)
         beside = (f"Without an explanation stays {left} rms above the noise.", *beside)
     lines = tuple(_of_cause(c, lambda v: scale_of(d.experiments, v)) for c in d.causes[:_CAUSES])
     return Advice(lines, (*_rivals(d.causes), *beside), commands)
+
+
+def _sizes(d: OdeDiagnosis) -> tuple[str, str]:
+    """Return the extended model's held-out error in every output, and the noise."""
+    if isinstance(d, Diagnosis):
+        scale = scale_of(d.experiments, d.extended_errors.holdout_rms_m)
+        error = f"{scale.text(d.extended_errors.holdout_rms_m)} rms"
+        return error, scale.text(d.noise_floor_rms_m)
+    of = len(d.errors) > 1
+    rows = [(e.extended, e.noise, e.unit, f" of {e.output}" * of) for e in d.errors]
+    errors = [f"{with_its_unit(error, unit)} rms{name}" for error, _, unit, name in rows]
+    return listing(errors), listing([with_its_unit(noise, unit) for _, noise, unit, _ in rows])
+
+
+def _further(d: OdeDiagnosis) -> str:
+    """Return what to do where no effect of any model explains what is missing."""
+    if d.correction is None:
+        return "record more of what may matter: another input, level or output"
+    return (
+        f"write the law of {d.correction.of} in {d.correction.port} into the equations, with its"
+        " parameter free, and diagnose again"
+    )
 
 
 def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -255,7 +281,7 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
     return tuple(commands), tuple(said)
 
 
-def _of_cause(cause: Cause | PortCause, length: Length) -> str:
+def _of_cause(cause: Cause, length: Length) -> str:
     """Return how large a cause is and what to do about it."""
     size, do = size_text(cause.sizes, length), DO.get(cause.remedy, DO["extended_model"])
     against = f"{size}. Against it: {lowered(do)}" if size else lowered(do)
@@ -276,29 +302,9 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
                 f"The record does not decide; in the place of {plain(cause.effect)} it may be"
                 f" {'; or '.join(each)}. What decides: {shown}."
             )
-    return lines
-
-
-def _of_own(d: OdeDiagnosis) -> Advice:
-    """Return what to do after the diagnosis of a model of one's own."""
-    if d.verdict == "adequate":
-        return Advice(("Use the model: what it misses cannot be told from noise.",))
-    if not added(d):
-        law = (
-            f"Write the law of {d.correction.of} in {d.correction.port} into the equations, with"
-            " its parameter free, and diagnose again."
-            if d.correction is not None
-            else "Record more of what may matter: another input, level or output."
-        )
-        return Advice((f"Do not correct the device by a name: none is certain. {law}",))
-    lines = tuple(_of_cause(c, handy_scale) for c in d.causes[:_CAUSES])
-    open_ones = [n for c in d.causes for n in c.cannot_be_told_from]
-    beside = [
-        "`result.model` is the extended model: psa.export_fmu(result.model, PATH) exports it."
-    ]
-    if open_ones:
-        beside.insert(0, "The records do not decide: record another level, rate or output as well.")
-    return Advice(lines, tuple(beside))
+        elif cause.cannot_be_told_from:
+            lines.append("The records do not decide: record another level, rate or output as well.")
+    return list(dict.fromkeys(lines))
 
 
 def effect_size(effect: Component, model: Model, sizes: Sequence[Size]) -> str:

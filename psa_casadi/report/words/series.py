@@ -1,17 +1,20 @@
 """Records as what pictures need: one series of each, and what its residual looks like."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.result import Candidate, Diagnosis
+from psa_casadi.diagnosis.result import Candidate, Diagnosis, OdeDiagnosis
+from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, phrases
 
 FloatArray = npt.NDArray[np.float64]
@@ -48,6 +51,11 @@ class Series:
     quantity: str = "displacement"
     unit: str = ""
     against: str = "voltage [V]"
+
+    @property
+    def record(self) -> str:
+        """The name of the record, without that of the output in front."""
+        return self.name.removeprefix(f"{self.quantity} of ")
 
     def residual(self, curve: Curve) -> FloatArray:
         """Return measured minus predicted [m]."""
@@ -107,33 +115,56 @@ def time_scale(span: float) -> phrases.Scale:
     return phrases.Scale("ms", 1e3) if span >= 1e-3 else phrases.Scale("µs", 1e6)
 
 
-def series_of(d: Diagnosis) -> tuple[Series, ...]:
-    """Return the records of a diagnosis with the base and, if something was added, the extended."""
-    rows = []
-    levels = [n.level for n in d.noise] or [d.noise_floor_rms_m] * len(d.experiments)
-    for e, base, extended, noise in zip(d.experiments, d.base, d.extended, levels, strict=True):
-        curves = [Curve("base model", colours.BASE, base)]
-        if phrases.added(d):
-            curves.append(Curve("extended model", colours.EXTENDED, extended))
-        rows.append(_series(e, curves, noise))
-    return tuple(rows)
+#: Readings that a column must have in a record to be a series.
+_FEWEST = 8
+
+
+def series_of(d: OdeDiagnosis) -> tuple[Series, ...]:
+    """Return the records of a diagnosis with the base and, if something was added, the extended.
+
+    Of a stack that is the displacement, of any other model every output in every record.
+    """
+    stack = d if isinstance(d, Diagnosis) else None
+    count = 1 if stack else len(d.experiments[0].channels)
+    noise = {e.output: e.noise for e in d.errors}
+    found = []
+    for j in range(count):
+        base, extended = d.shown(j)
+        for k, e in enumerate(d.experiments):
+            curves = [Curve("base model", colours.BASE, base[k])]
+            if phrases.added(d):
+                curves.append(Curve("extended model", colours.EXTENDED, extended[k]))
+            if stack:
+                level = stack.noise[k].level if stack.noise else stack.noise_floor_rms_m
+                found.append(_displacement(e, curves, level))
+            else:
+                found += _output(d.model, d.experiments, (k, j), noise, curves)
+    return tuple(found)
 
 
 def series_of_fit(found: Identification) -> tuple[Series, ...]:
     """Return the records of an identification with the fitted model.
 
-    The noise is that of the residual's fast differences: the level that weighted a record in the
-    fit may be its whole residual.
+    The noise of a displacement is that of the residual's fast differences: the level that weighted
+    a record in the fit may be its whole residual.
     """
-    rows = []
-    predictions = found.fit.predicted(found.experiments)
-    for e, predicted in zip(found.experiments, predictions, strict=True):
-        noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
-        rows.append(_series(e, [Curve("model", colours.EXTENDED, predicted)], noise))
+    rows: list[Series] = []
+    if isinstance(found, StackIdentification):
+        predictions = found.fit.predicted(found.experiments)
+        for e, predicted in zip(found.experiments, predictions, strict=True):
+            noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
+            rows.append(_displacement(e, [Curve("model", colours.EXTENDED, predicted)], noise))
+        return tuple(rows)
+    outputs = found.fit.outputs(found.experiments)
+    for j, channel in enumerate(found.experiments[0].channels):
+        place = found.model.output_names.index(channel.column)
+        for k, y in enumerate(outputs):
+            curves = [Curve("model", colours.EXTENDED, y[:, place])]
+            rows += _output(found.model, found.experiments, (k, j), found.noise, curves)
     return tuple(rows)
 
 
-def _series(e: Experiment, curves: Sequence[Curve], noise: float) -> Series:
+def _displacement(e: Experiment, curves: Sequence[Curve], noise: float) -> Series:
     return Series(
         name=e.record.name,
         time=e.record.time,
@@ -143,6 +174,36 @@ def _series(e: Experiment, curves: Sequence[Curve], noise: float) -> Series:
         held_out=e.held_out,
         noise=noise,
         counts=e.record.displacement_unit == "counts",
+    )
+
+
+def _output(
+    model: Model,
+    experiments: Sequence[Experiment],
+    place: tuple[int, int],
+    noise: Mapping[str, float],
+    curves: Sequence[Curve],
+) -> Iterator[Series]:
+    """Yield the series of a record and a channel, by their `place`, if it has readings enough."""
+    k, j = place
+    e, channel = experiments[k], experiments[0].channels[j]
+    if channel.column not in noise or np.isfinite(e.measured(j)).sum() < _FEWEST:
+        return
+    record, name, moving = e.record, channel.column, varied(model, e)
+    units = {i.name: i.unit for i in model.structure.inputs}
+    along = None if moving is None else record.column(moving)
+    yield Series(
+        name=record.name if len(noise) == 1 else f"{name} of {record.name}",
+        time=record.time - record.time[0],
+        voltage=np.zeros(record.n) if along is None else along,
+        measured=e.measured(j),
+        curves=tuple(curves),
+        held_out=e.at(j, e.held_out),
+        noise=noise[name] * e.share(j) / noise_share(experiments, j),
+        counts=False,
+        quantity=name,
+        unit=channel.unit or "1",
+        against="" if moving is None else phrases.in_brackets(moving, units[moving]),
     )
 
 

@@ -8,7 +8,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import BlindSpot, Diagnosis
+from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, OdeDiagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import StartOutcome
@@ -19,21 +19,22 @@ from psa_casadi.report.words.fit_words import grade
 from psa_casadi.report.words.phrases import (
     Scale,
     added,
+    in_brackets,
     interval_text,
     number,
     percent,
     plain,
+    prefixed_scale,
     probability_text,
     share_text,
     shown_in,
     with_unit,
 )
-from psa_casadi.report.words.series import ResidualFigures
+from psa_casadi.report.words.series import ResidualFigures, Series
 from psa_casadi.simulation.timings import Stage
 from psa_casadi.units import convert
 
 if TYPE_CHECKING:
-    from psa_casadi.any_model.result import OdeDiagnosis
     from psa_casadi.export.check.check import CheckReport
 
 
@@ -114,7 +115,7 @@ def _status(model: Model, name: str, found: StackIdentification | None) -> str:
     return "fit" if degree in ("determined", "fixed") else f"fit, {degree}"
 
 
-def candidate_table(d: "Diagnosis | OdeDiagnosis") -> Table:
+def candidate_table(d: OdeDiagnosis) -> Table:
     """Return every effect tried: evidence, share of the excess, and probability if one is named."""
     head = ["effect", "evidence over the base [ln]", "explains of the excess, alone"]
     rows = [[plain(c.effect), number(round(c.evidence, 6)), share_text(c, d)] for c in d.candidates]
@@ -125,18 +126,51 @@ def candidate_table(d: "Diagnosis | OdeDiagnosis") -> Table:
     return _table(head, rows)
 
 
-def error_table(d: Diagnosis, scale: Scale) -> Table:
-    """Return the errors of base and extended model beside the noise, in a unit of length."""
+def error_table(d: OdeDiagnosis, scale: Scale) -> Table:
+    """Return the errors of base and extended model beside the noise.
+
+    Of a stack they are lengths in the unit of the scale, else those of every output in its own.
+    """
+    if not isinstance(d, Diagnosis):
+        rows = [(e.output, e.unit, e.noise, e.base, e.extended) for e in d.errors]
+        return _falls("output", rows, added(d))
     unit, factor = scale.unit, scale.factor
-    rows = []
+    lines = []
     models = [("base", d.base_errors), ("extended", d.extended_errors)]
     for name, e in models if added(d) else models[:1]:
         lengths = (e.train_rms_m, e.holdout_rms_m, e.holdout_max_m)
-        rows.append((name, *(number(factor * v) for v in lengths), number(e.holdout_nrmse_percent)))
+        shown = (number(factor * v) for v in lengths)
+        lines.append((name, *shown, number(e.holdout_nrmse_percent)))
     noise = number(factor * d.noise_floor_rms_m)
-    rows.append(("noise", noise, noise, "", ""))
+    lines.append(("noise", noise, noise, "", ""))
     head = (f"training rms [{unit}]", f"held-out rms [{unit}]", f"held-out largest [{unit}]")
-    return _table(("model", *head, "held-out rms [% of range]"), rows)
+    return _table(("model", *head, "held-out rms [% of range]"), lines)
+
+
+def record_error_table(series: Sequence[Series]) -> Table:
+    """Return noise and held-out rms of the first and the last curve by record.
+
+    The rms of a record is over its used samples where none is held out.
+    """
+    rows = [
+        (s.name, s.unit, s.noise, s.judged_rms(s.curves[0]), s.judged_rms(s.curves[-1]))
+        for s in series
+    ]
+    return _falls("record", rows, len(series[0].curves) > 1)
+
+
+def _falls(
+    what: str, given: Iterable[tuple[str, str, float, float, float]], extended: bool
+) -> Table:
+    """Return rows of a name, unit, noise and two errors, and by how much the error falls."""
+    head = (what, "unit", "noise rms", "base, held-out rms")
+    rows = []
+    for name, unit, noise, base, after in given:
+        scale = prefixed_scale(base, unit)
+        shown = [noise, base, *([after] if extended else [])]
+        falls = [f"{100.0 * (1.0 - after / base):.0f} %"] if extended and base > 0 else []
+        rows.append((name, scale.unit, *(number(scale.factor * v) for v in shown), *falls))
+    return _table((*head, *(("extended, held-out rms", "falls by") if extended else ())), rows)
 
 
 def column_table(d: Diagnosis) -> Table:
@@ -150,28 +184,25 @@ def column_table(d: Diagnosis) -> Table:
     return _table(("column", "used as", "unit", *head), rows)
 
 
-def fit_error_table(rows: Sequence[tuple[str, ResidualFigures]], scale: Scale) -> Table:
-    """Return what the model leaves of every record, beside the record's noise level."""
+def fit_error_table(series: Sequence[Series], figures: Sequence[ResidualFigures]) -> Table:
+    """Return what the model leaves of every record, beside the record's noise level.
+
+    Each quantity has its unit, that of its largest error.
+    """
+    scales = {s.quantity: s.residual_scale for s in sorted(series, key=lambda s: -s.miss(0))}
+    for s in series:
+        scales[s.quantity] = max(scales[s.quantity], s.residual_scale, key=lambda q: 1.0 / q.factor)
+    one = next(iter(scales.values())).unit if len(scales) == 1 else ""
     lines = []
-    for name, f in rows:
-        lengths = (f.rms, f.largest, f.noise)
+    for s, f in zip(series, figures, strict=True):
+        scale = scales[s.quantity]
+        shown = (number(scale.factor * v) for v in (f.rms, f.largest, f.noise))
         ratio = number(f.rms / f.noise, 2) if f.noise > 0 else ""
-        share = number(100.0 * f.range_share, 2)
-        shown = (number(scale.factor * v) for v in lengths)
-        lines.append((name, *shown, ratio, share, number(f.neighbours, 2)))
-    unit = scale.unit
-    return _table(
-        (
-            "record",
-            f"rms [{unit}]",
-            f"largest [{unit}]",
-            f"noise [{unit}]",
-            "rms / noise",
-            "rms [% of range]",
-            "correlation of neighbours",
-        ),
-        lines,
-    )
+        told = (ratio, number(100.0 * f.range_share, 2), number(f.neighbours, 2))
+        lines.append((s.name, *(() if one else (scale.unit,)), *shown, *told))
+    lengths = [in_brackets(what, one) for what in ("rms", "largest", "noise")]
+    told = ("rms / noise", "rms [% of range]", "correlation of neighbours")
+    return _table(("record", *(() if one else ("unit",)), *lengths, *told), lines)
 
 
 def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:

@@ -4,21 +4,20 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from psa_casadi.any_model.result import OdeDiagnosis
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.diagnosis.result import Cause, Diagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis, OdeDiagnosis, OutputError
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words import verdict_words
 from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.notes import brief_text
-from psa_casadi.report.words.own_words import own_lines
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
     Scale,
@@ -27,11 +26,14 @@ from psa_casadi.report.words.phrases import (
     listing,
     number,
     percent,
+    place_of,
     plain,
+    prefixed_scale,
     probability_text,
     rest_sentence,
     scale_of,
     shown_in,
+    with_its_unit,
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
@@ -44,7 +46,7 @@ Lines = Sequence[tuple[str, str]]
 
 
 def story(
-    d: Diagnosis | OdeDiagnosis,
+    d: OdeDiagnosis,
     *,
     origin: str = "measured",
     width: int = 100,
@@ -52,62 +54,75 @@ def story(
 ) -> str:
     """Return a diagnosis in ten to twenty lines: verdict with gain, errors, cause, what now, rest.
 
-    `origin` is what a stack's records are called, `model_file` where its model was written. Raises
+    `origin` is what the records are called, `model_file` where the model was written. Raises
     InputError for what is no diagnosis.
     """
-    if isinstance(d, OdeDiagnosis):
-        lines = own_lines(d)
-    elif isinstance(d, Diagnosis):
-        lines = _lines(d, origin)
-    else:
+    if not isinstance(d, OdeDiagnosis):
         raise InputError(
             f"`story` tells a diagnosis, and this is of type {type(d).__name__}; print it."
         )
     advice = what_now(d, model_file)
     now = [("what now", text) for text in advice.causes]
     now += [("then", command) for command in advice.commands[:1]]
-    lines[1:1] = now
-    return labelled(lines, width)
+    lines = _lines(d, origin)
+    return labelled([lines[0], *now, *lines[1:]], width)
 
 
-def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
-    scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
+def told(d: OdeDiagnosis) -> str:
+    """Return how a diagnosis of any model prints: its verdict, and its story without advice."""
+    return f"{d.verdict}\n{labelled(_lines(d, 'measured'), 100)}"
+
+
+def _lines(d: OdeDiagnosis, origin: str) -> list[tuple[str, str]]:
+    stack = d if isinstance(d, Diagnosis) else None
     lines = [
         ("verdict", f"{verdict_words.VERDICTS[d.verdict]}. {verdict_words.verdict_sentence(d)}")
     ]
-    wrong = strongest(d.misfit)
+    wrong = strongest(stack.misfit) if stack else None
     lines += [("wrong", brief_text(wrong))] if wrong else []
-    sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
-    lines += [
-        ("records", _records_text(d.experiments, origin)),
-        ("noise", f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"),
-        ("base", _errors(d.base_errors, scale)),
-    ]
-    if added(d):
-        lines.append(("extended", _errors(d.extended_errors, scale)))
+    lines.append(("records", _records_text(d.experiments, origin)))
+    lines += _displacement_errors(stack) if stack else [("error", _missed(e, d)) for e in d.errors]
     for c in d.causes:
-        sure = f"{c.belongs_to}, {percent(c.confidence)}"
+        sure = f"{place_of(c)}, {percent(c.confidence)}"
         lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
         lines.append(("rivals", _rivals(d, c)))
-    lines.extend(("column", verdict_words.column_sentence(d, c)) for c in d.columns)
-    lines.extend(("export", f"{verdict_words.alternative_sentence(d, a)}.") for a in d.alternatives)
-    spent = verdict_words.budget_sentence(d, scale)
-    if spent and d.verdict not in ("adequate", "not_driven"):
-        lines.append(("budget", f"{spent}."))
+    if stack:
+        columns = [verdict_words.column_sentence(stack, c) for c in stack.columns]
+        others = [verdict_words.alternative_sentence(stack, a) for a in stack.alternatives]
+        lines += [("column", text) for text in columns] + [("export", f"{t}.") for t in others]
+    if d.verdict not in ("adequate", "not_driven"):
+        lines.append(("budget", f"{verdict_words.budget_sentence(d)}."))
+    lines += [] if stack else [("moved", m) for m in d.moved]
     lines.append(("remains", rest_sentence(d)))
-    blind = [plain(b.effect) for b in blindest(d)] or ["no effect of ordinary size in the table"]
-    lines.append(("blind to", listing(blind, most=MOST_NAMES)))
-    lines.append(("next", d.next_experiment.why))
+    if stack:
+        blind = [plain(b.effect) for b in blindest(stack)]
+        none = ["no effect of ordinary size in the table"]
+        lines.append(("blind to", listing(blind or none, most=MOST_NAMES)))
+        lines.append(("next", stack.next_experiment.why))
     firsts = (note.partition(". ") for note in d.notes)
     lines.extend(("note", f"{first}{dot.rstrip()}") for first, dot, _ in firsts)
     return lines
 
 
-def _rivals(d: Diagnosis, cause: Cause) -> str:
+def _displacement_errors(d: Diagnosis) -> list[tuple[str, str]]:
+    scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
+    sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
+    noise = f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"
+    lines = [("noise", noise), ("base", _errors(d.base_errors, scale))]
+    return [*lines, *([("extended", _errors(d.extended_errors, scale))] if added(d) else [])]
+
+
+def _missed(e: OutputError, d: OdeDiagnosis) -> str:
+    base, extended, noise = (with_its_unit(v, e.unit) for v in (e.base, e.extended, e.noise))
+    after = f", {extended} of the extended model" if added(d) else ""
+    return f"{e.output}: held-out rms {base} of the base{after}; noise {noise}"
+
+
+def _rivals(d: OdeDiagnosis, cause: Cause) -> str:
     """Return what a cause cannot be told from, else the next most probable effect of the first."""
     known = {c.effect: c.probability for c in d.candidates}
     # the candidates are those of the first step, whose cause may be without a name
-    steps = [c.what for c in d.budget.causes] if d.budget is not None else []
+    steps = [c.what for c in d.budget.causes]
     first = cause.effect == (steps or [d.causes[0].effect])[0]
     if cause.cannot_be_told_from:
         rivals = [
@@ -139,6 +154,22 @@ def identification_text(
     tail += [("next", a.sentence) for a in found.advice]
     tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
     return _around(head, parameter_table(found.model, found), tail, width)
+
+
+def fit_sentence(found: Identification) -> str:
+    """Say how far the model is from its records, and how many parameters these determine."""
+    parts = []
+    for name, rms in found.rms.items():
+        unit = next(o.unit for o in found.model.structure.outputs if o.name == name) or "1"
+        noise = found.noise[name]
+        ratio = f" ({number(rms / noise, 2)} times its noise)" if noise > 0 else ""
+        parts.append(f"{name} by {prefixed_scale(rms, unit).text(rms)}{ratio}")
+    count, open_ = len(found.errors), len(found.undetermined)
+    told = "all" if not open_ else f"{count - open_} of"
+    return (
+        f"The model misses {listing(parts)} rms. The records determine {told} {count} fitted"
+        f" parameter{'s' if count > 1 else ''}."
+    )
 
 
 def effect_page(

@@ -1,19 +1,14 @@
 """The verdict of a diagnosis and its error budget in sentences."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import numpy as np
 
-from psa_casadi.diagnosis.held_out import Budget, Share
-from psa_casadi.diagnosis.patch import Patch
-from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis
+from psa_casadi.diagnosis.corrections import Correction, Patch
+from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
+from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis, OdeDiagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words import phrases
 from psa_casadi.report.words.tables import Table
 from psa_casadi.units import convert
-
-if TYPE_CHECKING:
-    from psa_casadi.any_model.result import OdeDiagnosis, PortCause
-
 
 VERDICTS = {
     "adequate": "adequate",
@@ -25,6 +20,10 @@ VERDICTS = {
 }
 
 
+#: Outputs that a sentence names one by one.
+_NAMED = 4
+#: A row of the budget.
+_REMAINS = "remains above the noise"
 #: What an interval of the gain from blocks of few records says.
 OWN_VOLTAGES = (
     "The interval is taken over blocks of the held-out samples and holds for these voltages only;"
@@ -44,57 +43,76 @@ def gain_sentence(d: Diagnosis) -> str:
     return f"the held-out error falls by {told[0]} % (95 % interval {told[1]} to {told[2]} %)"
 
 
-def verdict_sentence(d: Diagnosis) -> str:
+def verdict_sentence(d: OdeDiagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
-    share = phrases.number(d.base_errors.holdout_nrmse_percent, 2)
-    error = f"the base model's held-out error is {share} % of the range"
     if d.doubt and d.verdict == "adequate":
-        return f"Nothing beyond the noise is seen to be missing; {d.doubt}."
-    if d.doubt:
-        return f"Something is missing, and no cause is named; {d.doubt}."
-    if d.verdict == "adequate":
-        return f"Nothing beyond the noise is missing from the base model; {error}."
-    if d.verdict == "not_driven":
+        said = f"Nothing beyond the noise is seen to be missing; {d.doubt}"
+    elif d.doubt:
+        said = f"Something is missing, and no cause is named; {d.doubt}"
+    elif d.verdict == "adequate":
+        said = f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}"
+    elif d.verdict == "not_driven":
         seen = (
             "The displacement falls while the voltage rises: correct the sign of one of them."
             " Nothing was diagnosed"
             if doubtful_sign([e.record for e in d.experiments])
             else "The displacement does not follow the voltage: nothing can be diagnosed"
         )
-        return f"{seen}; {error}."
-    if d.verdict == "unexplained" or not d.causes:
-        return (
-            "Something is missing, and no effect in the table explains it: no cause is named; "
-            f"{_without_name(d)}{error}."
-        )
-    return naming_sentence(d, [named_cause(c, c.belongs_to) for c in d.causes])
+        said = f"{seen}; {_base_errors(d)}"
+    elif d.verdict == "unexplained" or not d.causes:
+        nothing = "Something is missing, and no effect in the table explains it: no cause is named"
+        said = f"{nothing}; {_without_name(d)}{_base_errors(d)}"
+    else:
+        said = _named(d)
+    return f"{said}."
 
 
-def naming_sentence(d: "Diagnosis | OdeDiagnosis", causes: Sequence[str]) -> str:
-    """Say the verdict of a diagnosis that names: its `causes` in words, and what they remove.
-
-    Without a budget it says how far the error falls, noise included.
-    """
-    if d.budget is not None:
-        share = f"{d.budget.together.percents[0]} %"
-        if d.verdict == "partly_explained" and share.startswith("100"):
-            share = "nearly all"  # something remains
-        verb = "removes" if len(d.causes) == 1 else "remove"
-        # the noise is the floor
-        removal = f"{verb} {share} of the base model's held-out error above the noise (in power)"
-    gain = "" if d.budget is not None else gain_sentence(d)
+def _named(d: OdeDiagnosis) -> str:
+    """Say which causes are named, and what they remove."""
+    causes = [named_cause(c) for c in d.causes]
+    one, share = len(causes) == 1, f"{d.budget.together.percents[0]} %"
+    if d.verdict == "partly_explained" and share.startswith("100"):
+        share = "nearly all"  # something remains
+    # the noise is the floor
+    removal = (
+        f"{'removes' if one else 'remove'} {share} of the base model's held-out error above the"
+        " noise (in power)"
+    )
     if d.verdict == "ambiguous":
         first = d.causes[0]
         rivals = phrases.either((first.effect, *first.cannot_be_told_from))
         together = phrases.listing([phrases.plain(c.effect) for c in d.causes])
-        gone = f"with {together}, {gain}" if gain else f"{together} {removal}"
-        return f"Something is missing, and these data do not decide whether it is {rivals}; {gone}."
-    are = f"{'cause is' if len(causes) == 1 else 'causes are'} {phrases.listing(causes)}"
-    subject = "it" if len(causes) == 1 else "together they"
-    gone = gain or f"{subject} {removal}"
+        return (
+            f"Something is missing, and these data do not decide whether it is {rivals};"
+            f" {together} {removal}"
+        )
+    are = f"{'cause is' if one else 'causes are'} {phrases.listing(causes)}"
+    gone = f"{'it' if one else 'together they'} {removal}"
     if d.verdict == "partly_explained":
-        return f"The closest known {are}: {gone}; more than noise remains."
-    return f"The {are}: {gone}."
+        return f"The closest known {are}: {gone}; more than noise remains"
+    return f"The {are}: {gone}"
+
+
+def _base_errors(d: OdeDiagnosis) -> str:
+    """Say the base model's error in every output, over its range in all records.
+
+    That of a stack's displacement is each record's over its own range.
+    """
+    if isinstance(d, Diagnosis):
+        shares = {"displacement": d.base_errors.holdout_nrmse_percent}
+    else:
+        shares = {}
+        for k, e in enumerate(d.errors):
+            whole = np.concatenate([e.measured(k) for e in d.experiments])
+            shares[e.output] = 100.0 * e.base / float(np.nanmax(whole) - np.nanmin(whole))
+    each = [f"{phrases.number(share, 2)} %" for share in shares.values()]
+    if len(each) == 1:
+        return f"the base model's held-out error is {each[0]} of the range"
+    if len(each) > _NAMED:
+        low, high = (phrases.number(f(shares.values()), 2) for f in (min, max))
+        return f"the base model's held-out errors are {low} to {high} % of the ranges"
+    pairs = [f"{share} of {output}" for output, share in zip(shares, each, strict=True)]
+    return f"the base model's held-out errors are {phrases.listing(pairs)}, over their ranges"
 
 
 def within(share: float) -> float:
@@ -102,10 +120,10 @@ def within(share: float) -> float:
     return max(0.0, min(1.0, share))
 
 
-def _without_name(d: Diagnosis) -> str:
+def _without_name(d: OdeDiagnosis) -> str:
     """Say what an extended model without a cause holds and would take, "" where nothing."""
     said, b = "", d.budget
-    if b is not None and d.kept:
+    if d.kept:
         one = len(d.kept) == 1
         said = (
             f"{phrases.listing([phrases.plain(name) for name in d.kept])}"
@@ -114,16 +132,16 @@ def _without_name(d: Diagnosis) -> str:
             f" {'is' if one else 'are'} kept in the extended model without being"
             f" {'a cause' if one else 'causes'}; "
         )
-    if b is not None and d.patch is not None and b.unnamed is not None:
+    if d.patch is not None and b.unnamed is not None:
         more = "a further " if phrases.added(d) else ""
         share = phrases.percent(within(b.unnamed.share))
         said += f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
     return said
 
 
-def named_cause(cause: "Cause | PortCause", where: str) -> str:
+def named_cause(cause: Cause) -> str:
     """Name a cause with its place, how sure it is, and what it cannot be told from."""
-    sure = f"{where}, {phrases.confidence_text(cause.confidence)}"
+    sure = f"{phrases.place_of(cause)}, {phrases.confidence_text(cause.confidence)}"
     if cause.cannot_be_told_from:
         sure += f"; or {phrases.either(cause.cannot_be_told_from)}"
     return f"{phrases.plain(cause.effect)} ({sure})"
@@ -151,7 +169,7 @@ def column_sentence(d: Diagnosis, c: Decision) -> str:
     return f"{c.sentence} Held-out rms: {phrases.with_unit(errors, c.unit)}."
 
 
-def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str:
+def cause_size(d: OdeDiagnosis, cause: Cause) -> str:
     """Return "name = value unit (low to high)" for every parameter of a cause.
 
     Of one that is several of a kind, and has many, at which frequencies they are; of weights that
@@ -175,19 +193,21 @@ def cause_size(d: "Diagnosis | OdeDiagnosis", cause: "Cause | PortCause") -> str
     return ", ".join(texts)
 
 
-def patch_text(patch: Patch) -> str:
+def patch_text(patch: Correction) -> str:
     """Say what the unnamed correction is, and what else it may be."""
     others = phrases.listing(patch.open_to, "or")
     rest = f"; these data cannot distinguish it from {others}" if others else ""
-    return f"{patch.sentence}, at the {patch.port}{rest}"
+    where = f", at the {patch.port}" if isinstance(patch, Patch) else ""
+    return f"{patch.sentence}{where}{rest}"
 
 
-def budget_sentence(d: Diagnosis, scale: phrases.Scale) -> str:
+def budget_sentence(d: OdeDiagnosis) -> str:
     """Say where the held-out error above the noise goes."""
-    b = d.budget
-    if b is None:
-        return ""
-    parts = [f"of {scale.text(b.excess_rms_m)} rms above the noise"]
+    b, parts = d.budget, ["of the held-out error above the noise"]
+    stack = b if isinstance(b, StackBudget) else None
+    scale = phrases.scale_of(d.experiments, _base_rms(d)) if stack else phrases.Scale("", 1.0)
+    if stack:
+        parts = [f"of {scale.text(stack.excess_rms_m)} rms above the noise"]
     if phrases.added(d):
         parts.append(_removed(b))
     if b.unnamed is not None and d.patch is not None:
@@ -195,12 +215,15 @@ def budget_sentence(d: Diagnosis, scale: phrases.Scale) -> str:
         parts.append(
             f"an unnamed correction would remove {more} {b.unnamed.text}: {patch_text(d.patch)}"
         )
-    if phrases.added(d):
-        left = (
-            f"{scale.text(b.remains_rms_m)} ({phrases.number(b.remains_percent, 2)} % of the range)"
-        )
+    if phrases.added(d) and stack:
+        share = phrases.number(stack.remains_percent, 2)
+        left = f"{scale.text(stack.remains_rms_m)} ({share} % of the range)"
         parts.append(f"above the noise the extended model leaves {left}")
     return "; ".join(parts)
+
+
+def _base_rms(d: OdeDiagnosis) -> float:
+    return d.base_errors.holdout_rms_m if isinstance(d, Diagnosis) else 0.0
 
 
 def _removed(b: Budget) -> str:
@@ -216,21 +239,22 @@ def _removed(b: Budget) -> str:
     )
 
 
-def budget_table(d: Diagnosis, scale: phrases.Scale) -> Table:
+def budget_table(d: OdeDiagnosis) -> Table:
     """Return the shares of the base model's held-out error: power above the noise, and rms."""
     b = d.budget
-    if b is None:
-        return Table(("", "share", "95 % interval"), ())
     rows = [share_row(phrases.plain(c.what), c) for c in b.causes]
     if len(b.causes) > 1:
         rows.append(share_row("all causes together" if d.causes else "all together", b.together))
     if b.unnamed is not None and d.patch is not None:
         rows.append(share_row(f"unnamed: {d.patch.name}", b.unnamed))
-    remains = phrases.number(scale.factor * b.remains_rms_m)
-    share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
-    shown = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
-    rows.append(("remains above the noise", f"{shown}, {remains} {scale.unit}", ""))
-    return Table(("what", "removes", "95 % interval"), tuple(rows))
+    low, high = b.together.interval
+    left = share_row(_REMAINS, Share("left", 1.0 - b.together.share, (1.0 - high, 1.0 - low)))
+    if isinstance(b, StackBudget):
+        scale = phrases.scale_of(d.experiments, b.excess_rms_m)
+        share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
+        shown = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
+        left = (_REMAINS, f"{shown}, {scale.text(b.remains_rms_m)}", "")
+    return Table(("what", "removes", "95 % interval"), (*rows, left))
 
 
 def share_row(what: str, s: Share) -> tuple[str, str, str]:

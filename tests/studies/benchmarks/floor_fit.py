@@ -28,6 +28,8 @@ Columns = dict[str, FloatArray]
 #: Thresholds of the plays over half the voltage's range; relaxations in a decade of their time;
 #: voltages of the last samples that act directly.
 PLAYS, IN_A_DECADE, TAPS = 14, 2, 4
+#: Powers of the plays, each with a prior of its own.
+_POWERS = (1, 2, 3)
 
 
 class Mode(NamedTuple):

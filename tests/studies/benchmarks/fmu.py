@@ -26,8 +26,7 @@ from scipy.integrate import solve_ivp
 import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.export.common.variable_table import variable_table
-from psa_casadi.export.fixed_step.export import fixed_step
-from psa_casadi.export.fixed_step.probe import VOLTAGES
+from psa_casadi.export.fixed_step.export import VOLTAGES, fixed_step
 from psa_casadi.export.fmu.sources import compiled_files, exported_texts
 from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate

@@ -182,8 +182,6 @@ def names_of(d: psa.Diagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def _patched(d: psa.Diagnosis) -> float:
     """Return what is offered without a name: the effects that are kept, and the correction."""
     b = d.budget
-    if b is None:
-        return 0.0
     kept = b.together.share if d.kept and not d.causes else 0.0
     return kept + (b.unnamed.share if b.unnamed is not None else 0.0)
 

@@ -72,8 +72,6 @@ def _scores(axes: Axes, found: Known) -> None:
 
 def _shares(axes: Axes, d: psa.Diagnosis) -> None:
     b = d.budget
-    if b is None:
-        return
     shares = {plain(s.what).replace(" ", "\n"): s for s in b.causes}
     if b.unnamed is not None and d.patch is not None:
         shares[f"unnamed:\n{d.patch.kind}"] = b.unnamed

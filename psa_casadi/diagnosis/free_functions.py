@@ -17,10 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached
-from psa_casadi.any_model.result import FreeFunction, removed_from
 from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.diagnosis.colour import noise_left
-from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.diagnosis.corrections import FreeFunction
+from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes
 from psa_casadi.diagnosis.screening import (
     independent,
@@ -28,8 +27,7 @@ from psa_casadi.diagnosis.screening import (
     whitened_residuals,
     without,
 )
-from psa_casadi.diagnosis.search.hypothesis import View, hypothesis
-from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypothesis
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import refit, weighted
@@ -54,50 +52,53 @@ class _Law:
     terms: tuple[tuple[str, ...], ...]
     scales: dict[str, float]
 
-    def coefficients(self, prefix: str) -> list[str]:
-        """Return the names of the coefficients."""
-        return [f"{prefix}_{k}" for k in range(len(self.terms))]
 
+def free_functions(view: View, task: Task, base: Model, scale: Scale) -> list[FreeFunction]:
+    """Fit the most telling free functions beside a hypothesis; return them, the best first.
 
-@dataclass(frozen=True)
-class Free:
-    """A free function: of what, at which port, its evidence over the base, and what it removes.
-
-    `removes` is that with its interval, `law` are its monomials in the variables over their
-    `scales`, `fit` the base with it and `errors` what that leaves of every output
-    (`Hypothesis.errors`).
+    `base` is the model before its ports were opened.
     """
+    of, experiments = view.of, task.experiments
+    sizes = sizes_of(base, experiments, of.fit.starts())
+    scored: list[tuple[float, Attached, _Law]] = []
+    for attached, law in [_free(base, p, sizes) for p in ports_of(base)]:
+        with suppress(PsaError):
+            scored.append((_decrease(view, attached, experiments), attached, law))
+    scored.sort(key=lambda s: -s[0])
+    found = []
+    for _, attached, law in scored[:_FITTED]:
+        task.progress(f"a free function in {attached.port.words}")
+        with suppress(PsaError):
+            model = of.fit.model.with_effect(attached.component)
+            fit = refit(
+                replace(of.fit, model=model), weighted(of.fit, experiments),
+                [*of.fit.unknowns.names, *attached.component.fitted],
+                sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
+            )  # fmt: skip
+            h = hypothesis((*of.causes, attached.component), fit, experiments)
+            if h is not None:
+                gained = scale.evidence(h) - scale.evidence(of)
+                found.append(_told(h, attached, law, gained, experiments))
+    return sorted(found, key=lambda f: -f.evidence)
 
-    port: Port
-    of: str
-    evidence: float
-    removes: Share
-    law: _Law
-    fit: Fit
-    errors: tuple[float, ...]
 
-    @property
-    def share(self) -> float:
-        """What it removes of the base's held-out error above the noise."""
-        return self.removes.share
-
-
-def correction_of(free: Free, experiments: Sequence[Experiment]) -> FreeFunction | None:
-    """Return what a free function adds along all records, beside the variable it follows most.
-
-    None where it cannot be simulated.
-    """
-    try:
-        values = {n: _along(free, experiments, n) for n in free.law.names}
-    except PsaError:
-        return None
-    model = free.fit.model
-    (component,) = model.effects
-    added = sum(
-        model.values[c] * prod(values[n] / free.law.scales[n] for n in term)
-        for c, term in zip(free.law.coefficients(component.name), free.law.terms, strict=True)
+def _told(
+    h: Hypothesis,
+    attached: Attached,
+    law: _Law,
+    evidence: float,
+    experiments: Sequence[Experiment],
+) -> FreeFunction:
+    """Return a fitted function, and what it adds beside the variable that it follows most."""
+    component, values = attached.component, {}
+    for n in law.names:
+        values[n] = _along(h.fit, component.fitted, experiments, n)
+    added = np.asarray(
+        sum(
+            h.fit.model.values[c] * prod(values[n] / law.scales[n] for n in term)
+            for c, term in zip(component.fitted, law.terms, strict=True)
+        )
     )
-    added = np.asarray(added, dtype=np.float64)
 
     def scatter(name: str) -> float:
         """What a polynomial of one variable leaves of what is added (sum of squares)."""
@@ -106,18 +107,27 @@ def correction_of(free: Free, experiments: Sequence[Experiment]) -> FreeFunction
         rest = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
         return float(rest @ rest)
 
-    name, s = min(values, key=scatter), model.structure
+    name, s = min(values, key=scatter), h.fit.model.structure
     units = {v.name: v.unit for rows in (s.states, s.inputs, s.outputs) for v in rows}
     return FreeFunction(
-        port=free.port.words, of=free.of, evidence=free.evidence, share=free.removes.share,
-        unit=free.port.unit, variable=name, variable_unit=units[name], along=values[name],
+        port=attached.port.words,
+        evidence=evidence,
+        held=h.errors,
+        predicted=h.shown,
+        of=" and ".join(law.names),
+        unit=attached.port.unit,
+        variable=name,
+        variable_unit=units[name],
+        along=values[name],
         added=added,
-    )  # fmt: skip
+    )
 
 
-def _along(free: Free, experiments: Sequence[Experiment], name: str) -> FloatArray:
+def _along(
+    fit: Fit, coefficients: Sequence[str], experiments: Sequence[Experiment], name: str
+) -> FloatArray:
     """Return a variable along all records: an input, a state, or an output before its sensor."""
-    model, fit = free.fit.model, free.fit
+    model = fit.model
     if name in model.input_names:
         return np.concatenate([e.record.column(name) for e in experiments])
     if name in model.state_names:
@@ -127,47 +137,9 @@ def _along(free: Free, experiments: Sequence[Experiment], name: str) -> FloatArr
             for r, e in enumerate(experiments)
         ]
         return np.concatenate(rows)
-    (component,) = model.effects
-    none = fit.at(dict.fromkeys(free.law.coefficients(component.name), 0.0))
+    none = fit.at(dict.fromkeys(coefficients, 0.0))
     k = model.output_names.index(name)
     return np.concatenate([y[:, k] for y in none.outputs(experiments)])
-
-
-def free_functions(known: Known, view: View, base: Model) -> tuple[Free, ...]:
-    """Return the most telling free functions beside the base, fitted, the best first."""
-    root, experiments = view.of, known.task.experiments
-    sizes = sizes_of(base, experiments, root.fit.starts())
-    tried = [_free(base, p, sizes) for p in ports_of(base)]
-    scored: list[tuple[float, Attached, _Law]] = []
-    for attached, law in tried:
-        try:
-            scored.append((_decrease(view, attached, experiments), attached, law))
-        except PsaError:
-            continue
-    scored.sort(key=lambda s: -s[0])
-    found = []
-    for _, attached, law in scored[:_FITTED]:
-        known.task.progress(f"a free function in {attached.port.words}")
-        fitted: Fit | None = None
-        with suppress(PsaError):
-            model = root.fit.model.with_effect(attached.component)
-            fitted = refit(
-                replace(root.fit, model=model), weighted(root.fit, experiments),
-                [*root.fit.unknowns.names, *attached.component.fitted],
-                sigma=root.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
-            )  # fmt: skip
-        h = hypothesis((attached.component,), fitted, experiments)
-        if h is not None:
-            of = " and ".join(law.names)
-            # of the base's held-out error above the noise that it leaves
-            noise = noise_left(h.fit, view.screening.colour)
-            of_base = removed_from(experiments, root.shown, noise)
-            what = f"{of} in {attached.port.words}"
-            removes = of_base.share(what, root.shown, h.shown)
-            found.append(
-                Free(attached.port, of, known.scale.evidence(h), removes, law, h.fit, h.errors)
-            )
-    return tuple(sorted(found, key=lambda f: -f.evidence))
 
 
 def _decrease(view: View, attached: Attached, experiments: Sequence[Experiment]) -> float:

@@ -1,0 +1,585 @@
+"""A system of models as an SSP archive: an FMU for each part, wires, parameters, a drawing.
+
+Source: SSP 1.0, section 4.1 (packaging).
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import scipy
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from psa_casadi.characters import check_text
+from psa_casadi.errors import InputError
+from psa_casadi.export.common import markup
+from psa_casadi.export.common.parameter_sets import parameter_set
+from psa_casadi.export.common.templates import filled
+from psa_casadi.export.fmu.archive import export_fmu, write_archive
+from psa_casadi.files import atomic_path, temporary_folder
+from psa_casadi.model.compose import Model
+from psa_casadi.model.system import System
+from psa_casadi.units import FloatArray, parse_unit
+from psa_casadi.variables import Publication
+
+Point = tuple[float, float]
+
+#: Name of the system itself where the name of a part is asked for.
+OUTSIDE = ""
+
+_PITCH, _TITLE, _GAP, _CHAR, _EDGE = 8.0, 12.0, 6.0, 2.0, 12.0
+
+
+@dataclass(frozen=True)
+class Port:
+    """A port of a part, or of the system itself where `part` is `OUTSIDE`."""
+
+    part: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Wire:
+    """A connection from an output (or the system's input) to an input (or the system's output)."""
+
+    start: Port
+    end: Port
+
+
+@dataclass(frozen=True)
+class WiredParts:
+    """A system as SSP sees it: models by the names of the parts, wires, and its own ports.
+
+    A wire from or to `OUTSIDE` makes a port of the system, with the unit of the part's port.
+    """
+
+    name: str
+    parts: Mapping[str, Model]
+    wires: tuple[Wire, ...]
+    publication: Publication = field(default_factory=Publication)
+
+    def unit(self, port: Port) -> str:
+        """Return the unit of a port; that of the system is the unit of what it is wired to."""
+        if port.part == OUTSIDE:
+            ends = [w.end for w in self.wires if w.start == port]
+            port = ends[0] if ends else next(w.start for w in self.wires if w.end == port)
+        s = self.parts[port.part].structure
+        units = {v.name: v.unit for v in s.inputs} | {v.name: v.unit for v in s.outputs}
+        return units[port.name]
+
+    def ports(self, part: str) -> tuple[tuple[str, str], ...]:
+        """Return (name, kind) of the connected ports of a part, or of the system, inputs first."""
+        ends = dict.fromkeys(w.end.name for w in self.wires if w.end.part == part)
+        starts = dict.fromkeys(w.start.name for w in self.wires if w.start.part == part)
+        if part == OUTSIDE:
+            ends, starts = starts, ends
+        return (*((n, "input") for n in ends), *((n, "output") for n in starts))
+
+
+@dataclass(frozen=True)
+class Box:
+    """The rectangle of a part: lower left and upper right corner."""
+
+    name: str
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A drawing: its extent, the boxes, the places of all ports, and the way of each wire.
+
+    `paths` holds the corners of each wire, both ends included, in the order of the wires.
+    """
+
+    lower: float
+    upper: float
+    width: float
+    boxes: tuple[Box, ...]
+    places: Mapping[Port, Point]
+    wires: tuple[Wire, ...]
+    paths: tuple[tuple[Point, ...], ...]
+
+    def relative(self, port: Port) -> Point:
+        """Return the place of a port in its box, or in the drawing: 0, 0 to 1, 1."""
+        x, y = self.places[port]
+        box = next((b for b in self.boxes if b.name == port.part), None)
+        if box is None:
+            return x / self.width, (y - self.lower) / (self.upper - self.lower)
+        return (x - box.x1) / (box.x2 - box.x1), (y - box.y1) / (box.y2 - box.y1)
+
+
+def layout_of(wiring: WiredParts) -> Layout:
+    """Return the drawing of a system: its parts in a row, ports of its own level with a wire."""
+    routes, counts = _routes(wiring)
+    boxes = _boxes(wiring, counts)
+    width = boxes[-1].x2 + _EDGE + _GAP + _PITCH / 2 * counts[-1]
+    places: dict[Port, Point] = {}
+    for b in boxes:
+        for kind, x in (("input", b.x1), ("output", b.x2)):
+            names = [n for n, found in wiring.ports(b.name) if found == kind]
+            for k, name in enumerate(names):
+                places[Port(b.name, name)] = (x, b.y2 - _TITLE - _PITCH * k)
+    starts = [_EDGE, *(b.x2 + _GAP for b in boxes)]
+    bottom, above, below, paths = min(b.y1 for b in boxes), 0, 0, []
+    for wire, ((leaves, first), (arrives, last)) in zip(wiring.wires, routes, strict=True):
+        lane = None  # where it does not go straight
+        if arrives > leaves:
+            above += 1
+            lane = _PITCH * above
+        elif arrives < leaves:
+            below += 1
+            lane = bottom - _PITCH * below
+        for port, other, x in ((wire.start, wire.end, 0.0), (wire.end, wire.start, width)):
+            if port not in places:
+                places[port] = (x, places[other][1] if lane is None else lane)
+        begin, end = places[wire.start], places[wire.end]
+        left, right = starts[leaves] + _PITCH / 2 * first, starts[arrives] + _PITCH / 2 * last
+        level = begin[1] if lane is None else lane
+        corners = (begin, (left, begin[1]), (left, level), (right, level), (right, end[1]), end)
+        paths.append(_corners(corners))
+    heights = [y for path in paths for _, y in path]
+    lower, upper = min([*heights, bottom]) - _PITCH, max([*heights, 0.0]) + _PITCH
+    return Layout(lower, upper, width, boxes, places, wiring.wires, tuple(paths))
+
+
+def _routes(wiring: WiredParts) -> tuple[list[tuple[tuple[int, int], tuple[int, int]]], list[int]]:
+    """Return gap and number in it where each wire leaves and arrives, and the wires in each gap.
+
+    The gaps in the row are numbered from 0 at the left edge.
+    """
+    columns = {name: k for k, name in enumerate(wiring.parts)}
+    used, routes = [0] * (len(columns) + 1), []
+    for wire in wiring.wires:
+        leaves = columns.get(wire.start.part, -1) + 1
+        arrives = columns.get(wire.end.part, len(columns))
+        routes.append(((leaves, used[leaves]), (arrives, used[arrives])))
+        for gap in {leaves, arrives}:
+            used[gap] += 1
+    return routes, used
+
+
+def _boxes(wiring: WiredParts, counts: Sequence[int]) -> tuple[Box, ...]:
+    boxes, x = [], _EDGE
+    for name, count in zip(wiring.parts, counts, strict=False):
+        ports = wiring.ports(name)
+        sides = [[n for n, found in ports if found == kind] for kind in ("input", "output")]
+        longest = sum(max(map(len, side), default=0) for side in sides)
+        width = max(_CHAR * (longest + 4), 2.6 * (len(name) + 2))
+        x += _GAP + _PITCH / 2 * max(count, 1)
+        boxes.append(Box(name, x, -_TITLE - _PITCH * max(map(len, sides)), x + width, 0.0))
+        x += width
+    return tuple(boxes)
+
+
+def _corners(points: Sequence[Point]) -> tuple[Point, ...]:
+    """Return a polyline without repeated points and without corners on a straight line."""
+    kept = [points[0], *(b for a, b in pairwise(points) if a != b)]
+    inner = [
+        b
+        for a, b, c in zip(kept, kept[1:], kept[2:], strict=False)
+        if not (a[0] == b[0] == c[0] or a[1] == b[1] == c[1])
+    ]
+    return (kept[0], *inner, kept[-1])
+
+
+_INK, _FACE, _FRAME, _LANE, _FEEDBACK = "#222222", "#eef3f7", "#5b666f", "#0072b2", "#d55e00"
+_FONT, _TITLE_FONT, _MARGIN = 3.1, 4.2, 8.0
+#: Points on a drawing's unit of length, and pixels on an inch.
+_SCALE, _DPI = 2.83, 200
+
+
+def save_wiring(wiring: WiredParts, layout: Layout, path: str | os.PathLike[str]) -> Path:
+    """Write the wiring as SVG or PNG, by the suffix of the path.
+
+    Raises InputError for another suffix, or if the path cannot be written to.
+    """
+    target, kind = Path(path), Path(path).suffix.lower().removeprefix(".")
+    if kind not in ("svg", "png"):
+        raise InputError(f"{target}: a picture of the wiring is .svg or .png; name it so.")
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(wiring_picture(wiring, layout, kind))
+    return target
+
+
+def wiring_picture(wiring: WiredParts, layout: Layout, kind: str) -> bytes:
+    """Return the wiring as svg or png: boxes, ports with units, wires."""
+    content = BytesIO()
+    undated = {"Date": None} if kind == "svg" else None
+    # letters stay letters, and the same drawing gives the same bytes
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "psa_casadi"}):
+        _figure(wiring, layout).savefig(content, format=kind, dpi=_DPI, metadata=undated)
+    return content.getvalue()
+
+
+def _figure(wiring: WiredParts, layout: Layout) -> Figure:
+    """Draw boxes, wires and labels, with room for the outer labels."""
+    outer = [len(p.name) for p in layout.places if p.part == OUTSIDE]
+    side = _MARGIN + 1.9 * (max(outer, default=0) + 5)
+    bottom, width = layout.lower - _MARGIN / 2, layout.width + 2.0 * side
+    height = layout.upper - layout.lower + _MARGIN
+    figure = Figure(figsize=(width * _SCALE / 72.0, height * _SCALE / 72.0))
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_xlim(-side, -side + width)
+    axes.set_ylim(bottom, bottom + height)
+    axes.set_axis_off()
+    order = {b.name: k for k, b in enumerate(layout.boxes)}
+    for w, path in zip(layout.wires, layout.paths, strict=True):  # what leads back stands out
+        back = order.get(w.end.part, len(order)) <= order.get(w.start.part, -1)
+        axes.plot(*zip(*path, strict=True), color=_FEEDBACK if back else _LANE, linewidth=1.4)
+    style: dict[str, Any] = {"va": "center", "color": _INK, "zorder": 4}
+    for b in layout.boxes:
+        extent = (b.x2 - b.x1, b.y2 - b.y1)
+        axes.add_patch(
+            Rectangle((b.x1, b.y1), *extent, facecolor=_FACE, edgecolor=_FRAME, zorder=2)
+        )
+        axes.text(
+            (b.x1 + b.x2) / 2, b.y2 - 4.5, b.name.replace("_", " "), ha="center",
+            fontsize=_TITLE_FONT * _SCALE, fontweight="bold", **style,
+        )  # fmt: skip
+    lefts = {b.name: b.x1 for b in layout.boxes}
+    for p, (x, y) in layout.places.items():
+        axes.add_patch(Circle((x, y), 0.9, color=_FRAME if p.part else _LANE, zorder=3))
+        unit = wiring.unit(p)
+        text = f"{p.name} [{unit}]" if unit and p.part == OUTSIDE else p.name
+        begins = x == lefts[p.part] if p.part else x > 0.0
+        axes.text(
+            x + (2.2 if begins else -2.2), y, text, ha="left" if begins else "right",
+            fontsize=_FONT * _SCALE, **style,
+        )  # fmt: skip
+    return figure
+
+
+#: Relative tolerance that its master asks of the parts.
+TOLERANCE = 1e-6
+#: Rows of its table of results.
+_ROWS = 1000
+#: What SSP calls otherwise than FMI does.
+_PUBLISHED = {"version": "fileversion"}
+
+
+@dataclass(frozen=True)
+class Binding:
+    """Files in the archive that set parameters: of one part, or of the system (`OUTSIDE`)."""
+
+    part: str
+    values: str
+    mapping: str | None = None
+
+
+def structure_description(
+    wiring: WiredParts,
+    layout: Layout,
+    bindings: Sequence[Binding],
+    stop_time: float,
+    step: float,
+) -> str:
+    """Return the XML text of SystemStructure.ssd; FMUs are `resources/<part>.fmu`.
+
+    SSP 1.0 has no place for a communication step: `step` [s] stands in an annotation that
+    OMSimulator reads, and without which it opens no archive. A SystemGeometry is one that it
+    refuses; without it the drawing extends over all elements, as the standard has it.
+    """
+
+    def connection(wire: Wire, path: Sequence[Point]) -> tuple[dict[str, str], list[str]]:
+        """Return the ends of a wire, and the coordinates of its inner corners."""
+        ends = {}
+        for side, port in (("start", wire.start), ("end", wire.end)):
+            if port.part != OUTSIDE:
+                ends[f"{side}Element"] = port.part
+            ends[f"{side}Connector"] = port.name
+        return ends, [" ".join(map(_place, along)) for along in zip(*path[1:-1], strict=True)]
+
+    def ports(part: str) -> list[tuple[str, ...]]:
+        found = [(Port(part, name), kind) for name, kind in wiring.ports(part)]
+        return [
+            (p.name, kind, wiring.unit(p), *map(_place, layout.relative(p))) for p, kind in found
+        ]
+
+    parts = [
+        {
+            "name": box.name,
+            "about": markup.describe(wiring.parts[box.name]),
+            "ports": ports(box.name),
+            "corners": {n: _place(getattr(box, n)) for n in ("x1", "y1", "x2", "y2")},
+        }
+        for box in layout.boxes
+    ]
+    used = {wiring.unit(port) for wire in wiring.wires for port in (wire.start, wire.end)} - {""}
+    names = (name.replace("_", " ") for name in wiring.parts)
+    text = filled(
+        "SystemStructure.ssd",
+        name=wiring.name,
+        published={
+            _PUBLISHED.get(name, name): said for name, said in wiring.publication.stated.items()
+        },
+        tool=markup.generation_tool(),
+        about=f"{wiring.name.replace('_', ' ')}: {', '.join(names)}",
+        ports=ports(OUTSIDE),
+        bindings=bindings,
+        parts=parts,
+        wires=[connection(*pair) for pair in zip(layout.wires, layout.paths, strict=True)],
+        step=_decimal(step),
+        tolerance=_decimal(TOLERANCE),
+        units={name: markup.base_unit(parse_unit(name)) for name in sorted(used)},
+        stop_time=markup.number(stop_time),
+        interval=_decimal(stop_time / _ROWS),
+    )
+    check_text(text, "SystemStructure.ssd, an XML file,")
+    return text
+
+
+def _decimal(value: float) -> str:
+    """Return a number without exponent."""
+    return f"{value:.15f}".rstrip("0")
+
+
+def _place(value: float) -> str:
+    return f"{round(value, 6):.6g}"
+
+
+_VALUES = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
+_MAPPING = "http://ssp-standard.org/SSP1/SystemStructureParameterMapping"
+_COMMON = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+_FOLDER = "resources"
+
+
+def shared_parameters(parts: Mapping[str, Model]) -> dict[str, tuple[str, ...]]:
+    """Return the parts of each shared parameter by its name: same name, unit and value."""
+    owners: dict[tuple[str, str, float], list[str]] = {}
+    for part, model in parts.items():
+        for p in model.structure.parameters:
+            owners.setdefault((p.name, p.unit, model.values[p.name]), []).append(part)
+    names = [name for name, _, _ in owners]
+    return {
+        name: tuple(found)
+        for (name, _, _), found in owners.items()
+        if len(found) > 1 and names.count(name) == 1
+    }
+
+
+def parameter_files(
+    parts: Mapping[str, Model], name: str
+) -> tuple[dict[str, bytes], tuple[Binding, ...]]:
+    """Return the files of all parameter sets by their place in the archive, and their bindings."""
+    shared = shared_parameters(parts)
+    sets = {part: ET.fromstring(parameter_set(model)) for part, model in parts.items()}
+    units = {
+        u.get("name", ""): u for root in sets.values() for u in root.iter(f"{{{_COMMON}}}Unit")
+    }
+    entries: dict[str, bytes] = {}
+    bindings = []
+    lifted: dict[str, ET.Element] = {}
+    for part, root in sets.items():
+        own = []
+        for element in root.iter(f"{{{_VALUES}}}Parameter"):
+            named = element.get("name", "")
+            if part in shared.get(named, ()):
+                lifted.setdefault(named, element)
+            else:
+                own.append(element)
+        if own:
+            place = f"{_FOLDER}/{part}.ssv"
+            entries[place] = _set_text(parts[part].name, own, units)
+            bindings.append(Binding(part, place))
+    if lifted:
+        values, mapping = f"{_FOLDER}/shared.ssv", f"{_FOLDER}/shared.ssm"
+        elements = [lifted[n] for n in sorted(lifted)]
+        entries[values] = _set_text(f"{name}_shared", elements, units)
+        ET.register_namespace("ssm", _MAPPING)
+        attributes = {"version": "1.0", "generationTool": markup.generation_tool()}
+        root = ET.Element(f"{{{_MAPPING}}}ParameterMapping", attributes)
+        for source in sorted(shared):
+            for part in shared[source]:
+                target = {"source": source, "target": f"{part}.{source}"}
+                ET.SubElement(root, f"{{{_MAPPING}}}MappingEntry", target)
+        entries[mapping] = markup.xml_text(root).encode("utf-8")
+        bindings.append(Binding(OUTSIDE, values, mapping))
+    return entries, tuple(bindings)
+
+
+def _set_text(name: str, elements: Sequence[ET.Element], units: Mapping[str, ET.Element]) -> bytes:
+    """Return a parameter set of some parameters, with the units that they have."""
+    attributes = {"version": "1.0", "name": name, "generationTool": markup.generation_tool()}
+    root = ET.Element(f"{{{_VALUES}}}ParameterSet", attributes)
+    ET.SubElement(root, f"{{{_VALUES}}}Parameters").extend(elements)
+    used = {e.get("unit", "") for e in root.iter(f"{{{_VALUES}}}Real")} - {""}
+    if used:
+        ET.SubElement(root, f"{{{_VALUES}}}Units").extend([units[n] for n in sorted(used)])
+    return markup.xml_text(root).encode("utf-8")
+
+
+#: Growth of a step below which a system counts as stable: memories have the radius 1 itself.
+_GROWTH = 1e-7
+_STEPS_IN_SEARCH = 200
+_BISECTIONS = 40
+
+
+@dataclass(frozen=True)
+class Linear:
+    """All parts at rest, side by side: matrices A, B, C, D and the wires L, u = L y + outside."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    L: FloatArray
+
+    def exchange(self) -> FloatArray:
+        """Return K_0, inputs from states at a communication point, shape (nu, nx)."""
+        loop = np.eye(len(self.L)) - self.L @ self.D
+        return np.asarray(np.linalg.solve(loop, self.L @ self.C), dtype=float)
+
+    def step(self, h: float, *, rates: bool) -> FloatArray:
+        """Return M(h) [1], the map of the states over one communication step, shape (nx, nx)."""
+        nx, nu = self.B.shape
+        chain = np.zeros((nx + 2 * nu, nx + 2 * nu))
+        chain[:nx, :nx], chain[:nx, nx : nx + nu] = self.A, self.B
+        chain[nx : nx + nu, nx + nu :] = np.eye(nu)
+        flow = scipy.linalg.expm(chain * h)
+        K = self.exchange()
+        slopes = K @ (self.A + self.B @ K) if rates else np.zeros((nu, nx))
+        held, sloped = flow[:nx, nx : nx + nu], flow[:nx, nx + nu :]
+        return np.asarray(flow[:nx, :nx] + held @ K + sloped @ slopes)
+
+    def growth(self, h: float, *, rates: bool) -> float:
+        """Return the spectral radius of M(h)."""
+        return float(np.abs(np.linalg.eigvals(self.step(h, rates=rates))).max(initial=0.0))
+
+
+def linear(wiring: WiredParts) -> Linear:
+    """Return the parts at rest, each state and port in units of its nominal size.
+
+    Sampled parts hold their outputs, so they take no part in a loop.
+    """
+    pieces = []
+    for model in wiring.parts.values():
+        s, size = model.structure, model.state_nominals()
+        rest = [[v.start for v in group] for group in (s.states, s.inputs)]
+        held = [[v.start for v in s.sampled]] if s.sampled else []
+        found = s.slopes(0.0, *rest, model.parameter_vector(), *held)
+        a, b, c, d = (np.array(m, dtype=float).reshape(m.shape) for m in found)
+        pieces.append((a / size[:, None] * size, b / size[:, None], c * size, d))
+    a, b, c, d = (scipy.linalg.block_diag(*(p[k] for p in pieces)) for k in range(4))
+    ends = [(part, n) for part, model in wiring.parts.items() for n in model.input_names]
+    starts = [(part, n) for part, model in wiring.parts.items() for n in model.output_names]
+    wires = np.zeros((len(ends), len(starts)))
+    for wire in wiring.wires:
+        if OUTSIDE not in (wire.start.part, wire.end.part):
+            row = ends.index((wire.end.part, wire.end.name))
+            wires[row, starts.index((wire.start.part, wire.start.name))] = 1.0
+    return Linear(a, b, c, d, wires)
+
+
+def stable_step(wiring: WiredParts, *, rates: bool) -> float:
+    """Return the longest communication step [s] up to which all shorter ones are stable.
+
+    `rates` says whether inputs get slopes. Infinity if no loop turns unstable: at up to 100 times
+    the time of the slowest ordinary mode.
+    """
+    system = linear(wiring)
+    speeds = np.abs(np.linalg.eigvals(system.A + system.B @ system.exchange()))
+    speeds = speeds[speeds > 1e-6 * speeds.max(initial=0.0)]
+    if not speeds.size:
+        return float("inf")
+    steps = np.geomspace(1e-2 / speeds.max(), 1e2 / speeds.min(), _STEPS_IN_SEARCH)
+    for k, step in enumerate(steps):
+        if system.growth(float(step), rates=rates) > 1.0 + _GROWTH:
+            stable, unstable = float(steps[k - 1]) if k else 0.0, float(step)
+            for _ in range(_BISECTIONS):
+                middle = 0.5 * (stable + unstable)
+                if system.growth(middle, rates=rates) > 1.0 + _GROWTH:
+                    unstable = middle
+                else:
+                    stable = middle
+            return stable
+    return float("inf")
+
+
+def master_step(wiring: WiredParts, stop_time: float) -> float:
+    """Return a communication step [s] for a master that holds the inputs: 1, 2 or 5 times 10^k.
+
+    It is at most a twentieth of what stays stable, as the error of the coupling is of first order,
+    and a thousandth of the time that is simulated.
+    """
+    longest = min(stable_step(wiring, rates=False) / 20.0, stop_time / 1000.0)
+    size = 10.0 ** math.floor(math.log10(longest))
+    return max(round(k * size, 15) for k in (1.0, 2.0, 5.0) if k * size <= longest)
+
+
+#: Where the archive carries the picture of the wiring.
+PICTURE_ENTRY = "documentation/wiring.svg"
+#: What is simulated by default [s].
+STOP_TIME = 0.1
+
+
+def export_ssp(
+    system: System,
+    path: str | os.PathLike[str],
+    *,
+    platforms: Sequence[str] = ("host",),
+    stop_time: float = STOP_TIME,
+    publication: Publication | None = None,
+) -> Path:
+    """Write a system as an SSP archive (SSP 1.0, FMUs of FMI 2.0) and return its path.
+
+    The archive holds `SystemStructure.ssd` with units, connectors, wires and their drawing; in
+    `resources` the FMU of each part and the parameter sets; the picture of the wiring as SVG. The
+    same system gives the same bytes. `platforms` are those of `export_fmu`. `publication` says who
+    made the system and on what terms it is passed on; a part that says nothing of it says the same.
+
+    Raises what `connect` and `export_fmu` raise.
+    """
+    system.model()
+    wiring = wiring_of(system)
+    if publication is not None:
+        parts = {
+            name: part if part.publication.stated else replace(part, publication=publication)
+            for name, part in wiring.parts.items()
+        }
+        wiring = replace(wiring, parts=parts, publication=publication)
+    layout = layout_of(wiring)
+    entries, bindings = parameter_files(wiring.parts, wiring.name)
+    description = structure_description(
+        wiring, layout, bindings, stop_time, master_step(wiring, stop_time)
+    )
+    entries["SystemStructure.ssd"] = description.encode("utf-8")
+    entries[PICTURE_ENTRY] = wiring_picture(wiring, layout, "svg")
+    with temporary_folder() as folder:
+        for name, model in wiring.parts.items():
+            fmu = export_fmu(
+                model, folder / f"{name}.fmu", name=name, include_sensor=True,
+                platforms=platforms,
+            )  # fmt: skip
+            entries[f"resources/{name}.fmu"] = fmu.read_bytes()
+    with atomic_path(path) as temporary:
+        write_archive(temporary, entries)
+    return Path(path)
+
+
+def wiring_of(system: System) -> WiredParts:
+    """Return the parts with all wires, those from and to the surroundings too.
+
+    An input that has no wire and no name outside is no connector: it rests at its start value.
+    """
+
+    def port(text: str) -> Port:
+        return Port(*text.split(".", 1))
+
+    wires = [Wire(Port(OUTSIDE, name), port(end)) for name, end in system.inputs.items()]
+    wires += [Wire(port(start), port(end)) for start, end in system.wires]
+    wires += [Wire(port(start), Port(OUTSIDE, name)) for name, start in system.outputs.items()]
+    return WiredParts(system.name, system.parts, tuple(wires))

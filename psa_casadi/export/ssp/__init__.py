@@ -1,1 +1,0 @@
-"""A system of models as an SSP archive."""

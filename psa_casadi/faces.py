@@ -1,0 +1,139 @@
+"""`psa.identify` and `psa.diagnose`: of a stack's records, or of any model, which comes first."""
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from inspect import signature
+from typing import Any, overload
+
+from psa_casadi.component import Component
+from psa_casadi.diagnosis import diagnose as diagnosis
+from psa_casadi.diagnosis.ode import diagnose_ode
+from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.task import Method
+from psa_casadi.errors import InputError
+from psa_casadi.identification import identify as stack
+from psa_casadi.identification.identify import StackIdentification
+from psa_casadi.identification.multistart import identify_ode
+from psa_casadi.identification.result import Identification
+from psa_casadi.identification.start.ordinary import Hysteresis
+from psa_casadi.interruption import interruptible_work
+from psa_casadi.model.compose import Model
+from psa_casadi.progress import on_a_terminal
+from psa_casadi.records.read.reading import Records
+from psa_casadi.records.signals import Hold
+from psa_casadi.simulation.side_by_side import one_thread_of_algebra
+from psa_casadi.simulation.start import is_stack
+
+Progress = Callable[[str], None]
+
+
+def _told_of(own: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add to a function's help what it is for a model of one's own."""
+
+    def told(face: Callable[..., Any]) -> Callable[..., Any]:
+        words = f"Of a model of your own, {face.__name__}{signature(own)}:\n\n    {own.__doc__}"
+        face.__doc__ = f"{face.__doc__}\n    {words}"
+        return face
+
+    return told
+
+
+@overload
+def identify(
+    records: Records,
+    *,
+    model: Model | None = None,
+    stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
+    progress: Progress = ...,
+) -> StackIdentification: ...
+@overload
+def identify(
+    model: Model,
+    records: Any,
+    *,
+    free: Sequence[str] | None = None,
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+    hold: Hold | None = None,
+    progress: Progress = ...,
+) -> Identification: ...
+@on_a_terminal
+@_told_of(identify_ode)
+@wraps(stack.identify)
+def identify(*given: Any, **words: Any) -> Any:
+    """Identify a stack from its records, or a model of one's own, given first, from its."""
+    model, records = _models_first(given, words)
+    if model is None or is_stack(model):
+        return stack.identify(records, model=model, **_known(words, stack.identify))
+    return _own(identify_ode, model, records, words)
+
+
+@overload
+def diagnose(
+    records: Records,
+    *,
+    holdout: Records = (),
+    model: Model | None = None,
+    stiffness: float | None = None,
+    hysteresis: Hysteresis | None = None,
+    effects: Sequence[Component] | None = None,
+    method: Method | None = None,
+    progress: Progress = ...,
+) -> Diagnosis: ...
+@overload
+def diagnose(
+    model: Model,
+    records: Any,
+    *,
+    holdout: Any = (),
+    free: Sequence[str] | None = None,
+    leave_out: Sequence[str] = (),
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+    hold: Hold | None = None,
+    effects: Sequence[Component] = ...,
+    progress: Progress = ...,
+) -> OdeDiagnosis: ...
+@on_a_terminal
+@_told_of(diagnose_ode)
+@wraps(diagnosis.diagnose)
+def diagnose(*given: Any, **words: Any) -> Any:
+    """Diagnose a stack's records, or a model of one's own, given first, on its records."""
+    model, records = _models_first(given, words)
+    if model is None or is_stack(model):
+        return diagnosis.diagnose(records, model=model, **_known(words, diagnosis.diagnose))
+    return _own(diagnose_ode, model, records, words)
+
+
+@interruptible_work()
+@one_thread_of_algebra()
+def _own(work: Callable[..., Any], model: Model, records: Any, words: dict[str, Any]) -> Any:
+    return work(model, records, **_known(words, work))
+
+
+def _known(words: dict[str, Any], work: Callable[..., Any]) -> dict[str, Any]:
+    """Return the words for a piece of work. Raises InputError for one that it does not take."""
+    own = [n for n in signature(work).parameters if n not in ("model", "records")]
+    for word in words:
+        if word not in own:
+            what = "a model of your own" if "known_start" in own else "a stack"
+            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(own)}.")
+    return words
+
+
+def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model | None, Any]:
+    """Return the model, if there is one, and the records; `words` lose both."""
+    left = list(given)
+    model = left.pop(0) if left and isinstance(left[0], Model) else words.pop("model", None)
+    if left[1:] and isinstance(left[1], Model):
+        raise InputError(
+            "The model comes first and its records second: psa.diagnose(model, records). With the"
+            " records of a stack, name it: model=..."
+        )
+    records = left.pop(0) if left else words.pop("records", None)
+    if records is None or left:
+        raise InputError("Give records, or a model of your own and its records, and words beside.")
+    return model, records
