@@ -77,7 +77,7 @@ def refit(
     *,
     sigma: Sequence[float] | None = None,
     least: float = np.inf,
-    evaluations: int = POLISH,
+    evaluations: int | None = None,
     tolerance: float = 1e-5,
 ) -> Fit:
     """Continue a fit from where it stands, of the same parameters unless others are `free`.
@@ -94,7 +94,7 @@ def refit(
         previous.unknowns.names if free is None else free,
         sigma=levels,
         start_states=previous.starts(),
-        evaluations=evaluations,
+        evaluations=evaluations or POLISH,
         tolerance=tolerance,
         goal=now * (least / max(previous.rms, 1e-300)) ** 2,
     )
