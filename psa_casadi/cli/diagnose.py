@@ -3,6 +3,7 @@
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,7 @@ import psa_casadi as psa
 from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given, meant
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
-from psa_casadi.cli.own_model import Fitting, diagnosed_own
+from psa_casadi.cli.own_model import Fitting, own_diagnosis, own_model
 from psa_casadi.cli.screen import show, show_table, tell_written, width, working
 from psa_casadi.cli.steps import DIAGNOSE, events_to
 
@@ -72,52 +73,44 @@ def diagnose(
     """
     from psa_casadi.simulation.timings import stage, timed
 
-    if diagnosed_own(
-        model, records, holdout or (), fitting, reading, given, leave_out=leave_out or (),
-        expect=expect,
-        files={"--output": output, "--json": json, "--report": report, "--junit": junit},
-        others={
-            "--patch": patch, "--figure": figure, "--next": next_,
-            "--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis,
-            "--events": events, "--max-error": max_error, "--timings": timings,
-        },
-    ):  # fmt: skip
-        return
     outputs = {
         "--output": output, "--patch": patch, "--json": json, "--report": report,
         "--figure": figure,
     }  # fmt: skip
-    began, left_out = clock.perf_counter(), leave_out or []
+    began, left_out, held = clock.perf_counter(), leave_out or [], holdout or []
+    own = own_model(given, model, fitting)
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli import diagnosis_files as files
-            from psa_casadi.diagnosis.diagnose import diagnose as run
             from psa_casadi.diagnosis.result import DiagnosisInterrupted
             from psa_casadi.report.words.tables import timings_table
         with stage("reading"):
-            held, table = holdout or [], _searched(given, left_out)
-            given.stiffness(stiffness)
             beside = {"--next": next_, "--events": events, "--junit": junit}
             given.outputs({**outputs, **beside}, [*records, *held, model])
-            _keep_apart(given, output, model)
-            found = given.records(records, reading, held)
-            start = given.model_or_stack(model, stack, needed=False)
+            if own is None:
+                run = _of_stack(
+                    records, held, model, (stack, stiffness, hysteresis), reading, given, left_out
+                )
+                _keep_apart(given, output, model)
+            else:
+                run = own_diagnosis(
+                    own, records, held, fitting, reading, given, leave_out=left_out,
+                    others={
+                        "--patch": patch, "--next": next_, "--stack": stack,
+                        "--stiffness": stiffness, "--hysteresis": hysteresis,
+                    },
+                )  # fmt: skip
             wanted = files.expected(given, expect, max_error)
             given.check()
         with working("diagnosing", given.quiet, DIAGNOSE) as progress, events_to(events) as watch:
             try:
-                d = run(
-                    found[: given.fitted], holdout=found[given.fitted :], model=start,
-                    stiffness=stiffness, hysteresis=hysteresis, effects=table, progress=progress,
-                    watch=watch,
-                )  # fmt: skip
-                d = files.noted(d, left_out)
+                d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
             place = next_ or _beside(json or report)
             d, unpatched = _finish(d, place, outputs, (origin, still), progress)
         with stage("writing"):
-            path = None if output is None else str(output)
+            path = str(output) if output else None
             told = psa.story(d, origin=origin, width=width(), model_file=path)
     show(told, given.quiet)
     _tell_files(d, outputs, unpatched, given.quiet)
@@ -131,13 +124,39 @@ def diagnose(
     judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
 
 
+def _of_stack(
+    records: Sequence[Path],
+    held: Sequence[Path],
+    model: Path | None,
+    device: tuple[StackName, float | None, Hysteresis],
+    reading: Reading,
+    given: Given,
+    left_out: Sequence[str],
+) -> Callable[..., psa.OdeDiagnosis]:
+    """Read the records of a stack; return what diagnoses them, given `progress` and `watch`.
+
+    `device` are --stack, --stiffness and --hysteresis.
+    """
+    from psa_casadi.diagnosis.diagnose import diagnose as run
+
+    stack, stiffness, hysteresis = device
+    table = _searched(given, left_out)
+    given.stiffness(stiffness)
+    found = given.records(records, reading, held)
+    start = given.model_or_stack(model, stack, needed=False)
+    return partial(
+        run, found[: given.fitted], holdout=found[given.fitted :], model=start,
+        stiffness=stiffness, hysteresis=hysteresis, effects=table,
+    )  # fmt: skip
+
+
 def _finish(
-    d: "psa.Diagnosis",
+    d: psa.OdeDiagnosis,
     following: Path | None,
     outputs: Mapping[str, Path | None],
     page: tuple[str, bool],
     progress: Callable[[str], None],
-) -> "tuple[psa.Diagnosis, str]":
+) -> tuple[psa.OdeDiagnosis, str]:
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
     `page` says what the page calls the records, and whether it is still.
@@ -181,13 +200,14 @@ def _searched(given: Given, left_out: Sequence[str]) -> "tuple[psa.Component, ..
 
 
 def _tell_files(
-    d: "psa.Diagnosis", outputs: Mapping[str, Path | None], unpatched: str, quiet: bool
+    d: psa.OdeDiagnosis, outputs: Mapping[str, Path | None], unpatched: str, quiet: bool
 ) -> None:
     """Name the files that were written, and say why a patch is missing."""
     from psa_casadi.cli import diagnosis_files as files
 
     shown = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
-    tell_written(*shown, d.next_experiment.voltage_csv, quiet=quiet)
+    following = d.next_experiment.voltage_csv if isinstance(d, psa.Diagnosis) else None
+    tell_written(*shown, following, quiet=quiet)
     for line in [*files.models(d, outputs["--output"]), *([unpatched] if unpatched else [])]:
         show(line, quiet)
 

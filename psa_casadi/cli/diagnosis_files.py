@@ -17,12 +17,14 @@ from psa_casadi.records import write_record
 from psa_casadi.report.documents.junit import Case
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number
-from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
+from psa_casadi.report.words.verdict_words import VERDICTS, of_range, verdict_sentence
 
 
-def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
+def alternatives(
+    d: result.OdeDiagnosis, output: Path | None
+) -> list[tuple[result.Alternative, Path]]:
     """Return the models with another cause, each with its file beside the extended model's."""
-    if output is None:
+    if output is None or not isinstance(d, result.Diagnosis):
         return []
     return [
         (a, output.with_name(f"{output.stem}_{a.instead}_for_{a.cause}.json"))
@@ -30,7 +32,7 @@ def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.
     ]
 
 
-def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
+def noted(d: result.OdeDiagnosis, left_out: Sequence[str]) -> result.OdeDiagnosis:
     """Say in the remarks which effects were not looked for."""
     if not left_out:
         return d
@@ -38,7 +40,7 @@ def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
     return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
 
 
-def models(d: result.Diagnosis, output: Path | None) -> list[str]:
+def models(d: result.OdeDiagnosis, output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"
@@ -59,7 +61,7 @@ def keep_unfinished(stop: result.DiagnosisInterrupted, outputs: Mapping[str, Pat
 
 
 def keep(
-    d: result.Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]
+    d: result.OdeDiagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]
 ) -> str:
     """Write what takes no time of a finished diagnosis, and say which files there are."""
     quick = ("--output", "--json")
@@ -69,7 +71,7 @@ def keep(
 
 
 def write(
-    d: result.Diagnosis,
+    d: result.OdeDiagnosis,
     outputs: Mapping[str, Path | None],
     origin: str,
     written: list[Path],
@@ -96,10 +98,10 @@ def write(
 
 
 def with_next(
-    d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]
-) -> result.Diagnosis:
+    d: result.OdeDiagnosis, path: Path | None, progress: Callable[[str], None]
+) -> result.OdeDiagnosis:
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
-    if path is None or d.verdict != "ambiguous":
+    if path is None or not isinstance(d, result.Diagnosis) or d.verdict != "ambiguous":
         return d
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
@@ -120,9 +122,9 @@ def with_next(
     return replace(d, next_experiment=following)
 
 
-def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
+def write_patch(d: result.OdeDiagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
     """Write the model with the unnamed correction; say why where there is none to write."""
-    if path is None:
+    if path is None or not isinstance(d, result.Diagnosis):
         return ""
     progress("fitting the unnamed correction")
     try:
@@ -152,21 +154,15 @@ def expected(
     return wanted, None if max_error is None else largest
 
 
-def verdict_case(verdict: str, sentence: str, wanted: Sequence[str]) -> Case:
-    """Return a verdict as a test, failed where it is none of those wanted."""
-    wrong = f"The verdict is {verdict}; expected {listing(wanted, 'or')}."
-    failed = bool(wanted) and verdict not in wanted
-    return Case("verdict", f"{verdict}: {sentence}", wrong if failed else "")
-
-
-def cases(d: result.Diagnosis, verdicts: tuple[str, ...], max_error: float | None) -> list[Case]:
-    """Return verdict and held-out error of the extended model as tests, failed or passed."""
-    large = ""
-    error = d.extended_errors.holdout_nrmse_percent
-    shown = f"{number(error)} % of the range"
-    if max_error is not None and not error <= max_error:
+def cases(d: result.OdeDiagnosis, wanted: tuple[str, ...], max_error: float | None) -> list[Case]:
+    """Return verdict and largest held-out error of the extended model as tests, failed or not."""
+    wrong = f"The verdict is {d.verdict}; expected {listing(wanted, 'or')}."
+    failed = bool(wanted) and d.verdict not in wanted
+    verdict = Case("verdict", f"{d.verdict}: {verdict_sentence(d)}", wrong if failed else "")
+    large, shares = "", of_range(d, extended=True)
+    worst = max(shares, key=lambda output: shares[output])
+    output = f" of {worst}" if len(shares) > 1 else ""
+    shown = f"{number(shares[worst])} % of the range{output}"
+    if max_error is not None and not shares[worst] <= max_error:
         large = f"The extended model's held-out error is {shown}; expected {max_error:g} % at most."
-    return [
-        verdict_case(d.verdict, verdict_sentence(d), verdicts),
-        Case("held-out error", f"{shown} by the extended model", large),
-    ]
+    return [verdict, Case("held-out error", f"{shown} by the extended model", large)]

@@ -3,19 +3,16 @@
 import re
 import runpy
 import sys
-import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading
-from psa_casadi.cli.screen import show, tell_written, width, working
 from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
@@ -95,8 +92,8 @@ def _made(file: Path, name: str) -> psa.Model:
     return model
 
 
-def diagnosed_own(
-    path: Path | None,
+def own_diagnosis(
+    model: psa.Model,
     records: Sequence[Path],
     held_out: Sequence[Path],
     fitting: Fitting,
@@ -104,40 +101,16 @@ def diagnosed_own(
     given: Given,
     *,
     leave_out: Sequence[str],
-    expect: str | None,
-    files: Mapping[str, Path | None],
     others: Mapping[str, object],
-) -> bool:
-    """Diagnose a model of one's own: `files` are --output, --json, --report and --junit.
+) -> Callable[..., psa.OdeDiagnosis]:
+    """Read the records of a model of one's own; return what diagnoses it.
 
-    False where the path names none. `others` are options that must be empty.
+    That takes `progress` and `watch`; `others` are options that must be empty.
     """
-    model = own_model(given, path, fitting)
-    if model is None:
-        return False
-    from psa_casadi.cli.diagnosis_files import expected, verdict_case
-    from psa_casadi.report.words.verdict_words import verdict_sentence
-
-    began, own = clock.perf_counter(), given.of_any_model()
+    own = given.of_any_model()
     given.refuse(others)
-    given.outputs(files, [*records, *held_out])
     measured, held = (given.signals(model, part, reading) for part in (records, held_out))
-    wanted, _ = expected(given, expect, None)
-    given.check()
-    with working("diagnosing", given.quiet) as progress:
-        d = psa.diagnose(
-            model, measured, holdout=held, leave_out=leave_out, effects=own, progress=progress,
-            **fitting.words,
-        )  # fmt: skip
-    output, json, report, junit = files.values()
-    if output is not None:
-        psa.save_model(d.model, output)
-    if json is not None:
-        atomic_write(json, d.to_json())
-    if report is not None:
-        psa.write_report(d, report)
-    show(psa.story(d, width=width()), given.quiet)
-    tell_written(output, json, report, quiet=given.quiet)
-    case = verdict_case(d.verdict, verdict_sentence(d), wanted)
-    judge("diagnose", ", ".join(p.name for p in records), [case], junit, began, tells=True)
-    return True
+    return partial(
+        psa.diagnose, model, measured, holdout=held, leave_out=leave_out, effects=own,
+        **fitting.words,
+    )  # fmt: skip

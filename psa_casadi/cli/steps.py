@@ -36,7 +36,10 @@ class Course:
 
 
 _BASE = ("starting values", ("starting values",))
-_FIT = ("the base model", ("base fit", "exchanged", "resonances and lags", "moments", "the model"))
+_FIT = (
+    "the base model",
+    ("base fit", "exchanged", "resonances and lags", "moments", "the model", "fitting from"),
+)
 IDENTIFY = Course(
     (_BASE, _FIT, ("what to measure next", ("what further",)), ("files", ("profile", "writing"))),
     20.0,
@@ -45,12 +48,12 @@ DIAGNOSE = Course(
     (
         _BASE,
         _FIT,
-        ("screening the effects", ("the displacement with", "screening")),
+        ("screening the effects", ("the displacement with", "screening", "searching again")),
         (
             "trying causes",
             ("cause ", "several causes", "without ", "all causes", "fitting the r", "the same"),
         ),
-        ("judging", ("judging",)),
+        ("judging", ("judging", "a free function")),
         ("files", ("comparing", "improving", "writing", "fitting the unnamed")),
     ),
     40.0,

@@ -53,7 +53,7 @@ class _Law:
     scales: dict[str, float]
 
 
-def free_functions(view: View, task: Task, base: Model, scale: Scale) -> list[FreeFunction]:
+def fit_free_functions(view: View, task: Task, base: Model, scale: Scale) -> list[FreeFunction]:
     """Fit the most telling free functions beside a hypothesis; return them, the best first.
 
     `base` is the model before its ports were opened.

@@ -162,15 +162,9 @@ def held_out_parts(
 
     The parts are those of `psa_casadi.diagnosis.held_out`.
     """
-    sums, counts = parts_of(*(held_out_columns(experiments, p) for p in predicted))
+    each = [held_out_residuals(experiments, p) for p in predicted]
+    sums, counts = parts_of(*([r[:, None] for r in own] for own in each))
     return sums[:, :, 0], counts[:, 0]
-
-
-def held_out_columns(
-    experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """Return `held_out_residuals` as columns (n, 1): the displacement is the one output."""
-    return [r[:, None] for r in held_out_residuals(experiments, predicted)]
 
 
 def gain_of(

@@ -1,6 +1,6 @@
 """From what a search found to a diagnosis of any model: do the names stand, and what is left?"""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,7 +11,7 @@ from psa_casadi.any_model.effects.attached import Attached, extended
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
-from psa_casadi.diagnosis.free_functions import free_functions
+from psa_casadi.diagnosis.free_functions import fit_free_functions
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
@@ -28,8 +28,9 @@ from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.steps import Step, steps_of
-from psa_casadi.diagnosis.task import LIMITS, Thresholds
+from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.result import MISSED, with_told
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
@@ -81,37 +82,12 @@ class Weighed:
         return None
 
 
-def verdict_by(*, missing: bool, withdrawn: bool, ambiguous: bool, more: bool) -> Verdict:
-    """Return the verdict: is something `missing`, do no names stand, are there rivals, more left?
-
-    The first of these that is so decides.
-    """
-    if not missing:
-        return "adequate"
-    if withdrawn:
-        return "unexplained"
-    if ambiguous:
-        return "ambiguous"
-    return "partly_explained" if more else "cause_named"
-
-
 def told_from(step: Step, limits: Thresholds) -> tuple[str, ...]:
     """Effects that may as well be a step's cause: with the chosen one, the credible set."""
     if step.chosen is None:
         return ()
     within = credible_set(step.probability, limits.credible)
     return tuple(name for name in within if name != step.cause.name)
-
-
-def too_small(causes: Collection[Share], limits: Thresholds = LIMITS) -> tuple[Share, ...]:
-    """Return causes that are not named where structure remains: the form of the others is wrong.
-
-    Each removes less of the base's excess than a form may miss, and less than `enough` of what the
-    largest does: that one is always named.
-    """
-    most = max((c.share for c in causes), default=0.0)
-    least = min(limits.form, limits.enough * most if most > 0.0 else most)
-    return tuple(c for c in causes if c.share < least)
 
 
 class Judge:
@@ -229,17 +205,19 @@ class Judge:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """The verdict."""
-        if not self.driven:
-            return "not_driven"
+        """The verdict; the first of these that is so decides."""
         found = [s for s in self.steps if s.chosen is not None and s.cause.name not in self.vague]
         little = self.last.test.alarm and self.weighed.least[1] < self.limits.enough
-        return verdict_by(
-            missing=self.missing,
-            withdrawn=not self.stands or not found or little,
-            ambiguous=bool(found and told_from(found[0], self.limits)),
-            more=bool(self.vague) or not self.left(self.last).white,
-        )
+        if not self.driven:
+            return "not_driven"
+        if not self.missing:
+            return "adequate"
+        if not self.stands or not found or little:
+            return "unexplained"
+        if told_from(found[0], self.limits):
+            return "ambiguous"
+        more = self.vague or not self.left(self.last).white
+        return "partly_explained" if more else "cause_named"
 
     @cached_property
     def kept(self) -> tuple[Step, ...]:
@@ -274,10 +252,17 @@ class Judge:
 
     @cached_property
     def small(self) -> tuple[Share, ...]:
-        """Causes that remove too little to be named where structure remains."""
+        """Causes that are not named where structure remains: the form of the others is wrong.
+
+        Each removes less of the base's excess than a form may miss, and less than `enough` of what
+        the largest does: that one is always named.
+        """
         if not self.last.test.alarm or len(self.steps) < 2 or self.verdict not in NAMING:
             return ()
-        return too_small([c for c in self.budget.causes if c.what not in self.vague], self.limits)
+        shares = [c for c in self.budget.causes if c.what not in self.vague]
+        most = max((c.share for c in shares), default=0.0)
+        least = min(self.limits.form, self.limits.enough * most if most > 0.0 else most)
+        return tuple(c for c in shares if c.share < least)
 
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
@@ -389,6 +374,24 @@ class Judge:
         }
 
 
+def model_of(
+    base: Model,
+    fit: Fit,
+    effects: Sequence[Attached],
+    experiments: Sequence[Experiment],
+    *,
+    interrupted: bool = False,
+) -> Model:
+    """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
+    model = extended(base, effects)
+    values = {n: v for n, v in fit.model.values.items() if n in model.values}
+    sure, given = determinacy(fit, experiments), [e.record for e in experiments]
+    return with_told(
+        model.with_values(values), given, sure.names, sure.intervals, force_scale="given",
+        interrupted=interrupted,
+    )  # fmt: skip
+
+
 class ModelJudge(Judge):
     """The judge of any model: `base` as it was before the search, `table` effects at its ports."""
 
@@ -411,14 +414,8 @@ class ModelJudge(Judge):
     @cached_property
     def model(self) -> Model:
         """The extended model, open at the ports that it needs alone."""
-        model = extended(self.base, [self.table[s.cause.name] for s in self.kept])
-        values = self.final.fit.model.values
-        model = model.with_values({n: v for n, v in values.items() if n in model.values})
-        sure, given = (
-            determinacy(self.final.fit, self.experiments),
-            [e.record for e in self.experiments],
-        )
-        return with_told(model, given, sure.names, sure.intervals, force_scale="given")
+        attached = [self.table[s.cause.name] for s in self.kept]
+        return model_of(self.base, self.final.fit, attached, self.experiments)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Fit free functions beside a hypothesis; none beside causes that leave no structure."""
@@ -426,7 +423,7 @@ class ModelJudge(Judge):
         if of.causes and not view.test.alarm:
             return ()
         scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
-        return free_functions(view, self.task, self.base, scale)
+        return fit_free_functions(view, self.task, self.base, scale)
 
     def unseen(self, step: Step) -> tuple[Note, float] | None:
         """Return which output's held-out samples are unlike the fitted ones."""

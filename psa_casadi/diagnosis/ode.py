@@ -5,16 +5,16 @@ from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
-from psa_casadi.any_model.effects.attached import of_ones_own
+from psa_casadi.any_model.effects.attached import Attached, of_ones_own
 from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.judgement import ModelJudge
+from psa_casadi.diagnosis.judgement import ModelJudge, model_of
 from psa_casadi.diagnosis.pack import Pack, Task
-from psa_casadi.diagnosis.result import OdeDiagnosis
+from psa_casadi.diagnosis.result import DiagnosisInterrupted, OdeDiagnosis
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.rivals import fit_rivals
-from psa_casadi.diagnosis.task import Method
+from psa_casadi.diagnosis.task import Method, Tried
 from psa_casadi.errors import InputError
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit
@@ -45,6 +45,7 @@ def diagnose_ode(
     hold: Hold | None = None,
     effects: Sequence[Component] = (),
     progress: Callable[[str], None] = lambda _: None,
+    watch: Callable[[Tried], None] = lambda _: None,
 ) -> OdeDiagnosis:
     """Find what a model gets wrong on its records, name the cause and its place, measure the gain.
 
@@ -54,10 +55,11 @@ def diagnose_ode(
     `leave_out` names effects, or beginnings of their names such as "zero_of", that cannot be;
     `effects` are components of your own, which are searched beside these: each has a gain and adds
     a term to a port (`applied_u` of an input u, `rate_x` of a state x, `shown_y` of an output y).
-    Other words are those of `identify`.
+    Other words are those of `identify`. `watch` gets every hypothesis of the search (`Tried`).
 
     Raises InputError for records or names that do not fit, SimulationError where the model cannot
-    be simulated at its values.
+    be simulated at its values, DiagnosisInterrupted with the best model so far at a keyboard
+    interrupt once there is one.
     """
     refuse_unfit(model)
     if model.effects:
@@ -74,32 +76,50 @@ def diagnose_ode(
     base, runs, _ = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)
     if base.interrupted:
         raise KeyboardInterrupt
-    sizes = sizes_of(base.model, runs, base.starts())
-    gone = (*leave_out, *(f"zero_of_{n}" for n in shifted))
-    own_ones = [of_ones_own(base.model, c) for c in effects]
-    every = [*effects_of(base.model, sizes), *own_ones]
-    known_names = [e.name for e in every]
-    for name in leave_out:
-        if not any(n.startswith(name) for n in known_names):
-            near = get_close_matches(name, known_names, 3, 0.3) or known_names
-            raise InputError(
-                f"`leave_out` has '{name}', which begins the name of no effect; of the"
-                f" {len(known_names)} there are, the nearest are {', '.join(near)}."
-            )
-    table = {e.name: e for e in every if not e.name.startswith(gone)}
-    searched = tuple(e.component for e in table.values())
+    table = _table(base, runs, effects, leave_out, [f"zero_of_{n}" for n in shifted])
+    searched, so_far = tuple(e.component for e in table.values()), [base]
 
     def search(base: Fit, experiments: tuple[Experiment, ...]) -> Known:
         opened = replace(base, model=with_ports(base.model))
-        method = Method(without=_OF_STACKS)
-        return best_first(opened, Task(experiments, searched, Pack(), method, progress))
+        method, pack = Method(without=_OF_STACKS), Pack()
+        task = Task(experiments, searched, pack, method, progress, so_far.append, watch)
+        found = best_first(opened, task)
+        task.keep(found.answer.fit)
+        return found
 
-    known = search(base, runs)
-    told = with_noise(known.answer.fit, runs)
-    if unlike(told, runs):
-        progress("searching again, noise by record")
-        known = search(reweighted(base, told), told)
-    fit_rivals(known)
-    progress("judging")
-    found = ModelJudge(known, base.model, table).conclude()
+    try:
+        known = search(base, runs)
+        told = with_noise(known.answer.fit, runs)
+        if unlike(told, runs):
+            progress("searching again, noise by record")
+            known = search(reweighted(base, told), told)
+        fit_rivals(known)
+        progress("judging")
+        found = ModelJudge(known, base.model, table).conclude()
+    except KeyboardInterrupt:
+        best = so_far[-1]
+        attached = [table[c.name] for c in best.model.effects]
+        whole = model_of(base.model, best, attached, runs, interrupted=True)
+        raise DiagnosisInterrupted(whole) from None
     return replace(found, remarks=(*found.remarks, *told_of_columns(model, runs)))
+
+
+def _table(
+    base: Fit,
+    runs: Sequence[Experiment],
+    effects: Sequence[Component],
+    leave_out: Sequence[str],
+    known: Sequence[str],
+) -> dict[str, Attached]:
+    """Return the effects to search at a model's ports, by name, without those that are `known`."""
+    sizes = sizes_of(base.model, runs, base.starts())
+    every = [*effects_of(base.model, sizes), *(of_ones_own(base.model, c) for c in effects)]
+    names = [e.name for e in every]
+    for name in leave_out:
+        if not any(n.startswith(name) for n in names):
+            near = get_close_matches(name, names, 3, 0.3) or names
+            raise InputError(
+                f"`leave_out` has '{name}', which begins the name of no effect; of the"
+                f" {len(names)} there are, the nearest are {', '.join(near)}."
+            )
+    return {e.name: e for e in every if not e.name.startswith((*leave_out, *known))}

@@ -67,15 +67,8 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
 
 def line(result: Plotted | Told) -> str:
     """Return a result in one line."""
-    if isinstance(result, Diagnosis | DiagnosisFile):
-        before, after = (
-            e.holdout_nrmse_percent for e in (result.base_errors, result.extended_errors)
-        )
-        first = f"{number(before, 2)} -> " if before != after else ""
-        errors = f"{first}{number(after, 2)} % of range rms"
-        return f"<Diagnosis {result.verdict}{_causes(result)}; held-out error {errors}>"
     if isinstance(result, OdeDiagnosis | AnyDiagnosisFile):
-        return f"<Diagnosis of an own model {result.verdict}{_causes(result)}>"
+        return _diagnosis(result)
     if isinstance(result, StackIdentification):
         count = len(result.experiments)
         span = max(e.record.range_m for e in result.experiments)
@@ -93,9 +86,15 @@ def line(result: Plotted | Told) -> str:
     return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
 
 
-def _causes(d: OdeDiagnosis | Told) -> str:
-    causes = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
-    return f": {causes}" if causes else ""
+def _diagnosis(d: OdeDiagnosis | Told) -> str:
+    named = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
+    causes = f": {named}" if named else ""
+    if not isinstance(d, Diagnosis | DiagnosisFile):
+        return f"<Diagnosis of an own model {d.verdict}{causes}>"
+    before, after = (e.holdout_nrmse_percent for e in (d.base_errors, d.extended_errors))
+    first = f"{number(before, 2)} -> " if before != after else ""
+    errors = f"{first}{number(after, 2)} % of range rms"
+    return f"<Diagnosis {d.verdict}{causes}; held-out error {errors}>"
 
 
 def cell(result: Plotted | Model | Told) -> str:

@@ -16,6 +16,7 @@ from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
 from psa_casadi.any_model.effects.attached import extended
 from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import with_ports
 from psa_casadi.records.signals import Signals
@@ -223,6 +224,22 @@ def test_a_cause_that_no_effect_has_is_unexplained() -> None:
     assert np.std(x - free.along) < np.std(x - d.base[0][:, 0])  # with it, the model is nearer
     assert free.unit == "m/s2"
     valid("own_model", d.to_json())
+
+
+@pytest.mark.parametrize(
+    ("word", "effects"), [("screening", []), ("judging", ["friction_in_speed"])]
+)
+def test_an_interrupt_keeps_the_best_model_so_far(word: str, effects: list[str]) -> None:
+    def stop(told: str) -> None:
+        if told.startswith(word):
+            raise KeyboardInterrupt
+
+    with pytest.raises(DiagnosisInterrupted) as ended:
+        psa.diagnose(motor(), plants.motor(1), starts=1, progress=stop)
+    found = ended.value.model
+    assert [c.name for c in found.effects] == effects
+    assert found.provenance.interrupted
+    assert found.values["R"] == pytest.approx(1.2, rel=0.05)
 
 
 @pytest.mark.slow

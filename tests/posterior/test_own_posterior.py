@@ -54,7 +54,7 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
     """The records tell so much that the posterior is nearly normal."""
     arviz = pytest.importorskip("arviz")
     held = []
-    for seed in (1, 3, 5):
+    for seed in (1, 3):
         found = psa.sample(
             motor(), records(seed), starts=1, chains=2, draws=250, tune=200, seed=seed
         )
@@ -66,7 +66,7 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
             assert abs(f.mean - TRUTH[f.name]) < 4.0 * f.sd
             assert f.sd == pytest.approx(fitted.errors[f.name], rel=0.2)
         assert not found.divergences
-    assert sum(held) >= 8  # of 12 that hold it with 90 %: fewer in 0.4 % of all data
+    assert sum(held) >= 5  # of 8 that hold it with 90 %: fewer in 0.5 % of all data
     found.save(tmp_path / "posterior.nc")
     tree = arviz.from_netcdf(tmp_path / "posterior.nc")
     shown = tree.posterior_predictive.i_1.to_numpy()[0]

@@ -125,6 +125,7 @@ def diagnosis(
         noise_floor_rms_m=NOISE,
         base_errors=errors,
         extended_errors=Errors(5.1e-9, 8.5e-9, 2e-8, 0.052) if added else errors,
+        errors=(result.OutputError("displacement", "m", NOISE, 5e-8, 8.5e-9 if added else 5e-8),),
         budget=StackBudget(
             replace(removes, what="together"), (removes,) * added, None, 4.97e-8, NOISE, *left
         ),

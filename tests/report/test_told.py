@@ -90,7 +90,8 @@ def not_fitted() -> StackIdentification:
 def wide(d: psa.Diagnosis) -> psa.Diagnosis:
     """Return a diagnosis whose base errs by micrometres."""
     return replace(
-        d, base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
+        d, errors=(replace(d.errors[0], base=2.5e-6, extended=5e-8),),
+        base_errors=Errors(2e-6, 2.5e-6, 9e-6, 5.0),
         extended_errors=Errors(4e-8, 5e-8, 1e-7, 0.1),
     )  # fmt: skip
 

@@ -380,21 +380,6 @@ def test_the_three_plants_are_three() -> None:
         assert y == pytest.approx(100.0 / hard[name], rel=1e-4), name
 
 
-@slow
-@pytest.mark.xdist_group("verification")
-def test_the_micromanipulator_is_judged_on_what_was_kept(
-    measured_data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PSA_CASADI_DATA", str(measured_data))
-    sine, minor = paper.instrument(silent)
-    kept = np.isfinite(np.asarray(sine.record.displacement))
-    assert 0.15 < kept.mean() < 0.35
-    assert np.isnan(np.asarray(minor.record.displacement)[: minor.record.n // 10]).all()
-    assert 100.0 * sine.rms / sine.range_m < 0.5
-    assert 100.0 * minor.largest / minor.range_m < 6.0
-    assert "measured (Y. N. Aye)" in paper.verification_tables([sine, minor])[0].note
-
-
 def test_without_the_measured_records_their_rows_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -107,27 +108,8 @@ def write_fit_report(
     Raises InputError when `path` cannot be written to.
     """
     series = series_of_fit(found)
-    if not isinstance(found, StackIdentification):
-        page = render(
-            "fit.html",
-            f"Identification of {plain(found.model.name)}",
-            **_shared(found.model, series, found.experiments, origin),
-            found=found,
-            verdict=text.fit_sentence(found),
-            tiles=(),
-            live=None if still else live_fit(found, series),
-            determined=(),
-            profiles=(),
-            starts=(),
-            statuses={},
-            errors=tables.fit_error_table(
-                series, [residual_figures(s, s.curves[0]) for s in series]
-            ),
-        )
-    else:
-        live = None if still else live_fit(found, series)
-        page = fit_page(found, series, origin=origin, profiles=profiles, live=live)
-    atomic_write(path, page)
+    live = None if still else live_fit(found, series)
+    atomic_write(path, fit_page(found, series, origin=origin, profiles=profiles, live=live))
 
 
 def _diagnosis_page(d: OdeDiagnosis, origin: str, still: bool, model_file: str | None) -> str:
@@ -250,7 +232,7 @@ def _of_stack(d: Diagnosis) -> dict[str, Any]:
 
 
 def fit_page(
-    found: StackIdentification,
+    found: Identification,
     series: Sequence[Series],
     *,
     origin: str = "measured",
@@ -262,25 +244,31 @@ def fit_page(
     `live` is the model if it is to run in the page.
     """
     scale = max((s.residual_scale for s in series), key=lambda s: 1.0 / s.factor)
-    with phrases.one_unit(scale):
+    stack = found if isinstance(found, StackIdentification) else None
+    with phrases.one_unit(scale) if stack else nullcontext():
         figures = [residual_figures(s, s.curves[0]) for s in series]
-        graded = fit_words.grades(found)
-        noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
-        span = max(e.record.range_m for e in found.experiments)
-        error = fit_words.error_sentence(found.fit.rms, noise, span, scale, origin)
-        tiles = [
-            (f"error, {kind}", scale.text(size), f"{number(100.0 * size / span, 2)} % of the range")
-            for kind, size in (("rms", found.fit.rms), ("largest", max(f.largest for f in figures)))
-        ]
-        tiles.append(("noise, rms", scale.text(noise), "from fast differences"))
+        graded, tiles = fit_words.grades(found), []
+        error = text.fit_sentence(found) if stack is None else ""
+        if stack:
+            noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
+            span = max(e.record.range_m for e in found.experiments)
+            error = fit_words.error_sentence(found.fit.rms, noise, span, scale, origin)
+            largest = max(f.largest for f in figures)
+            tiles = [
+                (f"error, {what}", scale.text(v), f"{number(100.0 * v / span, 2)} % of the range")
+                for what, v in (("rms", found.fit.rms), ("largest", largest))
+            ]
+            tiles.append(("noise, rms", scale.text(noise), "from fast differences"))
         if fitted := sum(g.degree != "fixed" for g in graded):
             count = f"{len(fit_words.named(graded, 'determined'))} of {fitted}"
             tiles.append(("parameters determined", count, "to 10 % or better"))
         return render(
             "fit.html",
-            "Identification of a stack",
+            f"Identification of {'a stack' if stack else plain(found.model.name)}",
             **_shared(found.model, series, found.experiments, origin, found),
             found=found,
+            combinations=stack.combinations if stack else (),
+            further=stack.advice if stack else (),
             verdict=f"{error} {fit_words.determined_sentence(graded)}",
             tiles=tiles,
             live=live,
@@ -293,7 +281,7 @@ def fit_page(
                 )
                 for p in profiles
             ],
-            starts=tables.starts_table(found.starts, scale) if found.starts else (),
+            starts=tables.starts_table(found.starts, series[0].residual_scale),
             statuses=_STATUSES,
             errors=tables.fit_error_table(series, figures),
         )
@@ -326,9 +314,9 @@ def _shared(
     series: Sequence[Series],
     given: Sequence[Experiment],
     origin: str,
-    found: StackIdentification | None = None,
+    found: Identification | None = None,
 ) -> dict[str, Any]:
-    """Return what all four pages show: the record that is missed most, every record, parameters.
+    """Return what pages of results show: the record that is missed most, every record, parameters.
 
     On the page of a fit, `found`, the former is only seen where no script runs.
     """
@@ -342,7 +330,7 @@ def _shared(
         records.time_plot(worst, origin, limit),
         f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
     )
-    known = fit_words.determined(model, found)
+    known = fit_words.determined(model, found if isinstance(found, StackIdentification) else None)
     others = [n for n in model.parameter_names if n not in known]
     count = len(given)
     return {
@@ -535,9 +523,6 @@ def _of_the_data(d: Diagnosis, name: str) -> Picture | None:
         axis = AXES[name].title.lower()
         note = f"No record has {axis} to compare; this is the view that shows most."
     return None if data is None else Picture(data.caption, data.panel, note)
-
-
-# An identification of a stack
 
 
 def _determined(found: Identification, graded: tuple[fit_words.Grade, ...]) -> list[Picture]:

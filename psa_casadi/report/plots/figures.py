@@ -70,7 +70,7 @@ _OVER = {
 
 
 def save_figure(
-    diagnosis: Diagnosis,
+    diagnosis: OdeDiagnosis,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -108,7 +108,7 @@ def figure_of(result: Plotted) -> Figure:
     return outputs_figure(same) if len(same) > 1 else record_figure(worst)
 
 
-def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
+def diagnosis_figure(diagnosis: OdeDiagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
     verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
     figure, grid, shown = _sheet(series_of(diagnosis), origin, "base model", verdict)
@@ -209,7 +209,7 @@ def _draw_residual(axes: Axes, s: Series, origin: str = "measured") -> None:
     axes.set_ylim(-1.1 * largest, 1.45 * largest)
 
 
-def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
+def narrow_figure(diagnosis: OdeDiagnosis, *, origin: str = "measured") -> Figure:
     """Return two panels: the residual over a stretch of time, and the held-out errors as bars.
 
     At half its 720 x 880 points, the width of a phone, letters are still large enough.
@@ -232,16 +232,17 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     above.legend(fontsize=font - 0.5, loc="upper left", ncols=2, columnspacing=0.9,
                  handlelength=1.2, framealpha=0.0)  # fmt: skip
     below.set_title("Error on held-out samples, rms", fontsize=font + 1, loc="left")
-    rows = [("base model", colours.BASE, diagnosis.base_errors.holdout_rms_m)]
+    e = next(e for e in diagnosis.errors if e.output == s.quantity)
+    rows = [("base model", colours.BASE, e.base)]
     if phrases.added(diagnosis):
-        rows.append(("extended", colours.EXTENDED, diagnosis.extended_errors.holdout_rms_m))
-    rows.append(("noise", colours.NOISE, diagnosis.noise_floor_rms_m))
+        rows.append(("extended", colours.EXTENDED, e.extended))
+    rows.append(("noise", colours.NOISE, e.noise))
     largest = max(rms for *_, rms in rows)
-    scale = phrases.scale_of(diagnosis.experiments, largest)
+    scale = phrases.prefixed_scale(largest, e.unit)
     for k, (_, colour, rms) in enumerate(rows):
         below.barh(k, rms, color=colour, height=0.7)
         below.annotate(f" {scale.text(rms)}", (rms, k), va="center", fontsize=font)
-    below.axvline(diagnosis.noise_floor_rms_m, color="black", linestyle="--", linewidth=1.0)
+    below.axvline(e.noise, color="black", linestyle="--", linewidth=1.0)
     below.set_yticks(range(len(rows)), [name for name, *_ in rows], fontsize=font)
     below.set(xlim=(0.0, 1.3 * largest), xticks=[])
     below.invert_yaxis()

@@ -198,7 +198,7 @@ def what_now(d: OdeDiagnosis, model_file: str | None = None) -> Advice:
         ))  # fmt: skip
     stack = d if isinstance(d, Diagnosis) else None
     errors, noise = _sizes(d)
-    commands, beside = _commands(stack, model_file) if stack else ((), _IN_PYTHON)
+    commands, beside = _commands(stack, model_file) if stack else ((), _IN_PYTHON * added(d))
     if d.verdict == "adequate" and d.doubt:
         said = "Use the model within these records only: their held-out samples cannot confirm it."
         return Advice((said,), beside, commands[:1])

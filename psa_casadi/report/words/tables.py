@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, OdeDiagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.identify import StackIdentification
-from psa_casadi.identification.result import StartOutcome
+from psa_casadi.identification.result import Identification, StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment
@@ -87,7 +87,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 
 
 def parameter_table(
-    model: Model, found: StackIdentification | None = None, only: Collection[str] | None = None
+    model: Model, found: Identification | None = None, only: Collection[str] | None = None
 ) -> Table:
     """Return every parameter with value, 95 % interval, unit, how it was found, and meaning.
 
@@ -106,8 +106,8 @@ def parameter_table(
     return _table(("parameter", "value", "95 % interval", "unit", "found by", "meaning"), rows)
 
 
-def _status(model: Model, name: str, found: StackIdentification | None) -> str:
-    if found is not None and name in found.read_off:
+def _status(model: Model, name: str, found: Identification | None) -> str:
+    if isinstance(found, StackIdentification) and name in found.read_off:
         return "read off"
     if name not in model.provenance.free:
         return "current" if name in model.provenance.intervals else "not fitted"

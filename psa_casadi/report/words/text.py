@@ -157,19 +157,14 @@ def identification_text(
 
 
 def fit_sentence(found: Identification) -> str:
-    """Say how far the model is from its records, and how many parameters these determine."""
+    """Say how far a model is from its records."""
     parts = []
     for name, rms in found.rms.items():
         unit = next(o.unit for o in found.model.structure.outputs if o.name == name) or "1"
         noise = found.noise[name]
         ratio = f" ({number(rms / noise, 2)} times its noise)" if noise > 0 else ""
         parts.append(f"{name} by {prefixed_scale(rms, unit).text(rms)}{ratio}")
-    count, open_ = len(found.errors), len(found.undetermined)
-    told = "all" if not open_ else f"{count - open_} of"
-    return (
-        f"The model misses {listing(parts)} rms. The records determine {told} {count} fitted"
-        f" parameter{'s' if count > 1 else ''}."
-    )
+    return f"The model misses {listing(parts)} rms."
 
 
 def effect_page(

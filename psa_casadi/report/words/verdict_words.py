@@ -93,18 +93,25 @@ def _named(d: OdeDiagnosis) -> str:
     return f"The {are}: {gone}"
 
 
-def _base_errors(d: OdeDiagnosis) -> str:
-    """Say the base model's error in every output, over its range in all records.
+def of_range(d: OdeDiagnosis, *, extended: bool = False) -> dict[str, float]:
+    """Return a model's held-out error in every output, in % of its range in all records.
 
     That of a stack's displacement is each record's over its own range.
     """
     if isinstance(d, Diagnosis):
-        shares = {"displacement": d.base_errors.holdout_nrmse_percent}
-    else:
-        shares = {}
-        for k, e in enumerate(d.errors):
-            whole = np.concatenate([e.measured(k) for e in d.experiments])
-            shares[e.output] = 100.0 * e.base / float(np.nanmax(whole) - np.nanmin(whole))
+        errors = d.extended_errors if extended else d.base_errors
+        return {"displacement": errors.holdout_nrmse_percent}
+    shares = {}
+    for k, e in enumerate(d.errors):
+        whole = np.concatenate([e.measured(k) for e in d.experiments])
+        error = e.extended if extended else e.base
+        shares[e.output] = 100.0 * error / float(np.nanmax(whole) - np.nanmin(whole))
+    return shares
+
+
+def _base_errors(d: OdeDiagnosis) -> str:
+    """Say the base model's error in every output, over its range."""
+    shares = of_range(d)
     each = [f"{phrases.number(share, 2)} %" for share in shares.values()]
     if len(each) == 1:
         return f"the base model's held-out error is {each[0]} of the range"
@@ -205,7 +212,7 @@ def budget_sentence(d: OdeDiagnosis) -> str:
     """Say where the held-out error above the noise goes."""
     b, parts = d.budget, ["of the held-out error above the noise"]
     stack = b if isinstance(b, StackBudget) else None
-    scale = phrases.scale_of(d.experiments, _base_rms(d)) if stack else phrases.Scale("", 1.0)
+    scale = phrases.scale_of(d.experiments, d.errors[0].base)
     if stack:
         parts = [f"of {scale.text(stack.excess_rms_m)} rms above the noise"]
     if phrases.added(d):
@@ -220,10 +227,6 @@ def budget_sentence(d: OdeDiagnosis) -> str:
         left = f"{scale.text(stack.remains_rms_m)} ({share} % of the range)"
         parts.append(f"above the noise the extended model leaves {left}")
     return "; ".join(parts)
-
-
-def _base_rms(d: OdeDiagnosis) -> float:
-    return d.base_errors.holdout_rms_m if isinstance(d, Diagnosis) else 0.0
 
 
 def _removed(b: Budget) -> str:
@@ -248,7 +251,9 @@ def budget_table(d: OdeDiagnosis) -> Table:
     if b.unnamed is not None and d.patch is not None:
         rows.append(share_row(f"unnamed: {d.patch.name}", b.unnamed))
     low, high = b.together.interval
-    left = share_row(_REMAINS, Share("left", 1.0 - b.together.share, (1.0 - high, 1.0 - low)))
+    left = (_REMAINS, "100 %", "")
+    if phrases.added(d):
+        left = share_row(_REMAINS, Share("left", 1.0 - b.together.share, (1.0 - high, 1.0 - low)))
     if isinstance(b, StackBudget):
         scale = phrases.scale_of(d.experiments, b.excess_rms_m)
         share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
