@@ -21,10 +21,9 @@ from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.further import COLUMNS
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import unfinished
-from psa_casadi.identification.prepare import averaged, columns_of, with_levels
+from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
 from psa_casadi.identification.refitting import Progress, relevelled
 from psa_casadi.identification.search import (
     LOAD,
