@@ -413,7 +413,8 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         *([note("stuck", count=stuck)] if stuck else []),
     ]
     turned = [n for f in steps[0].fit.further for n in f.turned]
-    return replace(found, remarks=(*found.remarks, *seen.notes, *more_said, *turned))
+    told = *seen.notes, *more_said, *turned, *steps[-1].remarks
+    return replace(found, remarks=(*found.remarks, *told))
 
 
 def _base(start: Model, task: Task) -> tuple[Fit, Task]:
