@@ -96,8 +96,8 @@ def diagnose(
                 run = own_diagnosis(
                     own, records, held, fitting, reading, given, leave_out=left_out,
                     others={
-                        "--patch": patch, "--next": next_, "--stack": stack,
-                        "--stiffness": stiffness, "--hysteresis": hysteresis,
+                        "--next": next_, "--stack": stack, "--stiffness": stiffness,
+                        "--hysteresis": hysteresis,
                     },
                 )  # fmt: skip
             wanted = files.expected(given, expect, max_error)

@@ -38,7 +38,15 @@ class Course:
 _BASE = ("starting values", ("starting values",))
 _FIT = (
     "the base model",
-    ("base fit", "exchanged", "resonances and lags", "moments", "the model", "fitting from"),
+    (
+        "base fit",
+        "exchanged",
+        "resonances and lags",
+        "moments",
+        "the model",
+        "fitting from",
+        "fit from",
+    ),
 )
 IDENTIFY = Course(
     (_BASE, _FIT, ("what to measure next", ("what further",)), ("files", ("profile", "writing"))),

@@ -34,6 +34,7 @@ from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.start.linear_response import plays
+from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
@@ -259,7 +260,7 @@ class FreeFunction(Correction):
     """One of any model: a function without memory `of` some variables, added to a port's sum.
 
     Along all records it adds `added` (n,) in the port's `unit`; that follows the `variable`, of
-    these the one that tells most of it, with the values `along` (n,).
+    these the one that tells most of it, with the values `along` (n,). `model` holds it.
     """
 
     of: str
@@ -268,6 +269,7 @@ class FreeFunction(Correction):
     variable_unit: str
     along: FloatArray
     added: FloatArray
+    model: Model
 
     @property
     def name(self) -> str:

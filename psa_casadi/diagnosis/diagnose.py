@@ -385,8 +385,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     seen = driven(base, start, task)
     if not seen.follows:
         steps = unsearched(base, task)
-        judge = StackJudge(steps, task, scale_given=scale_given, driven=seen.filtered)
-        found = judge.conclude()
+        found = StackJudge(steps, task, scale_given=scale_given, driven=seen.filtered).conclude()
         return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = steps_of(best_first(base, task), task)
     task.keep(steps[-1].fit)

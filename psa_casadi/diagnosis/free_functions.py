@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.diagnosis.corrections import FreeFunction
-from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, Attached
+from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes
 from psa_casadi.diagnosis.screening import (
@@ -29,8 +29,10 @@ from psa_casadi.diagnosis.screening import (
 )
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypothesis
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import refit, weighted
+from psa_casadi.identification.result import with_told
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, true_output
 from psa_casadi.records.split import Experiment
@@ -53,10 +55,30 @@ class _Law:
     scales: dict[str, float]
 
 
-def fit_free_functions(view: View, task: Task, base: Model, scale: Scale) -> list[FreeFunction]:
+def model_of(
+    base: Model,
+    fit: Fit,
+    effects: Sequence[Attached],
+    experiments: Sequence[Experiment],
+    *,
+    interrupted: bool = False,
+) -> Model:
+    """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
+    model = extended(base, effects)
+    values = {n: v for n, v in fit.model.values.items() if n in model.values}
+    sure, given = determinacy(fit, experiments), [e.record for e in experiments]
+    return with_told(
+        model.with_values(values), given, sure.names, sure.intervals, force_scale="given",
+        interrupted=interrupted,
+    )  # fmt: skip
+
+
+def fit_free_functions(
+    view: View, task: Task, base: Model, effects: Sequence[Attached], scale: Scale
+) -> list[FreeFunction]:
     """Fit the most telling free functions beside a hypothesis; return them, the best first.
 
-    `base` is the model before its ports were opened.
+    `base` is the model before its ports were opened, `effects` are the hypothesis' causes.
     """
     of, experiments = view.of, task.experiments
     sizes = sizes_of(base, experiments, of.fit.starts())
@@ -78,7 +100,8 @@ def fit_free_functions(view: View, task: Task, base: Model, scale: Scale) -> lis
             h = hypothesis((*of.causes, attached.component), fit, experiments)
             if h is not None:
                 gained = scale.evidence(h) - scale.evidence(of)
-                found.append(_told(h, attached, law, gained, experiments))
+                model = model_of(base, fit, [*effects, attached], experiments)
+                found.append(_told(h, attached, law, model, gained, experiments))
     return sorted(found, key=lambda f: -f.evidence)
 
 
@@ -86,6 +109,7 @@ def _told(
     h: Hypothesis,
     attached: Attached,
     law: _Law,
+    model: Model,
     evidence: float,
     experiments: Sequence[Experiment],
 ) -> FreeFunction:
@@ -120,6 +144,7 @@ def _told(
         variable_unit=units[name],
         along=values[name],
         added=added,
+        model=model,
     )
 
 

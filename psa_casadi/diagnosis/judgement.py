@@ -10,8 +10,8 @@ import numpy as np
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
-from psa_casadi.diagnosis.free_functions import fit_free_functions
-from psa_casadi.diagnosis.generic.attached import Attached, extended
+from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
+from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
@@ -29,9 +29,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
-from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.result import MISSED, with_told
+from psa_casadi.identification.result import MISSED
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment, missed_rms
@@ -374,24 +372,6 @@ class Judge:
         }
 
 
-def model_of(
-    base: Model,
-    fit: Fit,
-    effects: Sequence[Attached],
-    experiments: Sequence[Experiment],
-    *,
-    interrupted: bool = False,
-) -> Model:
-    """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
-    model = extended(base, effects)
-    values = {n: v for n, v in fit.model.values.items() if n in model.values}
-    sure, given = determinacy(fit, experiments), [e.record for e in experiments]
-    return with_told(
-        model.with_values(values), given, sure.names, sure.intervals, force_scale="given",
-        interrupted=interrupted,
-    )  # fmt: skip
-
-
 class ModelJudge(Judge):
     """The judge of any model: `base` as it was before the search, `table` effects at its ports."""
 
@@ -423,7 +403,8 @@ class ModelJudge(Judge):
         if of.causes and not view.test.alarm:
             return ()
         scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
-        return fit_free_functions(view, self.task, self.base, scale)
+        effects = [self.table[c.name] for c in of.causes]
+        return fit_free_functions(view, self.task, self.base, effects, scale)
 
     def unseen(self, step: Step) -> tuple[Note, float] | None:
         """Return which output's held-out samples are unlike the fitted ones."""

@@ -38,6 +38,7 @@ from psa_casadi.diagnosis.result import (
     Cause,
     Diagnosis,
     NextExperiment,
+    OdeDiagnosis,
     OutputError,
     Verdict,
 )
@@ -361,13 +362,15 @@ class StackJudge(Judge):
         )
 
 
-def patched_model(d: Diagnosis) -> Model:
+def patched_model(d: OdeDiagnosis) -> Model:
     """Return the extended model with the unnamed correction fitted beside it, all values free.
 
     Raises InputError where a diagnosis has none, or one that no component stands for;
     SimulationError where it cannot be simulated.
     """
-    if d.patch is None:
+    if d.correction is not None:
+        return d.correction.model
+    if not isinstance(d, Diagnosis) or d.patch is None:
         raise InputError("No unnamed correction removes more than the extended model does.")
     found = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
     given = d.model.provenance.force_scale == "given"

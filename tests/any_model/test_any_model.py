@@ -207,7 +207,7 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
 
 @pytest.mark.slow
 @shares_hysteresis
-def test_a_cause_that_no_effect_has_is_unexplained() -> None:
+def test_a_cause_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
     """Golden answers (own/breathing) have the same verdict by all kinds of effects."""
     few = ["hysteresis", "stop", "curve"]
     d = psa.diagnose(oscillator(), plants.breathing(4), leave_out=few)
@@ -226,6 +226,15 @@ def test_a_cause_that_no_effect_has_is_unexplained() -> None:
     assert np.std(x - free.along) < np.std(x - d.base[0][:, 0])  # with it, the model is nearer
     assert free.unit == "m/s2"
     valid("own_model", d.to_json())
+    psa.save_model(psa.patched_model(d), tmp_path / "patched.json")
+    patched = psa.load_model(tmp_path / "patched.json")
+    assert [c.name for c in patched.effects] == ["free_in_rate_v"]
+    (run,) = d.experiments
+    x0 = np.zeros(len(patched.state_names))
+    u = record_inputs(patched, run.record, run.record.n)
+    y = psa.run(patched, run.record.time, u, x0, hold="linear").y[:, 0]
+    with_it, base = (np.std((x - shown)[run.held_out]) for shown in (y, d.base[0][:, 0]))
+    assert with_it < 0.8 * base
 
 
 @pytest.mark.parametrize(

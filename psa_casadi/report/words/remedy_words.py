@@ -214,7 +214,7 @@ def what_now(d: OdeDiagnosis, model_file: str | None = None) -> Advice:
             f"Do not correct the device by a name: none is certain. Take {errors} as the model's"
             f" error, and {'measure the next record' if stack else _further(d)}."
         )
-        if stack and d.patch is not None and d.budget.unnamed is not None:
+        if d.patch is not None and d.budget.unnamed is not None:
             patched = (
                 "To predict without a name, --patch patched.json writes the model with the unnamed"
                 f" correction, which removes {percent(within(d.budget.unnamed.share))} of the error"
