@@ -16,9 +16,9 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.any_model.effects.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.diagnosis.corrections import FreeFunction
+from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, Attached, extended
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes
 from psa_casadi.diagnosis.screening import (

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.any_model.effects.attached import Attached
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
 from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
+from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes

@@ -5,10 +5,10 @@ from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
-from psa_casadi.any_model.effects.attached import Attached, of_ones_own
-from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.free_functions import model_of
+from psa_casadi.diagnosis.generic.attached import Attached, of_ones_own
+from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.judgement import ModelJudge
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import DiagnosisInterrupted, OdeDiagnosis

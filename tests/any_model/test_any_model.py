@@ -14,8 +14,8 @@ import pytest
 import psa_casadi as psa
 from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
-from psa_casadi.any_model.effects.attached import extended
-from psa_casadi.any_model.effects.of_rates import effects_of
+from psa_casadi.diagnosis.generic.attached import extended
+from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import with_ports

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.any_model.effects.attached import Attached, extended, of_ones_own
-from psa_casadi.any_model.effects.of_rates import effects_of
 from psa_casadi.component import Component
 from psa_casadi.design.experiment.criteria import (
     Optimality,
@@ -29,6 +27,8 @@ from psa_casadi.design.experiment.experiment import (
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits
 from psa_casadi.design.experiment.search import Effort, Progress
+from psa_casadi.diagnosis.generic.attached import Attached, extended, of_ones_own
+from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.search.steps import fit_contenders, fitted_rivals

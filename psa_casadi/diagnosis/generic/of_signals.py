@@ -10,7 +10,8 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.any_model.effects.attached import (
+from psa_casadi.component import Expression, Symbols
+from psa_casadi.diagnosis.generic.attached import (
     Attached,
     Own,
     Terms,
@@ -19,7 +20,6 @@ from psa_casadi.any_model.effects.attached import (
     scale_of,
     size_of,
 )
-from psa_casadi.component import Expression, Symbols
 from psa_casadi.model.ports import Port, true_output
 from psa_casadi.shapes import ANGLES, pade_section, softplus
 from psa_casadi.simulation.sizes import Sizes

@@ -2,7 +2,8 @@
 
 import casadi as ca
 
-from psa_casadi.any_model.effects.attached import (
+from psa_casadi.component import Expression, Symbols
+from psa_casadi.diagnosis.generic.attached import (
     LARGEST,
     ORDINARY,
     Attached,
@@ -13,8 +14,7 @@ from psa_casadi.any_model.effects.attached import (
     scale_of,
     size_of,
 )
-from psa_casadi.any_model.effects.of_signals import ANGLE, bent, beyond, level_of, signal_effects
-from psa_casadi.component import Expression, Symbols
+from psa_casadi.diagnosis.generic.of_signals import ANGLE, bent, beyond, level_of, signal_effects
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, state_unit
 from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magnitude

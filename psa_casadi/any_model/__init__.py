@@ -1,1 +1,0 @@
-"""Identification and diagnosis of any model: own equations, several inputs and outputs."""
