@@ -78,7 +78,12 @@ if TYPE_CHECKING:
     from psa_casadi.records.signals import Signals
     from psa_casadi.report.documents.files import load_diagnosis
     from psa_casadi.report.documents.findings import read_findings
-    from psa_casadi.report.page.devices import write_comparison, write_population
+    from psa_casadi.report.page.devices import (
+        Comparison,
+        compare,
+        write_comparison,
+        write_population,
+    )
     from psa_casadi.report.page.results import write_fit_report, write_report
     from psa_casadi.report.plots.figures import save_figure
     from psa_casadi.report.shown import report
@@ -128,7 +133,7 @@ _HOMES = {
     "report.words.text": "story",
     "report.plots.figures": "save_figure",
     "report.page.results": "write_report write_fit_report",
-    "report.page.devices": "write_comparison write_population",
+    "report.page.devices": "Comparison compare write_comparison write_population",
     "report.documents.findings": "read_findings",
     "report.documents.files": "load_diagnosis",
     "devices.batch": "BatchRun batch",
@@ -154,7 +159,8 @@ __all__ = [
     "simulate_many", "memory_after", "settled_at", "run", "Identification",
     "identify", "sample", "Posterior", "diagnose", "Diagnosis", "OdeDiagnosis", "load_diagnosis",
     "timed", "Timings", "story", "report", "save_figure", "write_report", "write_fit_report",
-    "batch", "BatchRun", "Job", "Options", "read_findings", "write_comparison",
+    "batch", "BatchRun", "Job", "Options", "read_findings", "compare", "Comparison",
+    "write_comparison",
     "write_population", "HysteresisObserver", "FeedForward", "stack_values",
     "OnlineIdentification", "AdaptiveFeedForward", "identifier_for", "part_for",
     "design_mechanism", "mechanism_model", "port_model", "export_fmu", "CodeExport", "export_c",

@@ -273,6 +273,9 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
         lambda: own()[2],
         lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.outputs(d.experiments)],
     ),
+    "Comparison": (
+        lambda: psa.compare(own()[1], own()[2]), lambda c: [repr(c), *map(repr, c.differences)],
+    ),
     "HysteresisObserver": (
         lambda: moved(psa.HysteresisObserver(values()), 60.0), lambda b: block(b, 31.0),
     ),

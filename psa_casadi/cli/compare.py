@@ -19,10 +19,11 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
         output: HTML page to write.
     """
     from psa_casadi.devices.batch import read_results
-    from psa_casadi.population.population import differences, population
-    from psa_casadi.report.words import population_words as words
+    from psa_casadi.population.population import population
+    from psa_casadi.report.words.population_words import population_sentences
+    from psa_casadi.report.words.tables import Table
 
-    tables = []
+    tables: tuple[Table, ...] = ()
     given.outputs({"--output": output}, files)
     given.check()
     with working("comparing", given.quiet):
@@ -31,14 +32,11 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
             tell_lost(lost, output, given.quiet)
             shown = population(found)
             psa.write_population(shown, output, without=lost)
-            told = words.population_sentences(shown)
+            told = population_sentences(shown)
         else:
-            findings = psa.read_findings(files, given.own)
-            psa.write_comparison(findings, output)
-            rows = differences(findings)
-            told = (words.difference_sentence(findings, rows),)
-            tables = [words.verdict_table(findings, words.error_scale(findings))]
-            tables += [words.difference_table(findings, rows)] if rows else []
+            compared = psa.compare(*files, effects=given.own)
+            compared.report(output)
+            told, tables = (compared.sentence,), compared.tables
     for sentence in told:
         show(sentence, given.quiet)
     for table in tables:

@@ -215,14 +215,16 @@ def _noise(model: "psa.Model | None", texts: Sequence[str]) -> dict[str, float] 
 
 
 def _write_page(path: Path, design: Any, model: "psa.Model", still: bool) -> None:
-    """Write the page of a design, with the stack that runs in it unless it is `still`."""
+    """Write the page of a design, with the model that runs in it unless it is `still`."""
     from psa_casadi.report.page.designs import write_experiment_page
-    from psa_casadi.report.page.live import live_design
+    from psa_casadi.report.page.live import live_design, live_experiment
     from psa_casadi.simulation.simulate import simulate
     from psa_casadi.simulation.start import is_stack
 
     live = None
-    if is_stack(model) and not still:
+    if not still and is_stack(model):
         time, voltage = design.record.time, design.record.columns["voltage"]
         live = live_design(model, (time, voltage, simulate(model, time, voltage).displacement))
+    elif not still:
+        live = live_experiment(model, design.record)
     write_experiment_page(path, design, live)

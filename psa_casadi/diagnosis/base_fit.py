@@ -28,10 +28,11 @@ from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.exchanges import force_of, without_blur
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import trace_record
 from psa_casadi.identification.force_start import retuned
-from psa_casadi.identification.refitting import Progress, force_of, quick_from, refit, without_blur
+from psa_casadi.identification.refitting import Progress, quick_from, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.identification.start.starting_points import linear_start, resolved

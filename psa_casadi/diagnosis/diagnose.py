@@ -21,10 +21,9 @@ from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.further import COLUMNS
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import unfinished
-from psa_casadi.identification.prepare import averaged, columns_of, with_levels
+from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
 from psa_casadi.identification.refitting import Progress, relevelled
 from psa_casadi.identification.search import (
     LOAD,
@@ -386,8 +385,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
     seen = driven(base, start, task)
     if not seen.follows:
         steps = unsearched(base, task)
-        judge = StackJudge(steps, task, scale_given=scale_given, driven=seen.filtered)
-        found = judge.conclude()
+        found = StackJudge(steps, task, scale_given=scale_given, driven=seen.filtered).conclude()
         return replace(found, remarks=(*found.remarks, *seen.notes))
     steps = steps_of(best_first(base, task), task)
     task.keep(steps[-1].fit)
@@ -414,7 +412,8 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
         *([note("stuck", count=stuck)] if stuck else []),
     ]
     turned = [n for f in steps[0].fit.further for n in f.turned]
-    return replace(found, remarks=(*found.remarks, *seen.notes, *more_said, *turned))
+    told = *seen.notes, *more_said, *turned, *steps[-1].remarks
+    return replace(found, remarks=(*found.remarks, *told))
 
 
 def _base(start: Model, task: Task) -> tuple[Fit, Task]:

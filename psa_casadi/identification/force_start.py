@@ -15,12 +15,12 @@ from math import log
 import numpy as np
 
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.exchanges import force_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.refitting import (
     Progress,
-    force_of,
     quick_from,
     record_rms,
     refit,

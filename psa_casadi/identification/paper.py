@@ -28,6 +28,7 @@ from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
@@ -128,9 +129,7 @@ def _loop_of(record: Record) -> Loop | None:
     t = np.arange(record.time[0], record.time[-1] + 0.5 * step, step)
     v = np.interp(t, record.time, record.voltage)
     x = np.interp(t, record.time[valid], measured(record)[valid])
-    prominence = _PROMINENCE * float(np.ptp(v))
-    peaks = [scipy.signal.find_peaks(w, prominence=prominence)[0] for w in (v, -v)]
-    turns = np.sort(np.concatenate(peaks)).astype(np.int64)
+    turns = reversals(v, _PROMINENCE * float(np.ptp(v)))
     if turns.size == 0:
         return None
     ends = np.array([turns[0], len(v) - 1 - turns[-1]])

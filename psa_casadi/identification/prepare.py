@@ -1,13 +1,14 @@
 """What is done to records before they are fitted: masks, one clock, averages, further columns."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from psa_casadi.component import Component
+from psa_casadi.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.errors import InputError
-from psa_casadi.identification.fitting.further import COLUMNS, SENSORS, with_column
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.identification.start.ordinary import capacitance_of
@@ -17,8 +18,26 @@ from psa_casadi.notes import Note, note
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import MOST, Experiment
+from psa_casadi.records.split import MOST, Channel, Experiment
 from psa_casadi.records.suspects import cleaned, masked, suspects
+
+#: The columns of a stack that are fitted beside its displacement, by name. The charge on a stack is
+#: that of its capacitance and, by reciprocity, a share of the displacement; the current is its
+#: rate, which lags faster than the sampling move most.
+COLUMNS: Mapping[str, Channel] = {
+    c.column: c
+    for c in (
+        Channel("monitor_voltage", "V", ("monitor_voltage",), scale="monitor_scale"),
+        Channel("charge", "C", ("charge", "displacement"), straight=1e-2),
+        Channel("current", "A", ("current", "velocity"), straight=5e-2),
+        Channel("displacement_2", "m", ("displacement_2",), scale="sensor_2_scale"),
+        Channel("strain", "1", ("strain",), scale="strain_scale"),
+    )
+}
+#: The sensor that a model gets for a column.
+SENSORS: Mapping[str, Component] = {
+    "monitor_voltage": MONITOR, "displacement_2": SECOND_SENSOR, "strain": STRAIN_GAUGE
+}  # fmt: skip
 
 
 def as_read(record: Record) -> Record:
@@ -111,7 +130,7 @@ def with_levels(
     """Return the experiments with first noise levels of the columns that are fitted."""
     levels = []
     for column in columns:
-        own = [experiments[k] for k in with_column(experiments, column)]
+        own = [e for e in experiments if e.record.column(column) is not None and e.used.any()]
         values = [getattr(e.record, column)[e.used] for e in own]
         if values:
             noise = max(fast_noise(v) for v in values)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -80,12 +81,12 @@ class Identification(Reported):
         """The parameters that these records do not determine."""
         return self.determinacy.undetermined
 
-    @property
+    @cached_property
     def rms(self) -> Mapping[str, float]:
         """What is left of every measured output over all records (rms), in its unit."""
         return rms_left(self.fit, self.experiments)
 
-    @property
+    @cached_property
     def noise(self) -> Mapping[str, float]:
         """The fast part of what is left of every measured output (rms), in its unit."""
         return {

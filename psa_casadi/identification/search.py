@@ -18,6 +18,7 @@ import numpy as np
 
 from psa_casadi.components.stack import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
+from psa_casadi.identification.exchanges import exchanged, with_fast, without_blur
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.multistart import fits_from
@@ -25,15 +26,12 @@ from psa_casadi.identification.refitting import (
     Progress,
     differing,
     equal,
-    exchanged,
     noise_levels,
     quick_rtol,
     record_rms,
     refit_or_keep,
     residual_noise,
     same_place,
-    with_fast,
-    without_blur,
 )
 from psa_casadi.identification.result import StartOutcome
 from psa_casadi.identification.start.ordinary import FORMS

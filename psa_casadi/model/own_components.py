@@ -20,19 +20,11 @@ _MOST = {"variables": 2_000, "expressions": 20_000, "characters of equations": 5
 
 
 @dataclass(frozen=True)
-class OwnParameter:
+class OwnParameter(Parameter):
     """What a component declares of a parameter; `value` is its default, null no bound."""
 
-    name: str
-    value: float
-    unit: str
-    bounds: tuple[float | None, float | None]
-    description: str
-    display_unit: str | None = None
-    log: bool = False
+    bounds: tuple[float | None, float | None]  # type: ignore[assignment]
     scale: float | None = None
-    fitted: bool = True
-    limit: bool = False
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,7 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
     doubts = []
     if chains.divergences:
         doubts.append(note("diverged", count=chains.divergences, transitions=count * draws))
-    apart = [f.name for f in figures if not f.r_hat <= MOST_RHAT]
+    apart = [f.name for f in figures if count > 1 and not f.r_hat <= MOST_RHAT]
     if apart:
         doubts.append(note("chains_disagree", names=apart, limit=MOST_RHAT))
     few = [f.name for f in figures if f.ess < LEAST_ESS * count]

@@ -250,9 +250,15 @@ def autocovariance(residual: FloatArray) -> FloatArray:
         return np.array([float(residual @ residual) / max(n, 1)])
     r = float(np.clip(centred[1:] @ centred[:-1] / (n * power), -0.99, 0.99))
     reach = 1.1447 * (4.0 * r**2 * n / (1.0 - r**2) ** 2) ** (1.0 / 3.0)
-    size = 2 ** int(np.ceil(np.log2(2 * n)))
-    spectrum = np.abs(np.fft.rfft(centred, size)) ** 2
     lags = int(np.clip(reach, 1.0, n / 10.0))
     fade = 1.0 - np.arange(lags) / max(reach, lags)
-    covariance: FloatArray = np.fft.irfft(spectrum, size)[:lags] / n * fade
-    return covariance
+    return np.asarray(lag_products(centred, lags) / n * fade)
+
+
+def lag_products(d: FloatArray, lags: int) -> FloatArray:
+    """Return sum_i d_i d_(i+k) for k < lags."""
+    size = scipy.fft.next_fast_len(d.size + lags, real=True)
+    result = np.zeros(lags)
+    found = scipy.fft.irfft(np.abs(scipy.fft.rfft(d, size)) ** 2, size)[: min(lags, d.size)]
+    result[: found.size] = found
+    return result

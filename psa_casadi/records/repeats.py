@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from psa_casadi.records.noise import runs_of
+from psa_casadi.records.noise import lag_products, runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 
@@ -289,8 +289,8 @@ def _pooled(
     products, pairs = np.zeros(lags), np.zeros(lags)
     for d, _ in pieces:
         there = np.isfinite(d)
-        products += _products(np.where(there, d, 0.0), lags)
-        pairs += _products(there.astype(np.float64), lags)
+        products += lag_products(np.where(there, d, 0.0), lags)
+        pairs += lag_products(there.astype(np.float64), lags)
     lags = int(np.argmin(pairs >= 0.25 * FEWEST)) or lags
     covariance = share * products[:lags] / pairs[:lags]
     if not covariance[0] > 0:
@@ -302,18 +302,9 @@ def _pooled(
     return float(np.sqrt(covariance[0])), covariance, autoregression(covariance, samples), samples
 
 
-def _products(d: FloatArray, lags: int) -> FloatArray:
-    """Return sum_i d_i d_(i+k) for k < lags."""
-    size = scipy.fft.next_fast_len(d.size + lags, real=True)
-    result = np.zeros(lags)
-    found = scipy.fft.irfft(np.abs(scipy.fft.rfft(d, size)) ** 2, size)[: min(lags, d.size)]
-    result[: found.size] = found
-    return result
-
-
 def autoregression_of(signal: FloatArray) -> FloatArray:
     """Return the autoregression (p,) of a signal (n,), of at most eighth order."""
-    covariance = _products(signal - np.mean(signal), _ORDER + 1) / signal.size
+    covariance = lag_products(signal - np.mean(signal), _ORDER + 1) / signal.size
     return autoregression(covariance, signal.size) if covariance[0] > 0 else np.zeros(0)
 
 

@@ -283,21 +283,11 @@ def settling_time(model: Model) -> float:
 
     The inputs have their start values.
     """
-    p = model.parameter_vector()
-    memory = np.zeros(len(memory_names(model.structure)))
-    inputs = np.array([i.start for i in model.structure.inputs])
-    jacobian = np.array(_fast_jacobian(model.structure)(0.0, 0.0, inputs, p, memory))
-    decay = -np.linalg.eigvals(jacobian).real
+    time, _, *others = model.at_start()
+    fast = [i for i, state in enumerate(model.structure.states) if not state.memory]
+    slopes = np.array(model.structure.slopes(time, 0.0, *others)[0])[np.ix_(fast, fast)]
+    decay = -np.linalg.eigvals(slopes).real
     return float(1.0 / np.min(decay)) if np.all(decay > 0) else float("inf")
-
-
-@cache
-def _fast_jacobian(structure: Structure) -> ca.Function:
-    s = structure
-    fast = [i for i, state in enumerate(s.states) if not state.memory]
-    deviation = ca.SX.sym("deviation", sum(state.memory for state in s.states))
-    jacobian = ca.jacobian(_slopes(s), s.x)[fast, fast]
-    return ca.Function("fast", [s.time, s.x, s.u, s.p, deviation], [jacobian])
 
 
 @cache

@@ -208,7 +208,9 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
 @pytest.mark.slow
 @shares_hysteresis
 def test_a_cause_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
-    d = psa.diagnose(oscillator(), plants.breathing(4))
+    """Golden answers (own/breathing) have the same verdict by all kinds of effects."""
+    few = ["hysteresis", "stop", "curve"]
+    d = psa.diagnose(oscillator(), plants.breathing(4), leave_out=few)
     assert d.verdict == "unexplained"
     assert not d.causes
     assert d.extended_fit is d.base_fit

@@ -277,7 +277,7 @@ def test_one_reading_in_a_hundred_that_is_far_off_is_masked_in_its_output_alone(
 
 def test_a_clean_record_with_outliers_is_adequate() -> None:
     given = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
-    d = psa.diagnose(motor(), given)
+    d = psa.diagnose(motor(), given, leave_out=["hysteresis", "stop", "curve", "delay"])
     assert d.verdict == "adequate"
     assert not d.causes
     assert all(e.base < 1.1 * e.noise for e in d.errors)

@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from importlib import resources
 
 import numpy as np
+import pytest
 
 import psa_casadi as psa
+from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.task import LIMITS, STEPS, Method, Thresholds
+from psa_casadi.notes import Note
 from tests.studies.benchmarks.ablation import (
     ablation_table,
     moved_constants,
@@ -73,3 +77,19 @@ def test_a_diagnosis_decides_by_the_constants_that_it_is_given() -> None:
     assert [c.effect for c in found.causes] == ["offset_drift"]
     strict = Method(thresholds=replace(own.thresholds, price=1e6))
     assert not psa.diagnose([record], effects=effects, method=strict).causes
+
+
+def test_a_spent_budget_ends_the_search_and_says_what_was_left() -> None:
+    """The first visit is made; what was done and left is the same on one core and on two."""
+    record = psa.read_record(str(resources.files("psa_casadi") / "data" / "demo.csv"))
+    said = []
+    for count in ("1", "2"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("PSA_CASADI_THREADS", count)
+            found = diagnose([record], method=Method(budget=1.0))
+        assert [c.effect for c in found.causes] == ["slow_creep"]
+        said += [n for n in found.remarks if isinstance(n, Note) and n.code == "budget"]
+    assert len(said) == 2
+    assert said[0].values == said[1].values
+    assert {"neighbours", "finalists"} <= {*said[0].values["left"]}
+    assert "Not tried: " in str(said[0])

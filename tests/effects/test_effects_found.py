@@ -249,7 +249,9 @@ def _rate(h: float, dq: float) -> float:
 @pytest.mark.slow
 def test_it_is_named_alone_and_predicts_a_record_that_no_fit_has_seen() -> None:
     fitted = [_leaking("slow", 0.05, 60.0, 50.0, 1), _leaking("fast", 1.0, 10.0, 500.0, 2)]
-    d = diagnose(fitted, holdout=[_leaking("judged", 20.0, 0.5, 5000.0, 3)])
+    slow = ("charge_leakage", "slow_creep", "ageing", "self_heating", "offset_drift", "drive_lag")
+    like = [psa.EFFECTS[n] for n in (*slow, "sensor_lag", "hysteresis_memory")]
+    d = diagnose(fitted, holdout=[_leaking("judged", 20.0, 0.5, 5000.0, 3)], effects=like)
     assert [c.effect for c in d.causes] == ["charge_leakage"], d
     values = d.causes[0].parameters
     assert values["leak_gain"].value == pytest.approx(1.0, abs=2e-3)

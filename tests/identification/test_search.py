@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import StackIdentification, identify
-from psa_casadi.identification.refitting import exchanges
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from tests.studies.benchmarks.coverage import one_run

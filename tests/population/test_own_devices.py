@@ -42,6 +42,14 @@ def test_identifications_of_an_own_model_are_compared(tmp_path: Path) -> None:
     page = Page((tmp_path / "page.html").read_text("utf-8"))
     assert "Beyond noise, J differs (4 parameters compared)." in page.text
     assert page.loaded == []
+    compared = psa.compare(*results)
+    assert "Beyond noise, J differs (4 parameters compared)." in repr(compared)
+    rows = compared.to_frame().set_index(["parameter", "device"])
+    assert len(rows) == 12
+    assert rows.loc[("J", "third"), "value"] == results[2].model.values["J"]
+    assert set(rows.index[rows["differs"]].get_level_values(0)) == {"J"}
+    with pytest.raises(psa.InputError, match="One device is nothing to compare"):
+        psa.compare(results[0])
 
 
 @pytest.mark.slow

@@ -38,8 +38,9 @@ from psa_casadi.diagnosis.search.moves import (
 )
 from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.notes import note
 from psa_casadi.simulation.side_by_side import side_by_side
-from psa_casadi.simulation.timings import stage
+from psa_casadi.simulation.timings import Work, counted, stage
 
 #: Hypotheses whose neighbours are fitted, at most, and visits to them.
 _EXPANSIONS, _VISITS = 5, 24
@@ -52,21 +53,26 @@ _PACE = 2
 
 
 def best_first(base: Fit, task: Task) -> Known:
-    """Return what a search from a base fit finds. Raises SimulationError where that one fails."""
-    search = _Search(base, task)
-    try:
-        search.run()
-        return search.known
-    except KeyboardInterrupt:
-        task.keep(search.known.so_far().fit)
-        raise
+    """Return what a search from a base fit finds. Raises SimulationError where that one fails.
+
+    Where its work goes beyond the method's budget it begins nothing more, and says what it left.
+    """
+    with counted() as work:
+        search = _Search(base, task, work)
+        try:
+            search.run()
+        except KeyboardInterrupt:
+            task.keep(search.known.so_far().fit)
+            raise
+    return search.known
 
 
 class _Search:
     """The state of one search."""
 
-    def __init__(self, base: Fit, task: Task) -> None:
-        self.task, self.known = task, Known(base, task)
+    def __init__(self, base: Fit, task: Task, work: Work) -> None:
+        self.task, self.work, self.known = task, work, Known(base, task)
+        self.left: list[str] = []
         self.expanded: dict[Names, Hypothesis] = {}
         self.done: set[tuple[str, Names]] = set()
         self.sets_of: Hypothesis | None = None
@@ -77,6 +83,8 @@ class _Search:
             chosen = self.next()
             if chosen is None or len(self.expanded) > _EXPANSIONS:
                 break
+            if self.expanded and not self.does("neighbours"):
+                break
             self.known.tell(chosen, "visited")
             self.visit(chosen)
         best = self.known.best()
@@ -84,6 +92,18 @@ class _Search:
             self.task.progress("all causes to the end")
             self.known.note(together(best, self.task.experiments))
         self.known.conclude()
+        if self.left:
+            left = tuple(dict.fromkeys(self.left))
+            self.known.remarks = (note("budget", work=float(self.work.done), left=left),)
+
+    def does(self, step: str) -> bool:
+        """Whether a step belongs to the method, and may be begun; the budget may be spent."""
+        if step in self.task.method.without:
+            return False
+        if self.work.done <= self.task.method.budget:
+            return True
+        self.left.append(step)
+        return False
 
     # What to do next
 
@@ -98,7 +118,7 @@ class _Search:
             if own is not None and (own is best or own.names in self.expanded) and self.unseen(own):
                 return own
         if best.causes and self.once("exchange", best.names):
-            if "exchange" not in self.task.method.without:
+            if self.does("exchange"):
                 exchange(best, self.known, self.task)
             return self.next()
         if self.known.is_open(best):
@@ -110,7 +130,7 @@ class _Search:
 
         Beside a large one that is missing they can hardly confirm a small one.
         """
-        if "rejected" in self.task.method.without:
+        if not self.does("rejected"):
             return None
         for h in self.known.rejected():
             if len(h.causes) < self.task.limits.most_causes and self.unseen(h):
@@ -129,7 +149,7 @@ class _Search:
         if not self.known.best().causes and self.once("sets", NONE):
             self.several_at_once(self.known.best())
             return True
-        if "all afresh" in self.task.method.without or not self.once("all afresh", NONE):
+        if not self.once("all afresh", NONE) or not self.does("all afresh"):
             return False
         self.all_afresh()
         return True
@@ -179,12 +199,16 @@ class _Search:
         self.known.remember(h, *names)
         best = max(self.known.children(h), key=lambda c: c.removes(h), default=None)
         goal = self.known.near(h, best) if best is not None else np.inf
-        for found in side_by_side(lambda s: with_cause(h, experiments, s, goal), leading[_PACE:]):
-            self.known.note(found)
+        rest = leading[_PACE:]
+        if rest and self.does("other effects"):
+            for found in side_by_side(lambda s: with_cause(h, experiments, s, goal), rest):
+                self.known.note(found)
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
-            fit_from_other_parents(h, self.known, task)
-        self.known.finish([c for c in self.known.leaders(h) if not c.final][:FINALISTS])
+            if self.does("other parents"):
+                fit_from_other_parents(h, self.known, task)
+        leaders = [c for c in self.known.leaders(h) if not c.final]
+        self.known.finish(leaders[: FINALISTS if self.does("finalists") else 1])
 
     @stage("fits of candidates")
     def several_modes(self, h: Hypothesis, view: View) -> bool:
@@ -193,14 +217,12 @@ class _Search:
         Where fast records show several, or where one leaves structure.
         """
         name, experiments = STRUCTURAL_MODE.name, self.task.experiments
-        if "several modes" in self.task.method.without or not view.test.alarm:
-            return False
-        if STRUCTURAL_MODE not in self.task.table:
+        if STRUCTURAL_MODE not in self.task.table or not view.test.alarm:
             return False
         less = self.known.found.get(h.names - {name})
         if less is None or not (name in h.names or (self.task.fast and not h.causes)):
             return False
-        if self.shaken.get(less.names) is less.fit:
+        if self.shaken.get(less.names) is less.fit or not self.does("several modes"):
             return False
         self.shaken[less.names] = less.fit
         self.tell(less, "several modes at once")
@@ -216,7 +238,7 @@ class _Search:
 
     def several_at_once(self, h: Hypothesis) -> None:
         """Fit sets of causes at once, again where the base without causes has become another."""
-        if "several at once" in self.task.method.without or self.sets_of is self.known.root:
+        if self.sets_of is self.known.root or not self.does("several at once"):
             return
         self.sets_of = self.known.root
         fit_sets(self.known, self.task, h)
@@ -228,7 +250,7 @@ class _Search:
         children = [c for c in self.known.children(h) if not has_series(c)]
         for child in children[:count]:
             best = max(self.known.children(h), key=lambda c: c.removes(h))
-            if best.fit.rms < _SETTLED * floor:
+            if best.fit.rms < _SETTLED * floor or not self.does("fits afresh"):
                 break
             self.tell(h, f"{child.causes[-1].name} afresh")
             self.known.note(afresh(h, self.task.experiments, child, self.known.near(h, best)))
@@ -251,19 +273,18 @@ class _Search:
         Several modes that leave structure are challenged by a single one.
         """
         task = self.task
-        if "base again" not in task.method.without:
-            for cause in h.causes:
-                less = self.known.found.get(h.names - {cause.name})
-                if less is None or not cause.more_of:
-                    task.progress(f"without {cause.name}")
-                    self.known.note(without(h, cause, task.experiments, less))
+        for cause in h.causes:
+            less = self.known.found.get(h.names - {cause.name})
+            if (less is None or not cause.more_of) and self.does("base again"):
+                task.progress(f"without {cause.name}")
+                self.known.note(without(h, cause, task.experiments, less))
         before = self.known.found.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
             for one in one_mode(h, before, task.experiments):
                 self.known.note(one)
             self.known.remember(before, STRUCTURAL_MODE.name)
-        if "resonances" in task.method.without or before is None or has_series(h):
+        if before is None or has_series(h) or not self.does("resonances"):
             return
         last, found = h.causes[-1], None
         if rings(last):
@@ -280,7 +301,7 @@ class _Search:
         without a cause it counts only where nothing is left to explain.
         """
         task, experiments = self.task, self.task.experiments
-        if "resonances" in task.method.without or not view.test.alarm:
+        if not view.test.alarm or not self.does("resonances"):
             return False
         if task.fast and not h.causes and self.seen_in_records():
             return True
@@ -300,7 +321,7 @@ class _Search:
     def seen_in_records(self) -> bool:
         """Fit the base from resonances and lags that the records show; whether it is better."""
         root, task = self.known.root, self.task
-        if "resonances" in task.method.without or not self.once("resonances", NONE):
+        if not self.once("resonances", NONE) or not self.does("resonances"):
             return False
         fitted = from_resonances(root.fit, task.experiments, task.progress)
         self.known.note(hypothesis((), fitted, task.experiments, final=True))

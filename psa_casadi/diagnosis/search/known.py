@@ -21,6 +21,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
 )
 from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.notes import Note
 from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Neighbours are nearly as likely as the best one if their evidence is this share of its, or within
@@ -41,11 +42,13 @@ class Known:
 
     `found` holds them by their causes, `views` those whose residual was looked at, `fitted` the
     effects fitted beside each, `trials` what effects would add to the base. A search that has ended
-    has an `answer`, and the causes of all that is worth having (`worthy`).
+    has an `answer`, and the causes of all that is worth having (`worthy`); `remarks` say what it
+    has left.
     """
 
     answer: Hypothesis
     worthy: frozenset[Names]
+    remarks: tuple[Note, ...] = ()
 
     def __init__(self, base: Fit, task: Task) -> None:
         self.base, self.task = base, task

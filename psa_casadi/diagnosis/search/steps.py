@@ -51,7 +51,7 @@ class Step:
     `probability` that of being the cause, given that one effect of the table is. `chosen` is the
     hypothesis with the next cause, None of the last step; `without` the one with all causes but
     this, `beside` what that one still shows, and `instead` the hypotheses with other effects in
-    this cause's place.
+    this cause's place. `remarks` of the last step say what the search has left.
     """
 
     view: View
@@ -63,6 +63,7 @@ class Step:
     alone: Mapping[str, float] = field(default_factory=dict)
     evidence: Mapping[str, float] = field(default_factory=dict)
     probability: Mapping[str, float] = field(default_factory=dict)
+    remarks: tuple[Note, ...] = ()
 
     @property
     def fit(self) -> Fit:
@@ -98,7 +99,8 @@ def steps_of(found: Known, task: Task) -> list[Step]:
     ways.append(found.answer)
     views = [_view(found, h, task) for h in ways]
     pairs = zip(views, [*ways[1:], None], strict=True)
-    return [_step(found, task, view, chosen) for view, chosen in pairs]
+    steps = [_step(found, task, view, chosen) for view, chosen in pairs]
+    return [*steps[:-1], replace(steps[-1], remarks=found.remarks)]
 
 
 def unsearched(base: Fit, task: Task) -> list[Step]:

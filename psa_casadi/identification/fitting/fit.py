@@ -536,7 +536,9 @@ def fit(
     theta[: len(free)] = unknowns.coordinates(placed.values)
     for r, e in enumerate(experiments):
         if e.used.any():  # the offset's coordinate is linear: `minimise` puts it where it is best
-            unknowns.place(theta, r, start_states[r] if start_states else {}, 0.0)
+            shown = _readings(e, 0) if e.channels[0].offset else np.zeros(1)
+            offset = float(np.mean(shown)) if shown.size else 0.0
+            unknowns.place(theta, r, start_states[r] if start_states else {}, offset)
     minimum, way, told = accurate_minimum(
         model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
         rtol=rtol, goal=goal, radius=radius, patient=patient,

@@ -1,40 +1,20 @@
-"""Columns beside the displacement that are fitted as outputs: current, charge, monitor and so on.
+"""Channels beside the first that are fitted as outputs: a stack's current, charge and so on.
 
-Every column has an offset in each record and factors for what it shows, the same in all records;
+A channel may have an offset in each record and factors for what it shows, the same in all records;
 both are linear, so that they are projected out of the residual instead of being searched (variable
 projection; Golub and Pereyra 1973, with the Jacobian of Kaufman 1975).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.component import Component
-from psa_casadi.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.identification.fitting.prediction import Prediction
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Channel, Experiment
 from psa_casadi.units import FloatArray
-
-#: The columns of a stack that are fitted beside its displacement, by name. The charge on a stack is
-#: that of its capacitance and, by reciprocity, a share of the displacement; the current is its
-#: rate, which lags faster than the sampling move most.
-COLUMNS: Mapping[str, Channel] = {
-    c.column: c
-    for c in (
-        Channel("monitor_voltage", "V", ("monitor_voltage",), scale="monitor_scale"),
-        Channel("charge", "C", ("charge", "displacement"), straight=1e-2),
-        Channel("current", "A", ("current", "velocity"), straight=5e-2),
-        Channel("displacement_2", "m", ("displacement_2",), scale="sensor_2_scale"),
-        Channel("strain", "1", ("strain",), scale="strain_scale"),
-    )
-}
-#: The sensor that a model gets for a column.
-SENSORS: Mapping[str, Component] = {
-    "monitor_voltage": MONITOR, "displacement_2": SECOND_SENSOR, "strain": STRAIN_GAUGE
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,13 +142,6 @@ def span_of(experiments: Sequence[Experiment], number: int) -> float:
     """Return the range of a channel's readings over the fitted samples of all records."""
     parts = [e.measured(number)[e.at(number)] for e in experiments]
     return float(np.ptp(np.concatenate(parts))) if any(p.size for p in parts) else 0.0
-
-
-def with_column(experiments: Sequence[Experiment], column: str) -> list[int]:
-    """Return the experiments that have a column and samples of it to fit."""
-    return [
-        k for k, e in enumerate(experiments) if e.record.column(column) is not None and e.used.any()
-    ]
 
 
 def scaled(model: Model, found: Sequence[Further]) -> tuple[Model, tuple[Further, ...]]:

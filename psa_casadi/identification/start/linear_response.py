@@ -62,15 +62,6 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
     return found
 
 
-def one_pole(pole: complex, x: FloatArray, h: float) -> ComplexArray:
-    """Return the response (n,) of 1/(s - pole) to x (n,), as `mode` takes it, complex."""
-    now, before, decay = _weights(pole, 1.0, h)
-    found: ComplexArray = scipy.signal.lfilter(
-        [now, before], [1.0, -decay], x.astype(np.complex128)
-    )
-    return found
-
-
 def _weights(pole: complex, residue: complex, h: float) -> tuple[complex, complex, complex]:
     """Return the weights of x now and a sample before, and what remains of the response."""
     z = pole * h
@@ -383,6 +374,7 @@ def _ringing(records: Sequence[Shaken], frequency: float, damping: float) -> Flo
     pole = omega * complex(-damping, turn)
     rows = []
     for r in records:
-        y = one_pole(pole, r.drive - r.drive[0], r.sample_time) * omega / turn
-        rows.append(np.column_stack([y.imag, (pole * y).imag / omega])[r.used])
+        x = r.drive - r.drive[0]
+        both = [mode(pole, -0.5j * q / turn, x, r.sample_time) for q in (omega, pole)]
+        rows.append(np.column_stack(both)[r.used])
     return np.vstack(rows)

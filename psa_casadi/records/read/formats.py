@@ -401,15 +401,15 @@ def _arrow_cells(column: Any, rows: int) -> Cells:
     if len(column) != rows:
         raise ValueError(f"{len(column)} of the {rows} rows that it states")
     kinds = pyarrow.types
-    if kinds.is_timestamp(column.type) or kinds.is_date(column.type):
-        column = column.cast(pyarrow.timestamp("ns"), safe=False)
-    elif kinds.is_time(column.type) or kinds.is_duration(column.type):
-        column = column.cast(pyarrow.duration(column.type.unit)).cast(pyarrow.duration("ns"))
-    elif kinds.is_integer(column.type) and not column.null_count:
-        pass
-    elif any(of(column.type) for of in (kinds.is_integer, kinds.is_floating, kinds.is_decimal)):
+    if kinds.is_time(column.type):
+        column = column.cast(pyarrow.duration(column.type.unit))
+    elif kinds.is_decimal(column.type):
         column = column.cast(pyarrow.float64(), safe=False)
-    else:
+    elif not (
+        kinds.is_temporal(column.type)
+        or kinds.is_integer(column.type)
+        or kinds.is_floating(column.type)
+    ):
         return ["" if v is None else str(v) for v in column.to_pylist()]
     return np.asarray(column.to_numpy())
 

@@ -61,7 +61,7 @@ def write_design_page(
     still = None
     if live is not None:
         s = live.records[0].series
-        if live.records[0].residual.any():
+        if s.unit or live.records[0].residual.any():
             still = record_figure(s, origin=live.aim), f"The {live.aim} and the model"
         else:
             figure = response_figure(s.time, s.voltage, s.measured)

@@ -3,24 +3,110 @@
 import os
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
+from psa_casadi.component import Component
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.population.finding import Finding
-from psa_casadi.population.population import Population, differences
+from psa_casadi.population.population import Difference, Population, differences
+from psa_casadi.report.documents.findings import Result, read_findings
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.plots import device_plots as plots
 from psa_casadi.report.words import population_words as words
 from psa_casadi.report.words.phrases import number, one_unit
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import VERDICTS
+from psa_casadi.shown import frame
 
 #: More devices than this are a population.
 MOST = 20
+#: Columns of a comparison as text.
+_WIDTH = 100
 #: Tiles at the top for so many devices; the table has all.
 _MOST_TILES = 4
 #: Parameters that have a plot; those in which devices stand out come first.
 _MOST_PLOTS = 12
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison:
+    """Devices side by side: what was found of each, and the parameters that several tell."""
+
+    findings: tuple[Finding, ...]
+
+    @cached_property
+    def differences(self) -> tuple[Difference, ...]:
+        """Every parameter that two devices or more tell, with p of "all have one value"."""
+        return differences(self.findings)
+
+    @property
+    def sentence(self) -> str:
+        """Which parameters differ beyond noise, and how the verdicts do."""
+        return words.difference_sentence(self.findings, self.differences)
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Verdicts with held-out errors of every output, and the parameters, if any are shared."""
+        found = [words.verdict_table(self.findings, words.error_scale(self.findings))]
+        if self.differences:
+            found.append(words.difference_table(self.findings, self.differences))
+        return tuple(t for t in found if len(t.head) > 1)  # of models alone only names
+
+    def __repr__(self) -> str:
+        """Return the sentence and the tables."""
+        return "\n\n".join([self.sentence, *(t.fitted(_WIDTH) for t in self.tables)])
+
+    def to_frame(self) -> Any:
+        """Return parameters by device as a pandas DataFrame: value, interval, unit, p, differ."""
+        rows = [
+            (d, f.device, f.parameters[d.estimates.name])
+            for d in self.differences
+            for k, f in enumerate(self.findings)
+            if k in d.estimates.places
+        ]
+        ends = [p.interval or (p.value, p.value) for _, _, p in rows]
+        return frame(
+            {
+                "parameter": [d.estimates.name for d, _, _ in rows],
+                "device": [device for _, device, _ in rows],
+                "value": [p.value for _, _, p in rows],
+                "low": [low for low, _ in ends],
+                "high": [high for _, high in ends],
+                "unit": [p.unit for _, _, p in rows],
+                "p_adjusted": [d.p_adjusted for d, _, _ in rows],
+                "differs": [d.differs for d, _, _ in rows],
+            }
+        )
+
+    def report(self, path: str | os.PathLike[str]) -> None:
+        """Write the page, one HTML file that needs no network. Raises InputError."""
+        write_comparison(self.findings, path)
+
+
+def compare(
+    *results: str | os.PathLike[str] | Result, effects: Sequence[Component] = ()
+) -> Comparison:
+    """Compare two devices or more, stacks or of a model of one's own.
+
+    `results` are what `identify` and `diagnose` return, or files of these (`read_findings`);
+    `effects` are own ones that MODEL.json names.
+
+    Raises InputError for fewer than two, and for what cannot be read.
+    """
+    found = read_findings(results, effects)
+    _refuse_fewer(found)
+    return Comparison(found)
+
+
+def _refuse_fewer(findings: Sequence[Finding]) -> None:
+    if len(findings) < 2:
+        raise InputError(
+            "One device is nothing to compare; give the files of two or more. (A model and a"
+            " diagnosis of the same records are one device.)"
+        )
 
 
 def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) -> None:
@@ -32,11 +118,7 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
     Raises:
         InputError: there are fewer than two devices or too many, or `path` cannot be written to.
     """
-    if len(findings) < 2:
-        raise InputError(
-            "One device is nothing to compare; give the files of two or more. (A model and a"
-            " diagnosis of the same records are one device.)"
-        )
+    _refuse_fewer(findings)
     if len(findings) > MOST:
         raise InputError(
             f"{len(findings)} devices have no room side by side; give {MOST} at most, or the folder"

@@ -21,7 +21,7 @@ from psa_casadi.identification.fitting.prediction import record_start
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
-from psa_casadi.records.signals import Hold
+from psa_casadi.records.signals import Hold, Signals
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words import colours
@@ -37,8 +37,9 @@ from psa_casadi.report.words.phrases import (
 from psa_casadi.report.words.series import Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
-from psa_casadi.simulation.simulate import output_of
+from psa_casadi.simulation.simulate import input_samples, output_of
 from psa_casadi.simulation.start import is_stack
+from psa_casadi.simulation.stepper import run
 from psa_casadi.units import convert
 from psa_casadi.variables import Output, Parameter, State
 
@@ -198,6 +199,29 @@ def live_design(
     series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
     row = LiveRecord(series, {"voltage": voltage}, rest=rest)
     return LiveModel(model, begun_module(model), [row], aim=words, design=True)
+
+
+def live_experiment(model: Model, record: Signals) -> LiveModel:
+    """Begin what lets any model but a stack run on a designed record, from its declared starts."""
+    s, time = model.structure, record.time - record.time[0]
+    start = np.array([q.start for q in s.states])
+    u = input_samples(model, record.n, record.columns)
+    shown = run(model, time, u, start, hold=record.hold).y.T
+    along, none = next(iter(record.columns)), np.zeros(record.n, dtype=bool)
+    rows = []
+    for output, y in zip(s.outputs, shown, strict=True):
+        series = Series(
+            output.name, time, record.columns[along], y, (Curve("model", colours.EXTENDED, y),),
+            none, noise=0.0, counts=False, quantity=output.name, unit=output.unit,
+            against=in_brackets(along, record.units[along]),
+        )  # fmt: skip
+        rows.append(
+            LiveRecord(
+                series, record.columns, output=output.name, along=along, start=start,
+                hold=record.hold,
+            )
+        )  # fmt: skip
+    return LiveModel(model, begun_module(model), rows, aim="design", design=True)
 
 
 def _fitted_records(

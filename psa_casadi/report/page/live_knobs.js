@@ -101,7 +101,7 @@ psaLive.knobs = function (told, values, changed) {
       return [
         group('Effects', told.effects.map(effect).concat(more || [])),
         group('Parameters', near.map(knob)),
-        fold && make('details', {open: Boolean(open)}, [make('summary', {text: 'All other parameters (' + far.length + ')'}), fold])
+        fold && make('details', {open: Boolean(open) || !near.length}, [make('summary', {text: 'All other parameters (' + far.length + ')'}), fold])
       ].filter(Boolean);
     },
     // Move all sliders; to values that count as not moved, if `settled`.

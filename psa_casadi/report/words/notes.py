@@ -92,6 +92,23 @@ _SUSPECT = {
 }
 
 
+#: Steps of the search for causes, as what was not tried.
+_LEFT = {
+    "neighbours": "further sets of causes",
+    "other effects": "effects behind the two leading ones",
+    "finalists": "the nearest rivals to their end",
+    "fits afresh": "fits from an ordinary base",
+    "other parents": "sets of causes from each of their causes",
+    "base again": "the base once more without each cause",
+    "resonances": "resonances that the base has missed",
+    "several modes": "several modes at once",
+    "several at once": "several causes at once",
+    "exchange": "other effects in a cause's place",
+    "all afresh": "the effects far behind",
+    "rejected": "causes beside what held-out data reject",
+}
+
+
 def _reading(value: tuple[float, str], digits: int) -> str:
     size, unit = value
     scale = prefixed_scale(abs(size), unit or "1")
@@ -121,6 +138,10 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
     ),
     "quantised": lambda where, output, step: (
         f"{where}: {output} is quantised in steps of {_reading(step, 3)}."
+    ),
+    "budget": lambda work, left: (
+        f"The search for causes ended at its budget of work ({work:.2g} steps of simulations): the"
+        f" answer is the best so far. Not tried: {', '.join(_LEFT[name] for name in left)}."
     ),
     "coarse": (
         "{record}: the sensor resolves {steps:.0f} steps over the whole range. They make up the"

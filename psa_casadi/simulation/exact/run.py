@@ -21,7 +21,7 @@ from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import doubles, unit_columns, which_of
-from psa_casadi.simulation.timings import count_run
+from psa_casadi.simulation.timings import count_run, count_steps
 from psa_casadi.units import FloatArray
 
 #: A sample is halved so many times at most; what then misses the tolerance is counted as forced.
@@ -242,6 +242,7 @@ def _run(
         **{name: array.ctypes.data for name, array in given.items()},
     )  # fmt: skip
     status = _library(structure, outputs, lanes).psa_run_exact(ctypes.byref(request))
+    count_steps((request.steps + request.rejected) * (1 + count))
     if status == _STOPPED:
         raise KeyboardInterrupt
     if status:
