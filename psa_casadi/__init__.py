@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     )
     from psa_casadi.devices.batch import BatchRun, batch
     from psa_casadi.devices.jobs import Job, Options
-    from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
+    from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
     from psa_casadi.diagnosis.verdict import patched_model
     from psa_casadi.effects import EFFECTS
     from psa_casadi.errors import InputError, MachineError, PsaError
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp import export_ssp
     from psa_casadi.faces import diagnose, identify
+    from psa_casadi.identification.identify import StackIdentification
     from psa_casadi.identification.result import Identification
     from psa_casadi.identification.start.two_clocks import two_clocks
     from psa_casadi.model.compose import Model, compose
@@ -109,6 +110,7 @@ _HOMES = {
     "component": "Component Equations Symbols",
     "identification.start.two_clocks": "two_clocks",
     "identification.result": "Identification",
+    "identification.identify": "StackIdentification",
     "model.own_effects": "own_effects",
     "model.stacks": "STACKS stack_model",
     "model.compose": "Model compose",
@@ -129,7 +131,7 @@ _HOMES = {
     "faces": "identify diagnose",
     "posterior.sample": "Posterior sample",
     "diagnosis.verdict": "patched_model",
-    "diagnosis.result": "Diagnosis OdeDiagnosis",
+    "diagnosis.result": "Diagnosis StackDiagnosis",
     "report.words.text": "story",
     "report.plots.figures": "save_figure",
     "report.page.results": "write_report write_fit_report",
@@ -157,7 +159,8 @@ __all__ = [
     "nanopositioner", "ode_model", "fmu_model", "Input", "Output", "Parameter", "Publication",
     "State", "load_model", "save_model", "Trajectory", "simulate", "simulate_record",
     "simulate_many", "memory_after", "settled_at", "run", "Identification",
-    "identify", "sample", "Posterior", "diagnose", "Diagnosis", "OdeDiagnosis", "load_diagnosis",
+    "identify", "sample", "Posterior", "diagnose", "Diagnosis", "StackDiagnosis",
+    "StackIdentification", "load_diagnosis",
     "timed", "Timings", "story", "report", "save_figure", "write_report", "write_fit_report",
     "batch", "BatchRun", "Job", "Options", "read_findings", "compare", "Comparison",
     "write_comparison",

@@ -8,7 +8,7 @@ from typing import Any, overload
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import diagnose as diagnosis
 from psa_casadi.diagnosis.ode import diagnose_ode
-from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
@@ -81,7 +81,7 @@ def diagnose(
     effects: Sequence[Component] | None = None,
     method: Method | None = None,
     progress: Progress = ...,
-) -> Diagnosis: ...
+) -> StackDiagnosis: ...
 @overload
 def diagnose(
     model: Model,
@@ -96,7 +96,7 @@ def diagnose(
     hold: Hold | None = None,
     effects: Sequence[Component] = ...,
     progress: Progress = ...,
-) -> OdeDiagnosis: ...
+) -> Diagnosis: ...
 @on_a_terminal
 @_told_of(diagnose_ode)
 @wraps(diagnosis.diagnose)

@@ -132,7 +132,7 @@ def _of_stack(
     reading: Reading,
     given: Given,
     left_out: Sequence[str],
-) -> Callable[..., psa.OdeDiagnosis]:
+) -> Callable[..., psa.Diagnosis]:
     """Read the records of a stack; return what diagnoses them, given `progress` and `watch`.
 
     `device` are --stack, --stiffness and --hysteresis.
@@ -151,12 +151,12 @@ def _of_stack(
 
 
 def _finish(
-    d: psa.OdeDiagnosis,
+    d: psa.Diagnosis,
     following: Path | None,
     outputs: Mapping[str, Path | None],
     page: tuple[str, bool],
     progress: Callable[[str], None],
-) -> tuple[psa.OdeDiagnosis, str]:
+) -> tuple[psa.Diagnosis, str]:
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
     `page` says what the page calls the records, and whether it is still.
@@ -200,13 +200,13 @@ def _searched(given: Given, left_out: Sequence[str]) -> "tuple[psa.Component, ..
 
 
 def _tell_files(
-    d: psa.OdeDiagnosis, outputs: Mapping[str, Path | None], unpatched: str, quiet: bool
+    d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str, quiet: bool
 ) -> None:
     """Name the files that were written, and say why a patch is missing."""
     from psa_casadi.cli import diagnosis_files as files
 
     shown = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
-    following = d.next_experiment.voltage_csv if isinstance(d, psa.Diagnosis) else None
+    following = d.next_experiment.voltage_csv if isinstance(d, psa.StackDiagnosis) else None
     tell_written(*shown, following, quiet=quiet)
     for line in [*files.models(d, outputs["--output"]), *([unpatched] if unpatched else [])]:
         show(line, quiet)

@@ -20,11 +20,9 @@ from psa_casadi.report.words.phrases import added, listing, number
 from psa_casadi.report.words.verdict_words import VERDICTS, of_range, verdict_sentence
 
 
-def alternatives(
-    d: result.OdeDiagnosis, output: Path | None
-) -> list[tuple[result.Alternative, Path]]:
+def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
     """Return the models with another cause, each with its file beside the extended model's."""
-    if output is None or not isinstance(d, result.Diagnosis):
+    if output is None or not isinstance(d, result.StackDiagnosis):
         return []
     return [
         (a, output.with_name(f"{output.stem}_{a.instead}_for_{a.cause}.json"))
@@ -32,7 +30,7 @@ def alternatives(
     ]
 
 
-def noted(d: result.OdeDiagnosis, left_out: Sequence[str]) -> result.OdeDiagnosis:
+def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
     """Say in the remarks which effects were not looked for."""
     if not left_out:
         return d
@@ -40,7 +38,7 @@ def noted(d: result.OdeDiagnosis, left_out: Sequence[str]) -> result.OdeDiagnosi
     return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
 
 
-def models(d: result.OdeDiagnosis, output: Path | None) -> list[str]:
+def models(d: result.Diagnosis, output: Path | None) -> list[str]:
     """Say what the model's file holds if nothing was added, and which files are beside it."""
     lines = [
         f"written: {path}, with {a.instead} instead of {a.cause}"
@@ -61,7 +59,7 @@ def keep_unfinished(stop: result.DiagnosisInterrupted, outputs: Mapping[str, Pat
 
 
 def keep(
-    d: result.OdeDiagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]
+    d: result.Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]
 ) -> str:
     """Write what takes no time of a finished diagnosis, and say which files there are."""
     quick = ("--output", "--json")
@@ -71,7 +69,7 @@ def keep(
 
 
 def write(
-    d: result.OdeDiagnosis,
+    d: result.Diagnosis,
     outputs: Mapping[str, Path | None],
     origin: str,
     written: list[Path],
@@ -98,10 +96,10 @@ def write(
 
 
 def with_next(
-    d: result.OdeDiagnosis, path: Path | None, progress: Callable[[str], None]
-) -> result.OdeDiagnosis:
+    d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]
+) -> result.Diagnosis:
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
-    if path is None or not isinstance(d, result.Diagnosis) or d.verdict != "ambiguous":
+    if path is None or not isinstance(d, result.StackDiagnosis) or d.verdict != "ambiguous":
         return d
     told, same = one_of_each(d.contenders, d.experiments)
     if same and len(told) < 2:
@@ -122,7 +120,7 @@ def with_next(
     return replace(d, next_experiment=following)
 
 
-def write_patch(d: result.OdeDiagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
+def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str], None]) -> str:
     """Write the model with the unnamed correction; say why where there is none to write."""
     if path is None:
         return ""
@@ -154,7 +152,7 @@ def expected(
     return wanted, None if max_error is None else largest
 
 
-def cases(d: result.OdeDiagnosis, wanted: tuple[str, ...], max_error: float | None) -> list[Case]:
+def cases(d: result.Diagnosis, wanted: tuple[str, ...], max_error: float | None) -> list[Case]:
     """Return verdict and largest held-out error of the extended model as tests, failed or not."""
     wrong = f"The verdict is {d.verdict}; expected {listing(wanted, 'or')}."
     failed = bool(wanted) and d.verdict not in wanted

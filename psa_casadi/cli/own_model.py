@@ -102,7 +102,7 @@ def own_diagnosis(
     *,
     leave_out: Sequence[str],
     others: Mapping[str, object],
-) -> Callable[..., psa.OdeDiagnosis]:
+) -> Callable[..., psa.Diagnosis]:
     """Read the records of a model of one's own; return what diagnoses it.
 
     That takes `progress` and `watch`; `others` are options that must be empty.

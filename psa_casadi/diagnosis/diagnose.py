@@ -13,7 +13,7 @@ from psa_casadi.diagnosis.judgement import NAMING, told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.probes import laws_of, screened_with
-from psa_casadi.diagnosis.result import Decision, Diagnosis, DiagnosisInterrupted, Verdict
+from psa_casadi.diagnosis.result import Decision, DiagnosisInterrupted, StackDiagnosis, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
@@ -279,7 +279,7 @@ def diagnose(
     method: Method | None = None,
     progress: Progress = lambda _: None,
     watch: Callable[[Tried], None] = lambda _: None,
-) -> Diagnosis:
+) -> StackDiagnosis:
     """Find what the base model gets wrong on the records, name the cause, measure the gain.
 
     `records` are those of one device: a record, the path of a file, a data frame or a mapping of
@@ -368,7 +368,7 @@ def _on_one_clock(records: Sequence[Record], said: list[Note | str]) -> list[Rec
     return [r for r, _ in done]
 
 
-def _diagnose(start: Model, task: Task, scale_given: bool) -> Diagnosis:
+def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
     """Diagnose from where the base fit starts; the task's `keep` gets the best fit so far."""
     experiments, table, progress = task.experiments, task.table, task.progress
     every = table

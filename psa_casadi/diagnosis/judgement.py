@@ -18,7 +18,7 @@ from psa_casadi.diagnosis.remedy import Size, changes
 from psa_casadi.diagnosis.result import (
     Candidate,
     Cause,
-    OdeDiagnosis,
+    Diagnosis,
     OutputError,
     Remaining,
     Verdict,
@@ -450,7 +450,7 @@ class ModelJudge(Judge):
         return (note("slight", names=names, more=more, small=small, least=self.limits.further),)
 
     @stage("judging")
-    def conclude(self) -> OdeDiagnosis:
+    def conclude(self) -> Diagnosis:
         """Return the diagnosis."""
         first, final = self.first, self.final
         experiments, noise = self._noise(final)
@@ -464,7 +464,7 @@ class ModelJudge(Judge):
             for o, level in zip(final.fit.channels, noise, strict=True)
         )
         base, extended = (tuple(s.fit.outputs(self.experiments)) for s in (first, final))
-        return OdeDiagnosis(
+        return Diagnosis(
             errors=errors, remarks=self.said, experiments=experiments, base=base,
             extended=extended, **self.common,
         )  # fmt: skip

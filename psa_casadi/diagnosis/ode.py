@@ -11,7 +11,7 @@ from psa_casadi.diagnosis.generic.attached import Attached, of_ones_own
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.judgement import ModelJudge
 from psa_casadi.diagnosis.pack import Pack, Task
-from psa_casadi.diagnosis.result import DiagnosisInterrupted, OdeDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.rivals import fit_rivals
@@ -47,7 +47,7 @@ def diagnose_ode(
     effects: Sequence[Component] = (),
     progress: Callable[[str], None] = lambda _: None,
     watch: Callable[[Tried], None] = lambda _: None,
-) -> OdeDiagnosis:
+) -> Diagnosis:
     """Find what a model gets wrong on its records, name the cause and its place, measure the gain.
 
     The model is fitted as by `identify`; then generic effects at its inputs, outputs and rates are

@@ -211,7 +211,7 @@ class Decision:
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class OdeDiagnosis(Reported):
+class Diagnosis(Reported):
     """A diagnosis of any model: verdict, causes, the base and the extended model, what remains.
 
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` (n, ny)
@@ -352,7 +352,7 @@ class OdeDiagnosis(Reported):
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Diagnosis(OdeDiagnosis):
+class StackDiagnosis(Diagnosis):
     """A diagnosis of a stack, whose one output is its displacement.
 
     `base` and `extended` (n,) are its predictions [m]. `noise` is the floor of every record;

@@ -38,8 +38,8 @@ from psa_casadi.diagnosis.result import (
     Cause,
     Diagnosis,
     NextExperiment,
-    OdeDiagnosis,
     OutputError,
+    StackDiagnosis,
     Verdict,
 )
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
@@ -320,7 +320,7 @@ class StackJudge(Judge):
         return self.cause(step, sizes(step.cause, self.model, records, unit=unit))
 
     @stage("judging")
-    def conclude(self) -> Diagnosis:
+    def conclude(self) -> StackDiagnosis:
         """Return the diagnosis."""
         experiments, final, limits = self.experiments, self.final, self.limits
         both = self.first.predicted, final.predicted
@@ -334,7 +334,7 @@ class StackJudge(Judge):
         held = (s.view.of.held[1:] for s in (self.first, final))
         further = zip(final.fit.further, final.screening.colour.further, *held, strict=True)
         common = self.common | {"budget": self.spent}
-        return Diagnosis(
+        return StackDiagnosis(
             **common,
             errors=(
                 shown,
@@ -362,7 +362,7 @@ class StackJudge(Judge):
         )
 
 
-def patched_model(d: OdeDiagnosis) -> Model:
+def patched_model(d: Diagnosis) -> Model:
     """Return the extended model with the unnamed correction fitted beside it, all values free.
 
     Raises InputError where a diagnosis has none, or one that no component stands for;
@@ -370,7 +370,7 @@ def patched_model(d: OdeDiagnosis) -> Model:
     """
     if d.correction is not None:
         return d.correction.model
-    if not isinstance(d, Diagnosis) or d.patch is None:
+    if not isinstance(d, StackDiagnosis) or d.patch is None:
         raise InputError("No unnamed correction removes more than the extended model does.")
     found = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
     given = d.model.provenance.force_scale == "given"

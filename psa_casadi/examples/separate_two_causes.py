@@ -20,7 +20,7 @@ from psa_casadi.design.experiment.experiment import (
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, write_record
@@ -58,14 +58,14 @@ def measured(record: Signals, seed: int) -> Record:
     return Record(name=record.name, time=record.time, voltage=voltage, displacement=x + noise)
 
 
-def said(d: Diagnosis) -> str:
+def said(d: StackDiagnosis) -> str:
     """Return what a diagnosis names, with what cannot be distinguished from it."""
     names = [n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)]
     return " or ".join(names) or d.verdict
 
 
 def _draw(
-    path: Path, design: Separated, played: dict[str, Record], after: dict[str, Diagnosis]
+    path: Path, design: Separated, played: dict[str, Record], after: dict[str, StackDiagnosis]
 ) -> None:
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     rows = figure.subplots(len(played), 1, sharex=True, sharey=True)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
@@ -27,12 +27,12 @@ from psa_casadi.report.words.text import identification_text, posterior_text, st
 from psa_casadi.simulation.simulate import Trajectory
 
 _WORDS: dict[type, Callable[..., str]] = {
-    Diagnosis: story,
+    StackDiagnosis: story,
     StackIdentification: identification_text,
     Posterior: posterior_text,
 }
 Told = AnyDiagnosisFile
-Reported = OdeDiagnosis | Identification | Posterior | Population | Sequence[Finding]
+Reported = Diagnosis | Identification | Posterior | Population | Sequence[Finding]
 
 
 def report(result: Reported, path: str | os.PathLike[str], *, still: bool = False) -> None:
@@ -44,7 +44,7 @@ def report(result: Reported, path: str | os.PathLike[str], *, still: bool = Fals
     Raises:
         InputError: `path` cannot be written to.
     """
-    if isinstance(result, OdeDiagnosis):
+    if isinstance(result, Diagnosis):
         write_report(result, path, still=still)
     elif isinstance(result, Identification):
         write_fit_report(result, path, still=still)
@@ -67,7 +67,7 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
 
 def line(result: Plotted | Told) -> str:
     """Return a result in one line."""
-    if isinstance(result, OdeDiagnosis | AnyDiagnosisFile):
+    if isinstance(result, Diagnosis | AnyDiagnosisFile):
         return _diagnosis(result)
     if isinstance(result, StackIdentification):
         count = len(result.experiments)
@@ -86,10 +86,10 @@ def line(result: Plotted | Told) -> str:
     return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
 
 
-def _diagnosis(d: OdeDiagnosis | Told) -> str:
+def _diagnosis(d: Diagnosis | Told) -> str:
     named = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
     causes = f": {named}" if named else ""
-    if not isinstance(d, Diagnosis | DiagnosisFile):
+    if not isinstance(d, StackDiagnosis | DiagnosisFile):
         return f"<Diagnosis of an own model {d.verdict}{causes}>"
     before, after = (e.holdout_nrmse_percent for e in (d.base_errors, d.extended_errors))
     first = f"{number(before, 2)} -> " if before != after else ""

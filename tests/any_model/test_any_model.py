@@ -31,11 +31,11 @@ from tests.report.test_schemas import valid
 
 
 @cache
-def _hysteresis() -> psa.OdeDiagnosis:
+def _hysteresis() -> psa.Diagnosis:
     return psa.diagnose(oscillator(), plants.bouc_wen(1))
 
 
-def _only(d: psa.OdeDiagnosis, effect: str) -> bool:
+def _only(d: psa.Diagnosis, effect: str) -> bool:
     return d.verdict == "cause_named" and [c.effect for c in d.causes] == [effect]
 
 
@@ -180,7 +180,7 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     _run(first, names)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["motor.html", "motor_with_friction.fmu"]
     d = names["result"]
-    assert isinstance(d, psa.OdeDiagnosis)
+    assert isinstance(d, psa.Diagnosis)
     assert _only(d, "friction_in_speed")
     assert d.model.values["friction_in_speed_size"] == pytest.approx(0.012 / 3e-5, rel=0.02)
     for error, noise in zip(d.errors, (0.3, 0.005), strict=True):

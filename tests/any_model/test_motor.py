@@ -20,7 +20,7 @@ def test_effects_of_a_pack_are_named_in_plants_of_other_forms(
     (program,) = block_in_tests("docs/howto/motor.md").commands
     names: dict[str, Any] = {}
     exec("\n".join(program.split("\n")[1:-1]), names)
-    found: dict[str, psa.OdeDiagnosis] = names["results"]
+    found: dict[str, psa.Diagnosis] = names["results"]
     clean = found.pop("nothing")
     assert clean.verdict == "adequate"
     assert not clean.causes

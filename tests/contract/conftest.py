@@ -24,5 +24,5 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
 
 
 @pytest.fixture(scope="session")
-def result() -> psa.Diagnosis:
+def result() -> psa.StackDiagnosis:
     return psa.diagnose(DATA / "demo.csv")

@@ -125,7 +125,7 @@ def test_the_demos_models_say_where_they_come_from(demo: Demo) -> None:
 
 
 def test_the_extended_model_is_nearer_to_the_plant_than_the_noise(
-    result: psa.Diagnosis, tmp_path: Path
+    result: psa.StackDiagnosis, tmp_path: Path
 ) -> None:
     truth = make_demo(tmp_path / "r.csv")
     clean = truth.displacement
@@ -135,7 +135,7 @@ def test_the_extended_model_is_nearer_to_the_plant_than_the_noise(
     assert extended < 0.4 * truth.sigma < base
 
 
-def test_held_out_errors_are_those_of_samples_that_no_fit_saw(result: psa.Diagnosis) -> None:
+def test_held_out_errors_are_those_of_samples_that_no_fit_saw(result: psa.StackDiagnosis) -> None:
     frame = result.to_frame()
     held = frame["held_out"].to_numpy()
     assert 0.2 < held.mean() < 0.3
@@ -149,7 +149,7 @@ def test_held_out_errors_are_those_of_samples_that_no_fit_saw(result: psa.Diagno
         assert told.holdout_nrmse_percent == pytest.approx(share, rel=0.02)
 
 
-def test_a_diagnosis_is_loaded_back_and_pickled(demo: Demo, result: psa.Diagnosis) -> None:
+def test_a_diagnosis_is_loaded_back_and_pickled(demo: Demo, result: psa.StackDiagnosis) -> None:
     path = demo.folder / "diagnosis.json"
     loaded = psa.load_diagnosis(path)
     assert loaded.to_json() == path.read_text("utf-8")
@@ -192,7 +192,7 @@ def test_the_demos_page_is_one_file_with_the_figures(demo: Demo) -> None:
     assert [int.from_bytes(head[k : k + 4], "big") for k in (16, 20)] == [1600, 1000]
 
 
-def test_results_show_themselves(result: psa.Diagnosis, tmp_path: Path) -> None:
+def test_results_show_themselves(result: psa.StackDiagnosis, tmp_path: Path) -> None:
     assert repr(result).startswith("<Diagnosis cause_named: ")
     assert len(repr(result)) < 300
     cell = result._repr_html_()

@@ -144,7 +144,7 @@ def test_many_devices_are_worked_on_and_one_that_fails_stops_none(
 def test_friction_of_a_motor_is_found_with_its_size(tmp_path: Path) -> None:
     """A model of one's own, and a plant with other equations and dry friction at its shaft."""
     d = psa.diagnose(motor(), own_plants.motor(1))
-    assert isinstance(d, psa.OdeDiagnosis)
+    assert isinstance(d, psa.Diagnosis)
     assert d.verdict == "cause_named"
     assert [c.effect for c in d.causes] == ["friction_in_speed"]
     assert d.causes[0].port == "the rate of speed"

@@ -309,9 +309,9 @@ SAMPLES = 2000
 @dataclass(frozen=True, eq=False)
 class Loop:
     first: psa.Record
-    ambiguous: psa.Diagnosis
+    ambiguous: psa.StackDiagnosis
     design: Separated
-    named: psa.Diagnosis
+    named: psa.StackDiagnosis
 
 
 @pytest.fixture(scope="module")

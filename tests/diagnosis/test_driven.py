@@ -39,7 +39,7 @@ def shown() -> FloatArray:
     return found + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
 
 
-def _told(y: FloatArray, voltage: FloatArray = VOLTAGE) -> psa.Diagnosis:
+def _told(y: FloatArray, voltage: FloatArray = VOLTAGE) -> psa.StackDiagnosis:
     record = Record(name="r", time=TIME, voltage=voltage, displacement=y)
     return psa.diagnose([record], effects=TABLE)
 

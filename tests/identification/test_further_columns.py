@@ -46,7 +46,7 @@ def diagnosed(
     effects: tuple[str, ...],
     excitation: ExcitationKind = "rich",
     seed: int = 2,
-) -> psa.Diagnosis:
+) -> psa.StackDiagnosis:
     truth = hide(plants.plain(seed, excitation), gain)
     record = truth.record(seed, column, samples=SAMPLES)
     return psa.diagnose([record], effects=[EFFECTS[n] for n in effects])

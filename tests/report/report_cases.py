@@ -77,7 +77,7 @@ def periodic(counts: bool = False) -> tuple[Experiment, NoiseFloor, Misfit, Misf
     return split(record), floor, before, after
 
 
-def with_periodic(d: result.Diagnosis, *, counts: bool = False) -> result.Diagnosis:
+def with_periodic(d: result.StackDiagnosis, *, counts: bool = False) -> result.StackDiagnosis:
     """Return a diagnosis of one record with another in its place, of a periodic voltage."""
     e, floor, before, after = periodic(counts)
     y = measured(e.record)
@@ -95,7 +95,7 @@ def _fit(model: psa.Model, records: int) -> Fit:
 
 def diagnosis(
     verdict: result.Verdict, names: tuple[str, ...] = ("plant_a",), samples: int = 1500
-) -> result.Diagnosis:
+) -> result.StackDiagnosis:
     """Return a diagnosis with the given verdict on the named records."""
     added = verdict in ADDED
     parts = [experiment(n, samples) for n in names]
@@ -114,7 +114,7 @@ def diagnosis(
     removes = Share("slow_creep", 0.97 if added else 0.0, (0.95, 0.98) if added else (0.0, 0.0))
     left = (7e-9, 0.04) if added else (4.97e-8, 0.31)
     seen = [misfits(n, samples) for n in names]
-    return result.Diagnosis(
+    return result.StackDiagnosis(
         verdict=verdict,
         causes=(cause,) if added else (),
         candidates=(

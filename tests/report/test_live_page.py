@@ -33,7 +33,7 @@ NASTY = "<img src=x onerror=alert(1)>"
 
 
 @pytest.fixture(scope="module")
-def shown() -> psa.Diagnosis:
+def shown() -> psa.StackDiagnosis:
     """A diagnosis of two records, of a name that is no HTML; an unnamed correction adds 20 nm."""
     d = diagnosis("cause_named", ("rig_a", "rig_b"))
     first = d.experiments[0]
@@ -42,13 +42,13 @@ def shown() -> psa.Diagnosis:
 
 
 @pytest.fixture(scope="module")
-def page(shown: psa.Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(shown: psa.StackDiagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("live") / "page.html"
     psa.write_report(shown, path)
     return path
 
 
-def rms_of(d: psa.Diagnosis, values: dict[str, float]) -> float:
+def rms_of(d: psa.StackDiagnosis, values: dict[str, float]) -> float:
     """Return the held-out rms [nm] of the first record at other values, the offset found again."""
     e, fit = d.experiments[0], d.extended_fit
     model = d.model.with_values(values)
@@ -79,7 +79,7 @@ def told_rms(text: str) -> float:
 
 @slow
 def test_a_moved_slider_shows_what_python_simulates(
-    moved: dict[str, Any], shown: psa.Diagnosis
+    moved: dict[str, Any], shown: psa.StackDiagnosis
 ) -> None:
     names = shown.model.parameter_names
     at = dict(zip(names, moved["values"], strict=True))
@@ -94,7 +94,7 @@ def test_a_moved_slider_shows_what_python_simulates(
 
 
 @slow
-def test_the_error_budget_follows(moved: dict[str, Any], shown: psa.Diagnosis) -> None:
+def test_the_error_budget_follows(moved: dict[str, Any], shown: psa.StackDiagnosis) -> None:
     assert moved["fitted"] == []  # no effect is on
     at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
     values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
@@ -112,7 +112,7 @@ def test_the_error_budget_follows(moved: dict[str, Any], shown: psa.Diagnosis) -
 
 
 @slow
-def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: psa.Diagnosis) -> None:
+def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: psa.StackDiagnosis) -> None:
     at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
     assert at["tau"] == pytest.approx(2.5e-4, rel=1e-12)
     assert at["creep_gain"] > 0.0
@@ -126,7 +126,7 @@ def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: psa.Diagn
 
 @slow
 def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
-    browser: Browser, shown: psa.Diagnosis, tmp_path: Path
+    browser: Browser, shown: psa.StackDiagnosis, tmp_path: Path
 ) -> None:
     model = shown.model.with_values({"creep_gain": 0.02})
     psa.write_report(replace(shown, model=model), tmp_path / "on.html")
@@ -143,7 +143,7 @@ def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
 
 
 @slow
-def test_the_model_file_of_a_page_is_read(moved: dict[str, Any], shown: psa.Diagnosis) -> None:
+def test_the_model_file_of_a_page_is_read(moved: dict[str, Any], shown: psa.StackDiagnosis) -> None:
     model = loads(moved["file"])
     assert model.parameter_vector().tolist() == moved["values"]
     assert "k_L" not in model.provenance.intervals
@@ -195,7 +195,7 @@ def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -
 
 @slow
 def test_without_compiler_a_page_says_so(
-    shown: psa.Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shown: psa.StackDiagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("psa_casadi.export.web.has_zig", lambda: False)
     monkeypatch.setattr(live, "has_zig", lambda: False)

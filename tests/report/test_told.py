@@ -26,7 +26,7 @@ from tests.report.html_page import figures, numbers, written
 from tests.report.report_cases import VERDICTS, diagnosis, identification, with_periodic
 
 FOLDER = Path(__file__).parent / "told"
-Result = psa.Diagnosis | StackIdentification
+Result = psa.StackDiagnosis | StackIdentification
 
 
 def shares(*each: float, together: float = 0.97) -> StackBudget:
@@ -37,7 +37,7 @@ def shares(*each: float, together: float = 0.97) -> StackBudget:
     return StackBudget(whole, rows, None, 4e-8, 5e-9, 7e-9, 0.04)
 
 
-def with_memory() -> psa.Diagnosis:
+def with_memory() -> psa.StackDiagnosis:
     """Return a diagnosis whose second cause has a rival, and weights."""
     d, memory = diagnosis("partly_explained"), psa.EFFECTS["hysteresis_memory"]
     size = Estimate(0.1, "1", (0.08, 0.12))
@@ -46,7 +46,7 @@ def with_memory() -> psa.Diagnosis:
     return replace(d, causes=(*d.causes, second), model=d.model.with_effect(memory))
 
 
-def blind() -> psa.Diagnosis:
+def blind() -> psa.StackDiagnosis:
     """Return a diagnosis with seven blind spots, each further away than the one before."""
     d, spots = diagnosis("adequate"), []
     for k, effect in enumerate(list(psa.EFFECTS.values())[:7]):
@@ -57,7 +57,7 @@ def blind() -> psa.Diagnosis:
     return replace(d, blind_to=tuple(spots))
 
 
-def rival(*names: str) -> psa.Diagnosis:
+def rival(*names: str) -> psa.StackDiagnosis:
     d = diagnosis("ambiguous")
     return replace(d, causes=(replace(d.causes[0], cannot_be_told_from=names),))
 
@@ -87,7 +87,7 @@ def not_fitted() -> StackIdentification:
     return replace(found, determinacy=none)
 
 
-def wide(d: psa.Diagnosis) -> psa.Diagnosis:
+def wide(d: psa.StackDiagnosis) -> psa.StackDiagnosis:
     """Return a diagnosis whose base errs by micrometres."""
     return replace(
         d, errors=(replace(d.errors[0], base=2.5e-6, extended=5e-8),),

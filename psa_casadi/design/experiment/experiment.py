@@ -24,7 +24,7 @@ from psa_casadi.design.experiment.criteria import (
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
 from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, Progress, coarse, search
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.result import Diagnosis
+from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
@@ -401,7 +401,7 @@ def informative_experiment(
 
 
 def resolving_experiment(
-    d: Diagnosis,
+    d: StackDiagnosis,
     *,
     limits: Limits | None = None,
     effort: Effort | None = None,

@@ -560,10 +560,10 @@ DIAGNOSES: dict[Any, type[DiagnosisFile | OwnModelFile]] = {
 
 
 def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile:
-    """Return what DIAGNOSIS.json holds: verdict, causes, errors by the names of a `Diagnosis`.
+    """Return what DIAGNOSIS.json holds: verdict, causes, errors by the names of a `StackDiagnosis`.
 
     The file has no samples and no model (`load_model` reads that); to keep a whole result, pickle
-    it. A diagnosis of an own model gives what `OdeDiagnosis` names so.
+    it. A diagnosis of an own model gives what `Diagnosis` names so.
 
     Raises InputError for a file that cannot be read, is none of a diagnosis, or lacks something.
     """

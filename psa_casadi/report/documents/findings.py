@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import OdeDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
@@ -42,7 +42,7 @@ from psa_casadi.strict_json import decode, read_json
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 #: What `identify` and `diagnose` return.
-Result = OdeDiagnosis | Identification
+Result = Diagnosis | Identification
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
@@ -97,7 +97,7 @@ def _read(
     if isinstance(given, Identification):
         path, source = Path(given.experiments[0].record.name), "identification"
         content = identification_file(given)
-    elif isinstance(given, OdeDiagnosis):
+    elif isinstance(given, Diagnosis):
         path = Path(given.experiments[0].record.name)
         content = given.to_dict()
         finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))

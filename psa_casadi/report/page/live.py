@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
 from psa_casadi.export.web import begun_module
@@ -155,9 +155,9 @@ class LiveModel:
         return "" if has_zig() else f"It takes a compiler: {INSTALL_ZIG}"
 
 
-def live_diagnosis(d: Diagnosis | OdeDiagnosis, rows: Sequence[Series]) -> LiveModel:
+def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of a diagnosis alive; `rows` are its series."""
-    if not isinstance(d, Diagnosis):
+    if not isinstance(d, StackDiagnosis):
         records = _fitted_records(d.model, d.extended_fit, d.experiments, rows)
         return LiveModel(d.model, begun_module(d.model), records, extended=added(d))
     patch = d.patch

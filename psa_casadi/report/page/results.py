@@ -10,7 +10,7 @@ import numpy as np
 
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
-from psa_casadi.diagnosis.result import Cause, Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import StackIdentification
@@ -72,7 +72,7 @@ _STATUSES = {
 
 
 def write_report(
-    diagnosis: OdeDiagnosis,
+    diagnosis: Diagnosis,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -112,8 +112,8 @@ def write_fit_report(
     atomic_write(path, fit_page(found, series, origin=origin, profiles=profiles, live=live))
 
 
-def _diagnosis_page(d: OdeDiagnosis, origin: str, still: bool, model_file: str | None) -> str:
-    stack = d if isinstance(d, Diagnosis) else None
+def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | None) -> str:
+    stack = d if isinstance(d, StackDiagnosis) else None
     if stack is None:
         return _page(d, None, origin, still, model_file)
     with phrases.one_unit(phrases.scale_of(d.experiments, stack.base_errors.holdout_rms_m)):
@@ -121,7 +121,7 @@ def _diagnosis_page(d: OdeDiagnosis, origin: str, still: bool, model_file: str |
 
 
 def _page(
-    d: OdeDiagnosis, stack: Diagnosis | None, origin: str, still: bool, model_file: str | None
+    d: Diagnosis, stack: StackDiagnosis | None, origin: str, still: bool, model_file: str | None
 ) -> str:
     series, effects = series_of(d), {c.name: c for c in d.model.components}
     live = None if still else live_diagnosis(d, series)  # compiles meanwhile
@@ -157,13 +157,13 @@ def _page(
     )
 
 
-def _alternatives(d: Diagnosis, cause: Cause) -> list[str]:
+def _alternatives(d: StackDiagnosis, cause: Cause) -> list[str]:
     """Say which models have another effect in a cause's place."""
     own = [a for a in d.alternatives if a.cause == cause.effect]
     return [f"{phrases.raised(verdict_words.alternative_sentence(d, a))}." for a in own]
 
 
-def _of_any(d: OdeDiagnosis, series: Sequence[Series]) -> dict[str, Any]:
+def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
     """Return what the page shows of a model that is no stack."""
     rows = [(s, residual_figures(s, s.curves[0])) for s in series]
     rows.sort(key=lambda row: -row[1].range_share)
@@ -189,7 +189,7 @@ def _of_any(d: OdeDiagnosis, series: Sequence[Series]) -> dict[str, Any]:
     }
 
 
-def _of_stack(d: Diagnosis) -> dict[str, Any]:
+def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
     """Return what the page shows of a stack alone."""
     span = max(e.record.range_m for e in d.experiments)
     e, x = d.base_errors, d.extended_errors
@@ -398,7 +398,7 @@ def _part(
 
 
 def _bars(
-    d: OdeDiagnosis,
+    d: Diagnosis,
     base: float,
     extended: float,
     noise: float,
@@ -410,7 +410,7 @@ def _bars(
     return [(*row, text(row[1])) for row in rows]
 
 
-def _budget(d: OdeDiagnosis) -> dict[str, Any]:
+def _budget(d: Diagnosis) -> dict[str, Any]:
     """Return the error budget, and what the unnamed correction adds."""
     b, excess, patch = d.budget, None, None
     if isinstance(b, StackBudget):
@@ -444,14 +444,14 @@ def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
     return tuple((m, name) for _, m, name in order[:_VIEWS])
 
 
-def _compared(d: Diagnosis, m: Misfit) -> tuple[Misfit | None, bool]:
+def _compared(d: StackDiagnosis, m: Misfit) -> tuple[Misfit | None, bool]:
     """Return what the extended model leaves of the same record, and whether it is in counts."""
     after = next((r for r in d.remainder if r.record == m.record), None) if added(d) else None
     units = {e.record.name: e.record.displacement_unit for e in d.experiments}
     return after, units.get(m.record) == "counts"
 
 
-def _data_view(d: Diagnosis, m: Misfit, name: str) -> Picture | None:
+def _data_view(d: StackDiagnosis, m: Misfit, name: str) -> Picture | None:
     """Return the picture of one view of a record's residual, None where there is nothing in it."""
     after, counts = _compared(d, m)
     if name == "spectrum":
@@ -487,7 +487,7 @@ def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Ta
     return tables.Table(tuple(head), tuple(rows))
 
 
-def _signature(d: Diagnosis, name: str) -> dict[str, Any] | None:
+def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
     """Return the signature of a cause beside the same view of the record that shows most of it."""
     effect = next((c for c in d.model.components if c.name == name), None)
     if effect is None or effect.more_of:  # several modes look as their tones make them look
@@ -505,7 +505,7 @@ def _signature(d: Diagnosis, name: str) -> dict[str, Any] | None:
     }
 
 
-def _of_the_data(d: Diagnosis, name: str) -> Picture | None:
+def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
     """Return the data's view along the signature's coordinate, or the one that shows most."""
 
     def share(m: Misfit) -> float:

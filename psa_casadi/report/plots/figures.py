@@ -11,7 +11,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path
@@ -39,7 +39,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import convert
 
-Compared = OdeDiagnosis | Identification
+Compared = Diagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals
 
 #: What all pictures share.
@@ -70,7 +70,7 @@ _OVER = {
 
 
 def save_figure(
-    diagnosis: OdeDiagnosis,
+    diagnosis: Diagnosis,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -89,7 +89,7 @@ def save_figure(
 
 def figure_of(result: Plotted) -> Figure:
     """Return the picture of a result."""
-    if isinstance(result, Diagnosis):
+    if isinstance(result, StackDiagnosis):
         return diagnosis_figure(result)
     if isinstance(result, StackIdentification):
         series = series_of_fit(result)
@@ -108,7 +108,7 @@ def figure_of(result: Plotted) -> Figure:
     return outputs_figure(same) if len(same) > 1 else record_figure(worst)
 
 
-def diagnosis_figure(diagnosis: OdeDiagnosis, *, origin: str = "measured") -> Figure:
+def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
     verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
     figure, grid, shown = _sheet(series_of(diagnosis), origin, "base model", verdict)
@@ -209,7 +209,7 @@ def _draw_residual(axes: Axes, s: Series, origin: str = "measured") -> None:
     axes.set_ylim(-1.1 * largest, 1.45 * largest)
 
 
-def narrow_figure(diagnosis: OdeDiagnosis, *, origin: str = "measured") -> Figure:
+def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return two panels: the residual over a stretch of time, and the held-out errors as bars.
 
     At half its 720 x 880 points, the width of a phone, letters are still large enough.
@@ -288,7 +288,7 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
-    return series_of(result) if isinstance(result, OdeDiagnosis) else series_of_fit(result)
+    return series_of(result) if isinstance(result, Diagnosis) else series_of_fit(result)
 
 
 def _chosen(output: str | None, there: Collection[str], usual: str) -> str:

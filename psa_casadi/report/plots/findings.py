@@ -7,7 +7,7 @@ import numpy as np
 
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
 from psa_casadi.diagnosis.misfit import Misfit, Spectrum
-from psa_casadi.diagnosis.result import Candidate, OdeDiagnosis
+from psa_casadi.diagnosis.result import Candidate, Diagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.diagnosis.views import View
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
@@ -40,7 +40,7 @@ _TOP = 2.5
 _PARABOLA_POINTS = 81
 
 
-def evidence_plot(d: OdeDiagnosis, most: int | None = None) -> Panel:
+def evidence_plot(d: Diagnosis, most: int | None = None) -> Panel:
     """One bar for every effect that was tried; text says the share of the excess it explains.
 
     Named causes come first, with their confidence. Of many, the first and most telling ones where
@@ -68,7 +68,7 @@ def evidence_plot(d: OdeDiagnosis, most: int | None = None) -> Panel:
     )
 
 
-def _figure(candidate: Candidate, d: OdeDiagnosis) -> str:
+def _figure(candidate: Candidate, d: Diagnosis) -> str:
     """Return how sure a named cause is, the probability of others; else the share it explains."""
     named = next((c for c in d.causes if c.effect == candidate.effect), None)
     if named is not None:
@@ -154,7 +154,7 @@ def _ends(values: FloatArray) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def correction_plot(d: OdeDiagnosis, c: Correction) -> tuple[str, Panel]:
+def correction_plot(d: Diagnosis, c: Correction) -> tuple[str, Panel]:
     """Return over what, and what an unnamed correction adds.
 
     Of a stack it is that of the record to which most is added, of any other model that of all.

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
-from psa_casadi.diagnosis.result import Candidate, Cause, OdeDiagnosis
+from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 
@@ -179,7 +179,7 @@ def confidence_text(confidence: float) -> str:
     return f"confidence {percent(confidence)}: {words}"
 
 
-def share_text(candidate: Candidate, d: OdeDiagnosis) -> str:
+def share_text(candidate: Candidate, d: Diagnosis) -> str:
     """Return the share of the excess that an effect explains alone, or that it was only screened.
 
     Of one of several named causes also what it removes beside the others.
@@ -198,7 +198,7 @@ def share_text(candidate: Candidate, d: OdeDiagnosis) -> str:
     return alone if own is None else f"{alone}; with others {own.percents[0]} %"
 
 
-def rest_sentence(d: OdeDiagnosis) -> str:
+def rest_sentence(d: Diagnosis) -> str:
     """Say what remains, with the p value of the test of the rest."""
     p = d.remaining.p_value
     return f"{d.remaining.where.rstrip('.')} ({f'p = {number(p, 2)}' if p > 1e-6 else 'p < 1e-6'})."
@@ -259,7 +259,7 @@ def interval_text(low: float, high: float) -> str:
     return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def added(d: OdeDiagnosis) -> bool:
+def added(d: Diagnosis) -> bool:
     """Say whether the extended model differs from the base."""
     return bool(d.causes or d.kept)
 

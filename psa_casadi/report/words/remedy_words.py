@@ -9,7 +9,7 @@ from pathlib import PurePath
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.diagnosis.result import Cause, Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis, StackDiagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
@@ -189,14 +189,14 @@ class Advice:
     commands: tuple[str, ...] = ()
 
 
-def what_now(d: OdeDiagnosis, model_file: str | None = None) -> Advice:
+def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
     """Return what to do after a diagnosis; `model_file` is where its model was written."""
     if d.verdict == "not_driven":
         return Advice((
             "See that both columns are of one run and of one axis, that the amplifier was on, and"
             " that units and sign are right.",
         ))  # fmt: skip
-    stack = d if isinstance(d, Diagnosis) else None
+    stack = d if isinstance(d, StackDiagnosis) else None
     errors, noise = _sizes(d)
     commands, beside = _commands(stack, model_file) if stack else ((), _IN_PYTHON * added(d))
     if d.verdict == "adequate" and d.doubt:
@@ -229,9 +229,9 @@ def what_now(d: OdeDiagnosis, model_file: str | None = None) -> Advice:
     return Advice(lines, (*_rivals(d.causes), *beside), commands)
 
 
-def _sizes(d: OdeDiagnosis) -> tuple[str, str]:
+def _sizes(d: Diagnosis) -> tuple[str, str]:
     """Return the extended model's held-out error in every output, and the noise."""
-    if isinstance(d, Diagnosis):
+    if isinstance(d, StackDiagnosis):
         scale = scale_of(d.experiments, d.extended_errors.holdout_rms_m)
         error = f"{scale.text(d.extended_errors.holdout_rms_m)} rms"
         return error, scale.text(d.noise_floor_rms_m)
@@ -241,7 +241,7 @@ def _sizes(d: OdeDiagnosis) -> tuple[str, str]:
     return listing(errors), listing([with_its_unit(noise, unit) for _, noise, unit, _ in rows])
 
 
-def _further(d: OdeDiagnosis) -> str:
+def _further(d: Diagnosis) -> str:
     """Return what to do where no effect of any model explains what is missing."""
     if d.correction is None:
         return "record more of what may matter: another input, level or output"
@@ -251,7 +251,7 @@ def _further(d: OdeDiagnosis) -> str:
     )
 
 
-def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _commands(d: StackDiagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the commands that take the model further, and what must be said of its file."""
     file = model_file or _FILES[added(d)]
     fmu = shlex.quote(str(PurePath(file).with_suffix(".fmu")))

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.diagnosis.result import Candidate, Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Candidate, Diagnosis, StackDiagnosis
 from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import StackIdentification
@@ -119,12 +119,12 @@ def time_scale(span: float) -> phrases.Scale:
 _FEWEST = 8
 
 
-def series_of(d: OdeDiagnosis) -> tuple[Series, ...]:
+def series_of(d: Diagnosis) -> tuple[Series, ...]:
     """Return the records of a diagnosis with the base and, if something was added, the extended.
 
     Of a stack that is the displacement, of any other model every output in every record.
     """
-    stack = d if isinstance(d, Diagnosis) else None
+    stack = d if isinstance(d, StackDiagnosis) else None
     count = 1 if stack else len(d.experiments[0].channels)
     noise = {e.output: e.noise for e in d.errors}
     found = []

@@ -8,7 +8,7 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, StackDiagnosis
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification, StartOutcome
@@ -115,7 +115,7 @@ def _status(model: Model, name: str, found: Identification | None) -> str:
     return "fit" if degree in ("determined", "fixed") else f"fit, {degree}"
 
 
-def candidate_table(d: OdeDiagnosis) -> Table:
+def candidate_table(d: Diagnosis) -> Table:
     """Return every effect tried: evidence, share of the excess, and probability if one is named."""
     head = ["effect", "evidence over the base [ln]", "explains of the excess, alone"]
     rows = [[plain(c.effect), number(round(c.evidence, 6)), share_text(c, d)] for c in d.candidates]
@@ -126,12 +126,12 @@ def candidate_table(d: OdeDiagnosis) -> Table:
     return _table(head, rows)
 
 
-def error_table(d: OdeDiagnosis, scale: Scale) -> Table:
+def error_table(d: Diagnosis, scale: Scale) -> Table:
     """Return the errors of base and extended model beside the noise.
 
     Of a stack they are lengths in the unit of the scale, else those of every output in its own.
     """
-    if not isinstance(d, Diagnosis):
+    if not isinstance(d, StackDiagnosis):
         rows = [(e.output, e.unit, e.noise, e.base, e.extended) for e in d.errors]
         return _falls("output", rows, added(d))
     unit, factor = scale.unit, scale.factor
@@ -173,7 +173,7 @@ def _falls(
     return _table((*head, *(("extended, held-out rms", "falls by") if extended else ())), rows)
 
 
-def column_table(d: Diagnosis) -> Table:
+def column_table(d: StackDiagnosis) -> Table:
     """Return what base and extended model miss of every further column, beside its noise."""
     rows = []
     for c in d.columns:
@@ -226,7 +226,7 @@ def record_table(experiments: "Sequence[Experiment]", origin: str) -> Table:
     )
 
 
-def blindest(d: Diagnosis) -> tuple[BlindSpot, ...]:
+def blindest(d: StackDiagnosis) -> tuple[BlindSpot, ...]:
     """Return the blind spots, the largest detectable gain over its ordinary size first."""
 
     def excess(spot: BlindSpot) -> float:
@@ -240,7 +240,7 @@ def blindest(d: Diagnosis) -> tuple[BlindSpot, ...]:
     return tuple(sorted(d.blind_to, key=excess, reverse=True))
 
 
-def blind_table(d: Diagnosis) -> Table:
+def blind_table(d: StackDiagnosis) -> Table:
     """Return the effects of practical size that the records could not have shown."""
     rows = []
     for b in blindest(d):

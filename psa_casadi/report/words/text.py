@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.diagnosis.result import Cause, Diagnosis, OdeDiagnosis, OutputError
+from psa_casadi.diagnosis.result import Cause, Diagnosis, OutputError, StackDiagnosis
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.identification.identify import StackIdentification
@@ -46,7 +46,7 @@ Lines = Sequence[tuple[str, str]]
 
 
 def story(
-    d: OdeDiagnosis,
+    d: Diagnosis,
     *,
     origin: str = "measured",
     width: int = 100,
@@ -57,7 +57,7 @@ def story(
     `origin` is what the records are called, `model_file` where the model was written. Raises
     InputError for what is no diagnosis.
     """
-    if not isinstance(d, OdeDiagnosis):
+    if not isinstance(d, Diagnosis):
         raise InputError(
             f"`story` tells a diagnosis, and this is of type {type(d).__name__}; print it."
         )
@@ -68,13 +68,13 @@ def story(
     return labelled([lines[0], *now, *lines[1:]], width)
 
 
-def told(d: OdeDiagnosis) -> str:
+def told(d: Diagnosis) -> str:
     """Return how a diagnosis of any model prints: its verdict, and its story without advice."""
     return f"{d.verdict}\n{labelled(_lines(d, 'measured'), 100)}"
 
 
-def _lines(d: OdeDiagnosis, origin: str) -> list[tuple[str, str]]:
-    stack = d if isinstance(d, Diagnosis) else None
+def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
+    stack = d if isinstance(d, StackDiagnosis) else None
     lines = [
         ("verdict", f"{verdict_words.VERDICTS[d.verdict]}. {verdict_words.verdict_sentence(d)}")
     ]
@@ -104,7 +104,7 @@ def _lines(d: OdeDiagnosis, origin: str) -> list[tuple[str, str]]:
     return lines
 
 
-def _displacement_errors(d: Diagnosis) -> list[tuple[str, str]]:
+def _displacement_errors(d: StackDiagnosis) -> list[tuple[str, str]]:
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
     noise = f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"
@@ -112,13 +112,13 @@ def _displacement_errors(d: Diagnosis) -> list[tuple[str, str]]:
     return [*lines, *([("extended", _errors(d.extended_errors, scale))] if added(d) else [])]
 
 
-def _missed(e: OutputError, d: OdeDiagnosis) -> str:
+def _missed(e: OutputError, d: Diagnosis) -> str:
     base, extended, noise = (with_its_unit(v, e.unit) for v in (e.base, e.extended, e.noise))
     after = f", {extended} of the extended model" if added(d) else ""
     return f"{e.output}: held-out rms {base} of the base{after}; noise {noise}"
 
 
-def _rivals(d: OdeDiagnosis, cause: Cause) -> str:
+def _rivals(d: Diagnosis, cause: Cause) -> str:
     """Return what a cause cannot be told from, else the next most probable effect of the first."""
     known = {c.effect: c.probability for c in d.candidates}
     # the candidates are those of the first step, whose cause may be without a name

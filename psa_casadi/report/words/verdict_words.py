@@ -4,7 +4,7 @@ import numpy as np
 
 from psa_casadi.diagnosis.corrections import Correction, Patch
 from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
-from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis, OdeDiagnosis
+from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis, StackDiagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words import phrases
 from psa_casadi.report.words.tables import Table
@@ -31,7 +31,7 @@ OWN_VOLTAGES = (
 )
 
 
-def gain_sentence(d: Diagnosis) -> str:
+def gain_sentence(d: StackDiagnosis) -> str:
     """Say how far the held-out error falls."""
     gain = d.gain.holdout_rms_reduction_percent
     low, high = d.gain.interval
@@ -43,7 +43,7 @@ def gain_sentence(d: Diagnosis) -> str:
     return f"the held-out error falls by {told[0]} % (95 % interval {told[1]} to {told[2]} %)"
 
 
-def verdict_sentence(d: OdeDiagnosis) -> str:
+def verdict_sentence(d: Diagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
     if d.doubt and d.verdict == "adequate":
         said = f"Nothing beyond the noise is seen to be missing; {d.doubt}"
@@ -67,7 +67,7 @@ def verdict_sentence(d: OdeDiagnosis) -> str:
     return f"{said}."
 
 
-def _named(d: OdeDiagnosis) -> str:
+def _named(d: Diagnosis) -> str:
     """Say which causes are named, and what they remove."""
     causes = [named_cause(c) for c in d.causes]
     one, share = len(causes) == 1, f"{d.budget.together.percents[0]} %"
@@ -93,12 +93,12 @@ def _named(d: OdeDiagnosis) -> str:
     return f"The {are}: {gone}"
 
 
-def of_range(d: OdeDiagnosis, *, extended: bool = False) -> dict[str, float]:
+def of_range(d: Diagnosis, *, extended: bool = False) -> dict[str, float]:
     """Return a model's held-out error in every output, in % of its range in all records.
 
     That of a stack's displacement is each record's over its own range.
     """
-    if isinstance(d, Diagnosis):
+    if isinstance(d, StackDiagnosis):
         errors = d.extended_errors if extended else d.base_errors
         return {"displacement": errors.holdout_nrmse_percent}
     shares = {}
@@ -109,7 +109,7 @@ def of_range(d: OdeDiagnosis, *, extended: bool = False) -> dict[str, float]:
     return shares
 
 
-def _base_errors(d: OdeDiagnosis) -> str:
+def _base_errors(d: Diagnosis) -> str:
     """Say the base model's error in every output, over its range."""
     shares = of_range(d)
     each = [f"{phrases.number(share, 2)} %" for share in shares.values()]
@@ -127,7 +127,7 @@ def within(share: float) -> float:
     return max(0.0, min(1.0, share))
 
 
-def _without_name(d: OdeDiagnosis) -> str:
+def _without_name(d: Diagnosis) -> str:
     """Say what an extended model without a cause holds and would take, "" where nothing."""
     said, b = "", d.budget
     if d.kept:
@@ -154,7 +154,7 @@ def named_cause(cause: Cause) -> str:
     return f"{phrases.plain(cause.effect)} ({sure})"
 
 
-def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
+def alternative_sentence(d: StackDiagnosis, a: Alternative) -> str:
     """Say which of two causes an exported plant holds, and what that makes of its displacement."""
     apart = phrases.scale_of(d.experiments, a.plant_differs_m).text(a.plant_differs_m, 2)
     inside = any(c.name == a.cause for c in d.model.plant().components)
@@ -167,7 +167,7 @@ def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
     )
 
 
-def column_sentence(d: Diagnosis, c: Decision) -> str:
+def column_sentence(d: StackDiagnosis, c: Decision) -> str:
     """Say what a further column decided, and what the models miss of it in held-out samples."""
     if c.base_rms is None or c.noise is None or c.extended_rms is None:
         return c.sentence
@@ -176,7 +176,7 @@ def column_sentence(d: Diagnosis, c: Decision) -> str:
     return f"{c.sentence} Held-out rms: {phrases.with_unit(errors, c.unit)}."
 
 
-def cause_size(d: OdeDiagnosis, cause: Cause) -> str:
+def cause_size(d: Diagnosis, cause: Cause) -> str:
     """Return "name = value unit (low to high)" for every parameter of a cause.
 
     Of one that is several of a kind, and has many, at which frequencies they are; of weights that
@@ -208,7 +208,7 @@ def patch_text(patch: Correction) -> str:
     return f"{patch.sentence}{where}{rest}"
 
 
-def budget_sentence(d: OdeDiagnosis) -> str:
+def budget_sentence(d: Diagnosis) -> str:
     """Say where the held-out error above the noise goes."""
     b, parts = d.budget, ["of the held-out error above the noise"]
     stack = b if isinstance(b, StackBudget) else None
@@ -242,7 +242,7 @@ def _removed(b: Budget) -> str:
     )
 
 
-def budget_table(d: OdeDiagnosis) -> Table:
+def budget_table(d: Diagnosis) -> Table:
     """Return the shares of the base model's held-out error: power above the noise, and rms."""
     b = d.budget
     rows = [share_row(phrases.plain(c.what), c) for c in b.causes]

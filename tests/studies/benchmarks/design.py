@@ -141,7 +141,7 @@ def likely_rival(record: psa.Record, effect: str) -> str:
     return max((n for n in evidence if n != effect), key=lambda n: evidence[n])
 
 
-def judged(d: psa.Diagnosis, effect: str) -> str:
+def judged(d: psa.StackDiagnosis, effect: str) -> str:
     """Return "right" or "wrong" where one of the two was named alone, else "open"."""
     if not d.causes or d.verdict == "ambiguous" or d.causes[0].cannot_be_told_from:
         return "open"

@@ -172,21 +172,21 @@ def diagnosed(
     return on_all_cores(run_case, [(case, method, only) for case in cases], progress)
 
 
-def names_of(d: psa.Diagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def names_of(d: psa.StackDiagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the named causes, and these with what they cannot be told from."""
     named = tuple(c.effect for c in d.causes)
     alike = (n for c in d.causes for n in c.cannot_be_told_from)
     return named, tuple(dict.fromkeys((*named, *alike)))
 
 
-def _patched(d: psa.Diagnosis) -> float:
+def _patched(d: psa.StackDiagnosis) -> float:
     """Return what is offered without a name: the effects that are kept, and the correction."""
     b = d.budget
     kept = b.together.share if d.kept and not d.causes else 0.0
     return kept + (b.unnamed.share if b.unnamed is not None else 0.0)
 
 
-def _level(d: psa.Diagnosis, truth: Truth) -> float:
+def _level(d: psa.StackDiagnosis, truth: Truth) -> float:
     """Return the rms of the noise that was added, of a first record in its held-out samples [m]."""
     if len(d.experiments) > 1:
         return truth.sigma

@@ -60,7 +60,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     return Outcome((whole, *tables), partial(narrow_figure, sine))
 
 
-def _diagnoses(progress: Progress) -> tuple[list[TitledTable], psa.Diagnosis]:
+def _diagnoses(progress: Progress) -> tuple[list[TitledTable], psa.StackDiagnosis]:
     """Diagnose what the table of `docs/measured.md` diagnoses; return the sine's as well.
 
     And fit the sine again with every cause that others have and it has not, as it is found there,

@@ -48,7 +48,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     return Outcome((TitledTable(title, rows),), partial(picture, found, d))
 
 
-def picture(found: Known, d: psa.Diagnosis) -> Figure:
+def picture(found: Known, d: psa.StackDiagnosis) -> Figure:
     """Return scores of the hypotheses, and the shares of the budget."""
     figure = Figure(figsize=(12.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
@@ -70,7 +70,7 @@ def _scores(axes: Axes, found: Known) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _shares(axes: Axes, d: psa.Diagnosis) -> None:
+def _shares(axes: Axes, d: psa.StackDiagnosis) -> None:
     b = d.budget
     shares = {plain(s.what).replace(" ", "\n"): s for s in b.causes}
     if b.unnamed is not None and d.patch is not None:

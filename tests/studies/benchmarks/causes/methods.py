@@ -67,7 +67,7 @@ def by_psa(case: Path) -> Answer:
     return d.verdict not in ("adequate", "not_driven"), _sets(d), _predicted(d, case), gain
 
 
-def _sets(d: psa.Diagnosis) -> Sets:
+def _sets(d: psa.StackDiagnosis) -> Sets:
     """Return each named cause with what it cannot be told from, and their probabilities.
 
     The first step's candidates have theirs; a later cause has its confidence, and what it cannot be
@@ -85,7 +85,7 @@ def _sets(d: psa.Diagnosis) -> Sets:
     return sets
 
 
-def _predicted(d: psa.Diagnosis, case: Path) -> FloatArray:
+def _predicted(d: psa.StackDiagnosis, case: Path) -> FloatArray:
     """Return the displacement on the held-out voltage [m]: with the unnamed correction, where a
     remainder has no name and one is offered.
     """
