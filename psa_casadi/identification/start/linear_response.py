@@ -35,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from psa_casadi.records.noise import filtered
 from psa_casadi.units import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -58,7 +59,7 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
         lower = [1.0, -2.0 * np.real(decay), abs(decay) ** 2]
     else:
         upper, lower = np.real([now, before]), [1.0, -np.real(decay)]
-    found: FloatArray = scipy.signal.lfilter(upper, lower, x, axis=0)
+    found: FloatArray = filtered(upper, lower, x)  # scipy.signal is slow to load
     return found
 
 
