@@ -102,7 +102,8 @@ def diagnose_ode(
         attached = [table[c.name] for c in best.model.effects]
         whole = model_of(base.model, best, attached, runs, interrupted=True)
         raise DiagnosisInterrupted(whole) from None
-    return replace(found, remarks=(*found.remarks, *told_of_columns(model, runs)))
+    said = *known.remarks, *told_of_columns(model, runs)
+    return replace(found, remarks=(*found.remarks, *said))
 
 
 def _table(
