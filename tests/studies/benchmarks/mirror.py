@@ -34,8 +34,8 @@ PEAKS, EVERY = (
     (640, 810, 922, 957, 996, 1320, 1386, 1450, 1688, 2127, 2280, 2314, 2547, 2780, 3090),
     3,
 )
-#: Images of a line above and below the sampling rate that are counted.
-IMAGES = 1
+#: Images of a line on either side that are counted: as frequencies and shapes are sought.
+IMAGES, IMAGES_OF_SHAPES = 1, 15
 #: Amplitude of the voltages that frequencies count from [V rms], and how long it is felt [s].
 MIDDLE, FELT = 0.2, 0.05
 #: Samples of each level's piece that is fitted, and before them, in which transients die.
@@ -101,11 +101,11 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
     told = np.flatnonzero(np.abs(first[:, 0, 0]) > 0)[1::EVERY]
     w, count = 2 * np.pi * np.linspace(0.0, RATE / 2, len(first))[told], len(PEAKS)
     target = np.vstack([1e6 * g[told].reshape(len(told), -1) for g in responses.values()])
-    every = w + 2 * np.pi * RATE * np.arange(-IMAGES, IMAGES + 1)[:, None]
-    held = (1 - np.exp(-1j * w / RATE)) * RATE / (1j * every)
 
-    def columns(q: FloatArray) -> list[ComplexArray]:
+    def columns(q: FloatArray, images: int) -> list[ComplexArray]:
         """Return the responses of all modes times (j w / w_r)^0, 1, 2, and what follows at once."""
+        every = w + 2 * np.pi * RATE * np.arange(-images, images + 1)[:, None]
+        held = (1 - np.exp(-1j * w / RATE)) * RATE / (1j * every)
         frequency, damping, softer, lossier = q[:-2].reshape(4, count)[..., None, None]
         parts = []
         for amplitude in responses:
@@ -120,7 +120,7 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
         return [np.vstack(part) for part in zip(*parts, strict=True)]
 
     def errors(q: FloatArray) -> FloatArray:
-        plain, quick, _, rest = columns(q)
+        plain, quick, _, rest = columns(q, IMAGES)
         return solved(np.hstack([plain, quick, rest]), target)[1]
 
     def each(*sizes: float) -> FloatArray:
@@ -137,11 +137,12 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
         x_scale=each(5, 5e-3, 0.05, 1, 0.3, 0.2),
         max_nfev=15,
     ).x
-    plain, quick, quicker, rest = columns(q)
+    plain, quick, _, rest = columns(q, IMAGES)
     tables = solved(np.hstack([plain, quick, rest]), target)[0].reshape(-1, len(AXES), len(AXES))
     shapes = np.linalg.svd(tables[:count] + 1j * tables[count:-1])[2][:, 0]
     driven = shapes / np.take_along_axis(shapes, np.argmax(np.abs(shapes), axis=1)[:, None], axis=1)
     # what the sensors show of modes with these shapes at the stacks
+    plain, quick, quicker, rest = columns(q, IMAGES_OF_SHAPES)
     rows = []
     for j, b in enumerate(driven.T):
         first, second = plain * b.real + quick * b.imag, quick * b.real + quicker * b.imag
