@@ -65,7 +65,10 @@ def originals(name: str) -> dict[str, Path]:
     data = os.environ.get(DATA_VARIABLE)
     if data:
         folder = Path(data) / name
-        return {k: _from_folder(folder, dataset, k, o.sha256) for k, o in every.items()}
+        return {
+            k: _from_folder(folder, dataset, k, o.sha256, f"download {o.url} to it")
+            for k, o in every.items()
+        }
     return {k: _download(o, _room(dataset)) for k, o in every.items()}
 
 
@@ -87,7 +90,9 @@ def origin_text(dataset: Dataset) -> str:
 def _path(dataset: Dataset, file: DatasetFile) -> Path:
     data = os.environ.get(DATA_VARIABLE)
     if data:
-        return _from_folder(Path(data) / dataset.name, dataset, file.name, file.sha256)
+        folder = Path(data) / dataset.name
+        how = f"run `psa datasets {dataset.name} -o {folder}` without {DATA_VARIABLE}"
+        return _from_folder(folder, dataset, file.name, file.sha256, how)
     room = _room(dataset)
     kept = room / file.name
     if kept.is_file() and _sha256(kept.read_bytes()) == file.sha256:
@@ -105,13 +110,12 @@ def _room(dataset: Dataset) -> Path:
     return writable_room("datasets") / dataset.name
 
 
-def _from_folder(folder: Path, dataset: Dataset, name: str, sha256: str) -> Path:
+def _from_folder(folder: Path, dataset: Dataset, name: str, sha256: str, how: str) -> Path:
     path = folder / name
     if not path.is_file():
         raise InputError(
-            f"{path}: there is no such file, and {DATA_VARIABLE} says that records lie there; run"
-            f" `psa datasets {dataset.name} -o {folder}` without {DATA_VARIABLE} on a machine with"
-            f" a network, or unset {DATA_VARIABLE}."
+            f"{path}: there is no such file, and {DATA_VARIABLE} says that records lie there; {how}"
+            f" on a machine with a network, or unset {DATA_VARIABLE}."
         )
     if _sha256(path.read_bytes()) != sha256:
         raise InputError(

@@ -6,20 +6,19 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.datasets.devices import linear_response
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.records import time_grid
 from psa_casadi.records.split import split
 from psa_casadi.simulation import device
 from psa_casadi.simulation.simulate import EXACT, STEPPER
 from tests.datasets.test_datasets_one_axis import N as PERIOD
-from tests.datasets.test_datasets_one_axis import driven, voltages
 from tests.studies.__main__ import app
 from tests.studies.benchmarks import changed, fits, floors, mirror, peers, sampling
 from tests.studies.benchmarks import diagnose as study
@@ -44,9 +43,8 @@ def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["identify", "--folder", str(tmp_path)])
     assert said.exit_code == 2
     assert "--folder: 'identify' takes none" in said.stderr.replace("\n", " ")
-    for run, words in ((floors.run, "holds no CSV file"), (mirror.run, "no model axis_1_")):
-        with pytest.raises(psa.InputError, match=words):
-            run(silent, False, folder=tmp_path)
+    with pytest.raises(psa.InputError, match="holds no CSV file"):
+        floors.run(silent, False, folder=tmp_path)
 
 
 # ---- ensembles
@@ -258,29 +256,87 @@ def test_where_a_record_comes_from_is_found() -> None:
     assert found[-1] == 1.0
 
 
-# ---- mirror: its score is that of the authors, and a model is simulated settled
+# ---- mirror: modes from a response, a model of them, and the score of its authors
 
 
-def test_an_exact_response_scores_nothing_and_noise_scores_its_share() -> None:
-    train, test = (np.tile(voltages(seed, k), (4, 1, 1, 1)) for seed, k in ((1, 6), (2, 3)))
-    y = driven(test)
-    response = linear_response(train, driven(train))
-    assert len(y) == 4 * PERIOD > mirror.SKIPPED
-    assert mirror.scores(test, y, response, 0, None)[0] < 1e-9
-    noisy = y + 1e-8 * np.random.default_rng(4).standard_normal(y.shape)
-    share, rms = mirror.scores(test, noisy, response, 1, None)
-    assert rms == pytest.approx(1e-8, rel=0.05)
-    assert share == pytest.approx(1e-8 / np.std(y[:, 1]), rel=0.1)
+def structure(softer: float = -0.03) -> mirror.Modes:
+    """Return 15 modes with shapes that are a little out of phase, and a lag of 50 us."""
+    rng, modes = np.random.default_rng(6), []
+    for peak in mirror.PEAKS:
+        driven, shown = rng.normal(size=(2, 3)) + 0.1j * rng.normal(size=(2, 3))
+        driven = driven / driven[np.argmax(np.abs(driven))]
+        frequency = float(peak + rng.uniform(-4, 4))
+        modes.append(mirror.Mode(frequency, 0.01, softer, 0.4, driven, shown))
+    return mirror.Modes(tuple(modes), rng.normal(size=(3, 3)), 5e-5, 0.2)
 
 
-def test_a_settled_model_repeats_itself_and_has_no_mean() -> None:
-    one = 20.0 * np.sin(2 * np.pi * np.arange(2000) / 500.0)
-    shown = mirror.settled(psa.stack_model("P-885.51"), np.column_stack([one, one]))
-    assert shown.shape == (2000, 2)
-    np.testing.assert_allclose(shown[:, 0], shown[:, 1], atol=2e-3 * np.ptp(shown))
-    assert abs(np.mean(shown)) < 1e-6 * np.ptp(shown)
-    assert np.ptp(shown) > 1e-7
-    assert mirror.RATE == 6400.0
+def response_of(
+    found: mirror.Modes, frequency: FloatArray, amplitude: float
+) -> npt.NDArray[np.complex128]:
+    """Return displacement over voltage (lines, 3, 3) [m/V] of voltages held between samples."""
+    above, whole = amplitude - mirror.MIDDLE, np.zeros((len(frequency), 3, 3), dtype=np.complex128)
+    for n in range(-20, 21):  # what steps drive beside the line itself, and samples show as it
+        s = 2j * np.pi * (frequency + n * mirror.RATE)
+        table = np.tile(found.rest.astype(np.complex128), (len(s), 1, 1))
+        for m in found.modes:
+            w = 2 * np.pi * m.frequency * (1 + m.softer * above)
+            damping = m.damping * (1 + m.lossier * above)
+            pole = w**2 / (s**2 + 2 * damping * w * s + w**2)
+            shape = m.shown[:, None] * m.driven
+            table += pole[:, None, None] * (shape.real + (s / w)[:, None, None] * shape.imag)
+        held = np.full(len(s), float(n == 0), dtype=np.complex128)
+        held[1:] = (1 - np.exp(-s[1:] / mirror.RATE)) / (s[1:] / mirror.RATE)
+        factor = 1e-6 * (1 + found.rise * above) * held / (1 + s * found.lag)
+        whole += table * factor[:, None, None]
+    return whole
+
+
+def test_modes_are_found_in_responses() -> None:
+    truth, frequency = structure(), np.linspace(0.0, mirror.RATE / 2, 1500)
+    responses = {a: response_of(truth, frequency, a) for a in (0.1, 0.3)}
+    for response in responses.values():
+        response[frequency > 3000] = 0.0  # no voltage there
+    found = mirror.modes_of(responses)
+    assert found.lag == pytest.approx(truth.lag, rel=1e-2)
+    assert found.rise == pytest.approx(truth.rise, rel=1e-2)
+    assert found.modes[-1].frequency == pytest.approx(truth.modes[-1].frequency, rel=2e-3)
+    for own, true in zip(found.modes[:-1], truth.modes[:-1], strict=True):  # below 3 kHz
+        assert own.frequency == pytest.approx(true.frequency, rel=1e-4)
+        assert own.damping == pytest.approx(true.damping, rel=1e-2)
+        assert own.softer == pytest.approx(true.softer, rel=2e-2)
+        assert own.lossier == pytest.approx(true.lossier, rel=5e-2)
+        np.testing.assert_allclose(own.driven, true.driven, atol=2e-2)
+        np.testing.assert_allclose(own.shown, true.shown, atol=5e-2)
+
+
+@slow
+def test_the_mirror_answers_as_its_modes_say_at_an_amplitude() -> None:
+    """In steady state, where the shapes at the stacks have one phase: it has their tables then."""
+    n, rng, given = 4096, np.random.default_rng(8), structure()
+    modes = [replace(m, driven=np.real(m.driven).astype(np.complex128)) for m in given.modes]
+    found = replace(given, modes=tuple(modes))
+    lines = np.zeros((n // 2 + 1, 3), dtype=np.complex128)
+    lines[1:1800] = np.exp(2j * np.pi * rng.uniform(size=(1799, 3)))
+    u = np.fft.irfft(lines, n=n, axis=0)
+    u, lines = 0.3 / np.std(u) * u, 0.3 / np.std(u) * lines
+    said = mirror.played(mirror.mirror(found), np.stack([u, u], axis=2))
+    errors, frequency = [], np.linspace(0.0, mirror.RATE / 2, n // 2 + 1)
+    for amplitude in (0.1, 0.3):
+        response = response_of(found, frequency, amplitude)
+        true = np.fft.irfft(np.einsum("kij,kj->ki", response, lines), n=n, axis=0)
+        errors.append([float(np.std(said[:, :, k] - true) / np.std(true)) for k in range(2)])
+    assert max(errors[1]) < 0.02
+    assert min(errors[0]) > 0.1
+
+
+def test_an_exact_simulation_scores_nothing_and_noise_scores_its_share() -> None:
+    y = np.random.default_rng(4).normal(size=(4 * PERIOD, 3, 3, 2)) * [[[1.0]], [[2.0]], [[3.0]]]
+    assert len(y) > mirror.SKIPPED
+    assert np.all(mirror.score(y, y) == 0.0)
+    said = y.copy()
+    said[mirror.SKIPPED :] += 0.5 * np.std(y[mirror.SKIPPED :], axis=0)
+    said[: mirror.SKIPPED] += 100.0
+    np.testing.assert_allclose(mirror.score(y, said), 0.5)
 
 
 # ---- sampling: the one equation that PyMC gets shows what the whole stack shows
