@@ -132,7 +132,7 @@ def law_of(structure: Structure, effect: Component) -> Law | None:
     others = [k for k in range(len(names)) if k not in own]
     moved = effect.linear or (effect.gain,)
     by = ca.vertcat(*(s.symbols[n] for n in moved))
-    z, rates = s.x[list(own)], s.xdot[list(own)]
+    z, rates = s.x[list(own), 0], s.xdot[list(own), 0]
     slopes = s.jacobian(rates, z)
     if written.switches or ca.depends_on(slopes, ca.vertcat(s.x, s.u, s.time)):
         return None

@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from build_scripts.measured_data import ROOT
@@ -54,6 +55,44 @@ def test_a_clean_model_of_two_outputs_is_identified_with_its_errors(tmp_path: Pa
     assert "w by 0.301 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
     assert "R 1.200 1.199 to 1.200 Ohm fit" in page.text
     assert page.loaded == []
+
+
+def test_pages_hold_every_output_of_every_record(tmp_path: Path) -> None:
+    whole = plants.motor(2, friction=0.0)
+    parts = [
+        replace(
+            whole, name=name, time=whole.time[part],
+            columns={n: v[part] for n, v in whole.columns.items()},
+        )
+        for name, part in (("first", slice(None, 1500)), ("second", slice(1500, None)))
+    ]  # fmt: skip
+    found = psa.identify(motor(), parts, starts=1)
+    found.report(tmp_path / "fit.html")
+    page = Page((tmp_path / "fit.html").read_text("utf-8"))
+    for name in ("w of first", "w of second", "i of first", "i of second"):
+        assert name in page.text
+
+
+def test_a_model_of_one_state_is_diagnosed(tmp_path: Path) -> None:
+    """A heater whose loss grows with the square of the temperature, as in a draught."""
+    t, u, c = np.arange(400) * 0.05, ca.SX.sym("power"), ca.SX.sym("T")
+    power = 1.0 + np.sin(t) + 0.5 * np.sin(3.1 * t)
+    loss = ca.SX.sym("loss")
+    heater = psa.ode_model(
+        {"x": c, "u": u, "p": loss, "ode": u - loss * c, "y": c}, name="heater",
+        inputs=["power"], outputs=["temperature"], values={"loss": 1.0},
+    )  # fmt: skip
+    true = solve_ivp(
+        lambda s, y: np.interp(s, t, power) - 1.3 * y - 0.3 * y * np.abs(y), (0.0, t[-1]), [0.0],
+        t_eval=t, max_step=0.05,
+    ).y[0]  # fmt: skip
+    noise = 0.002 * np.random.default_rng(1).standard_normal(len(t))
+    record = {"time": t, "power": power, "temperature": true + noise}
+    d = psa.diagnose(heater, record, leave_out=["hysteresis", "stop"])
+    assert d.causes[0].effect == "drag_in_T"
+    assert d.explained_share > 0.99
+    d.report(tmp_path / "heater.html", still=True)
+    assert "Drag in T:" in Page((tmp_path / "heater.html").read_text("utf-8")).text
 
 
 #: Tests that share a diagnosis run in one process.

@@ -1,10 +1,9 @@
 """A model that runs in a page: its module and variables, the records that it runs on."""
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -238,13 +237,13 @@ def _fitted_records(
     """
     theta, stack = fit.placed(experiments), is_stack(model)
     rows = []
-    places = [(k, 0) for k, _ in enumerate(series)] if stack else _places(experiments, series)
-    for n, ((k, j), s) in enumerate(zip(places, series, strict=True)):
+    for s in series:
+        k, j = s.place
         e, channel = experiments[k], experiments[k].channels[j]
         columns = {i: e.record.column(i) for i in model.input_names}
         inputs = {i: v for i, v in columns.items() if v is not None}
         deviation = fit.unknowns.start(theta, k)
-        row = LiveRecord(s, inputs, deviation, share * s.noise, beyond[n] if beyond else None)
+        row = LiveRecord(s, inputs, deviation, share * s.noise, beyond[k] if beyond else None)
         if not stack:
             row = replace(
                 row, deviation={}, start=record_start(model, e.record, deviation),
@@ -253,18 +252,6 @@ def _fitted_records(
             )  # fmt: skip
         rows.append(row)
     return rows
-
-
-def _places(
-    experiments: Sequence[Experiment], series: Sequence[Series]
-) -> Iterator[tuple[int, int]]:
-    """Yield the numbers of experiment and channel of every series, which are in their order."""
-    left = iter(product(range(len(experiments)), range(len(experiments[0].channels))))
-    for s in series:
-        for k, j in left:
-            if np.array_equal(experiments[k].measured(j), s.measured, equal_nan=True):
-                yield k, j
-                break
 
 
 def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:

@@ -28,7 +28,10 @@ psaLive.knobs = function (told, values, changed) {
     var a = p.ends[0], b = p.ends[1];
     return p.log ? a * Math.pow(b / a, part) : a + (b - a) * part;
   }
-  function shown(p, value) { return String(+(p.factor * value + p.shift).toPrecision(6)); }
+  function shown(p, value) {
+    var rounded = +(p.factor * value + p.shift).toPrecision(6), text = String(rounded);
+    return text.length > 9 ? rounded.toExponential() : text;
+  }
 
   function put(name, value, from) {
     var i = index[name], p = told.parameters[i], row = rows[name];

@@ -142,7 +142,8 @@ def outputs_figure(outputs: Sequence[Series], *, origin: str = "measured") -> Fi
     grid = figure.subplots(len(outputs), 2, width_ratios=(1.6, 1.0), squeeze=False)
     for s, (left, right) in zip(outputs, grid, strict=True):
         shown = records.samples(s, _MOST_POINTS)
-        draw(left, records.measured_plot(s, origin, shown), s.title, legend=_ABOVE)
+        legend = _ABOVE if s is outputs[0] else None
+        draw(left, records.measured_plot(s, origin, shown), legend=legend)
         left.margins(x=0.01)
         draw(right, records.residual_plot(s, shown), f"Residual of {s.title}")
         right.margins(x=0.01)

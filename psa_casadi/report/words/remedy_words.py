@@ -24,6 +24,7 @@ from psa_casadi.report.words.phrases import (
     percent,
     plain,
     prefixed_scale,
+    raised,
     scale_of,
     shown_in,
     with_its_unit,
@@ -285,7 +286,7 @@ def _of_cause(cause: Cause, length: Length) -> str:
     """Return how large a cause is and what to do about it."""
     size, do = size_text(cause.sizes, length), DO.get(cause.remedy, DO["extended_model"])
     against = f"{size}. Against it: {lowered(do)}" if size else lowered(do)
-    return f"{plain(cause.effect).capitalize()}: {against}."
+    return f"{raised(plain(cause.effect))}: {against}."
 
 
 def _rivals(causes: Sequence[Cause]) -> list[str]:

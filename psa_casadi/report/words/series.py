@@ -37,7 +37,8 @@ class Series:
 
     `noise` is the standard deviation of the record's noise [m]; `counts` says that lengths are in
     counts of the sensor. Of a model that is no stack, `measured` is another `quantity` in its
-    `unit`, and `voltage` what it is shown `against`, "" if there is nothing.
+    `unit`, and `voltage` what it is shown `against`, "" if there is nothing. `place` numbers its
+    experiment and channel.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Series:
     quantity: str = "displacement"
     unit: str = ""
     against: str = "voltage [V]"
+    place: tuple[int, int] = (0, 0)
 
     @property
     def record(self) -> str:
@@ -136,7 +138,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
                 curves.append(Curve("extended model", colours.EXTENDED, extended[k]))
             if stack:
                 level = stack.noise[k].level if stack.noise else stack.noise_floor_rms_m
-                found.append(_displacement(e, curves, level))
+                found.append(_displacement(k, e, curves, level))
             else:
                 found += _output(d.model, d.experiments, (k, j), noise, curves)
     return tuple(found)
@@ -151,9 +153,10 @@ def series_of_fit(found: Identification) -> tuple[Series, ...]:
     rows: list[Series] = []
     if isinstance(found, StackIdentification):
         predictions = found.fit.predicted(found.experiments)
-        for e, predicted in zip(found.experiments, predictions, strict=True):
+        rows_of = zip(found.experiments, predictions, strict=True)
+        for k, (e, predicted) in enumerate(rows_of):
             noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
-            rows.append(_displacement(e, [Curve("model", colours.EXTENDED, predicted)], noise))
+            rows.append(_displacement(k, e, [Curve("model", colours.EXTENDED, predicted)], noise))
         return tuple(rows)
     outputs = found.fit.outputs(found.experiments)
     for j, channel in enumerate(found.experiments[0].channels):
@@ -164,7 +167,7 @@ def series_of_fit(found: Identification) -> tuple[Series, ...]:
     return tuple(rows)
 
 
-def _displacement(e: Experiment, curves: Sequence[Curve], noise: float) -> Series:
+def _displacement(k: int, e: Experiment, curves: Sequence[Curve], noise: float) -> Series:
     return Series(
         name=e.record.name,
         time=e.record.time,
@@ -174,6 +177,7 @@ def _displacement(e: Experiment, curves: Sequence[Curve], noise: float) -> Serie
         held_out=e.held_out,
         noise=noise,
         counts=e.record.displacement_unit == "counts",
+        place=(k, 0),
     )
 
 
@@ -204,6 +208,7 @@ def _output(
         quantity=name,
         unit=channel.unit or "1",
         against="" if moving is None else phrases.in_brackets(moving, units[moving]),
+        place=place,
     )
 
 
