@@ -74,7 +74,7 @@ psaLive.report = function (box, told, run) {
   });
   var output = make('output', {}), budget = make('div', {className: 'budget'}), status = make('span', {role: 'status'});
 
-  function length(size) { return +(record.error.factor * size).toPrecision(3) + ' ' + record.error.unit; }
+  function length(size) { return +(record.error.factor * size).toPrecision(3) + (record.error.unit && ' ' + record.error.unit); }
 
   function say(now) {
     if (now.status) { output.textContent = 'With these values the model cannot be run: ' + now.reason + '.'; return; }
