@@ -37,6 +37,9 @@ from psa_casadi.simulation.timings import stage
 
 #: Verdicts that name causes.
 NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
+#: Causes cancel each other where one of them changes an output so many times as all together do:
+#: three wrong names for a heat capacity that changes reach 20, causes of other places about 1.
+_CANCEL = 5.0
 
 
 @dataclass(frozen=True)
@@ -422,13 +425,32 @@ class ModelJudge(Judge):
 
     def named(self, step: Step) -> Cause:
         """Return a cause with its port, and what it changes of every output."""
-        sizes = changes(step.cause, self.final.fit, self.experiments)
+        sizes = changes([step.cause], self.final.fit, self.experiments)
         return self.cause(step, sizes, self.table[step.cause.name].port.words)
 
     @property
     def said(self) -> tuple[Note | str, ...]:
-        """What is said of any, and which causes add too little to be told."""
-        return (*super().said, *(() if self.doubt else self._left_out()))
+        """What is said of any, which causes cancel each other, which add too little to be told."""
+        left_out = () if self.doubt else self._left_out()
+        return (*super().said, *self._cancelling(), *left_out)
+
+    def _cancelling(self) -> tuple[Note, ...]:
+        """Return the output that one of several causes changes much more than all of them do."""
+        if len(self.causes) < 2:
+            return ()
+        every = [s.cause for s in self.kept]
+        whole = changes(every, self.final.fit, self.experiments)
+        rows = [
+            (size.value / max(both.value, 1e-300), cause.effect, size, both)
+            for cause in self.causes
+            for size, both in zip(cause.sizes, whole, strict=False)
+        ]
+        times, effect, size, both = max(rows, key=lambda r: r[0], default=(0.0, "", None, None))
+        if times < _CANCEL or size is None or both is None:
+            return ()
+        alone, together = (size.value, size.unit), (both.value, both.unit)
+        said = note("cancel", effect=effect, output=size.output, alone=alone, together=together)
+        return (said,)
 
     def _left_out(self) -> tuple[Note, ...]:
         """Return which causes are clearly likelier than the best, but may only correct its form.

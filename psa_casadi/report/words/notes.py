@@ -12,9 +12,11 @@ from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
 from psa_casadi.report.words.phrases import (
     are,
     listing,
+    plain,
     prefixed_scale,
     quantity,
     raised,
+    with_its_unit,
     with_unit,
 )
 
@@ -343,6 +345,11 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         "The fitted samples leave no more than noise, but the held-out ones of {output}"
         " {ratio:.1f} times their noise: these records do not say the same, or their inputs are not"
         " read alike (see `hold`)."
+    ),
+    "cancel": lambda effect, output, alone, together: (
+        f"That each cause is physics is doubtful, as they cancel each other: {plain(effect)} alone"
+        f" changes {output} by up to {with_its_unit(*alone)}, all together by"
+        f" {with_its_unit(*together)}."
     ),
     "slight": (
         "{names: and } together fit better (ln of the Bayes factor higher by {more:.0f}). Not"

@@ -152,8 +152,11 @@ def size_text(sizes: Sequence[Size], length: Length) -> str:
         text = f"at {where} Hz it makes the displacement {listing(each)} times as large"
     else:
         seen = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
+        still = {s.output for s in sizes if s.value == 0.0} if len(sizes) > 1 else set()
         moves = [
-            f"the {plain(o)} by up to {a}" for (test, o), a in seen.items() if test == "record"
+            f"the {plain(o)} by up to {a}"
+            for (test, o), a in seen.items()
+            if test == "record" and o not in still
         ]
         rms = "".join(f", {a} rms" for (test, _), a in seen.items() if test == "rms")
         text = f"within a record of {number(first.at)} s it moves {listing(moves)}{rms}"
