@@ -24,6 +24,7 @@ from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.sizes import Sizes, sizes_of
+from psa_casadi.units import FloatArray
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor, oscillator, pair, tanks
 from tests.report.browser import DARK, find_browser
@@ -93,6 +94,39 @@ def test_a_model_of_one_state_is_diagnosed(tmp_path: Path) -> None:
     assert d.explained_share > 0.99
     d.report(tmp_path / "heater.html", still=True)
     assert "Drag in T:" in Page((tmp_path / "heater.html").read_text("utf-8")).text
+
+
+@pytest.mark.slow
+def test_causes_that_cancel_each_other_are_told() -> None:
+    """A heater whose capacity grows with its temperature: no effect of the table does that."""
+    rng, t = np.random.default_rng(3), 2.0 * np.arange(700)
+    power = np.repeat(rng.uniform(0.0, 120.0, 14), 50)
+
+    def rates(time: float, x: FloatArray) -> list[float]:
+        flow, heat = 4.0 * (x[0] - x[1]), power[min(int(time / 2.0), 699)]
+        return [(heat - flow) / (280.0 + 1.12 * x[0]), (flow - 1.2 * x[1]) / 150.0]
+
+    both = solve_ivp(rates, (0.0, t[-1]), [0.0, 0.0], t_eval=t, max_step=1.0, rtol=1e-8).y
+    core, shell = both + 0.05 * rng.standard_normal(both.shape)
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    p = ca.SX.sym("p", 4)
+    flow = p[2] * (x[0] - x[1])
+    heater = psa.ode_model(
+        {"x": x, "u": u, "p": p, "ode": ca.vertcat((u - flow) / p[0], (flow - p[1] * x[1]) / p[3]),
+         "y": x},
+        name="heater", inputs=["power"], outputs=["core", "shell"],
+        parameters=[
+            psa.Parameter(n, v, "1", (0.01, 5000.0), "", log=True)
+            for n, v in (("C", 200.0), ("G", 1.0), ("K", 3.0), ("D", 100.0))
+        ],
+    )  # fmt: skip
+    kinds = ["hysteresis", "stop", "lag", "delay", "drift", "zero", "dead", "friction"]
+    d = psa.diagnose(
+        heater, {"time": t, "power": power, "core": core, "shell": shell}, hold="zero",
+        leave_out=kinds,
+    )  # fmt: skip
+    assert len(d.causes) > 1
+    assert any("they cancel each other" in note for note in d.notes)
 
 
 #: Tests that share a diagnosis run in one process.
