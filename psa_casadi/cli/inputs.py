@@ -19,6 +19,11 @@ if TYPE_CHECKING:
     from psa_casadi.records.read.columns import ColumnMap
 
 T = TypeVar("T")
+#: What the names of the files that an option writes end with.
+_ENDINGS = {
+    "--report": ((".html", ".htm"), "a page, .html or .htm"),
+    "--figure": ((".png", ".svg", ".pdf"), "a picture, .png, .svg or .pdf"),
+}
 
 
 @dataclass(kw_only=True)
@@ -235,13 +240,19 @@ class Given:
             )
 
     def outputs(self, named: Mapping[str, Path | None], inputs: Sequence[Path | None]) -> None:
-        """Demand that every output can be written, and that no two are one file or an input."""
+        """Demand that every output can be written, and that no two are one file or an input.
+
+        A page and a picture whose names have an ending have one of theirs.
+        """
         sources = {p.resolve() for p in inputs if p is not None}
         taken: dict[Path, str] = {}
         for option, path in named.items():
             if path is None:
                 continue
             where = path.resolve()
+            endings, what = _ENDINGS.get(option, ((), ""))
+            if endings and path.suffix and path.suffix.lower() not in endings:
+                self.add(f"{path}: {option} writes {what}; name it so.")
             if where in taken:
                 self.add(
                     f"{path}: both {taken[where]} and {option} name it; give each its own file."
