@@ -158,6 +158,15 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
         assert apart["name"] == "stands out"
         assert [t.strip() for t in apart["text"]] == apart["hovertext"] == ["d5"]
         assert (len(others["x"]), set(others["text"])) == (39, {""})
+    axis = spread_plot(found, spread).layout["xaxis"]
+    assert axis["ticktext"] == [str(k + 1) for k in axis["tickvals"]]
+    few = population(devices()[:6])
+    plot = spread_plot(few, few.spreads[0])
+    axis = plot.layout["xaxis"]
+    marks = ((p["x"], p["hovertext"]) for p in plot.data)
+    named = {x: name for xs, names in marks for x, name in zip(xs, names, strict=True)}
+    assert [named[k] for k in axis["tickvals"]] == axis["ticktext"]
+    assert set(axis["ticktext"]) == {f"d{k}" for k in range(6)}
     # found in this parameter by itself, and not among all tests
     assert spread.far.found.sum() == 1
     (only,) = spread_plot(replace(found, outliers=()), spread).data
