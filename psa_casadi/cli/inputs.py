@@ -19,11 +19,8 @@ if TYPE_CHECKING:
     from psa_casadi.records.read.columns import ColumnMap
 
 T = TypeVar("T")
-#: What the names of the files that an option writes end with.
-_ENDINGS = {
-    "--report": ((".html", ".htm"), "a page, .html or .htm"),
-    "--figure": ((".png", ".svg", ".pdf"), "a picture, .png, .svg or .pdf"),
-}
+#: What an option writes, and what the names of such files end with.
+_PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".pdf")
 
 
 @dataclass(kw_only=True)
@@ -239,20 +236,26 @@ class Given:
                 " its data sheet, such as 5e7."
             )
 
-    def outputs(self, named: Mapping[str, Path | None], inputs: Sequence[Path | None]) -> None:
+    def outputs(
+        self,
+        named: Mapping[str, Path | None],
+        inputs: Sequence[Path | None],
+        page: str = "--report",
+    ) -> None:
         """Demand that every output can be written, and that no two are one file or an input.
 
-        A page and a picture whose names have an ending have one of theirs.
+        Where the names of the `page` and of a picture have an ending, it is one of theirs.
         """
+        endings = {page: _PAGE, "--figure": _PICTURE}
         sources = {p.resolve() for p in inputs if p is not None}
         taken: dict[Path, str] = {}
         for option, path in named.items():
             if path is None:
                 continue
             where = path.resolve()
-            endings, what = _ENDINGS.get(option, ((), ""))
-            if endings and path.suffix and path.suffix.lower() not in endings:
-                self.add(f"{path}: {option} writes {what}; name it so.")
+            what, *known = endings.get(option, ("",))
+            if known and path.suffix and path.suffix.lower() not in known:
+                self.add(f"{path}: {option} writes {what}, {' or '.join(known)}; name it so.")
             if where in taken:
                 self.add(
                     f"{path}: both {taken[where]} and {option} name it; give each its own file."

@@ -113,11 +113,10 @@ def missed_sentences(findings: Sequence[Finding]) -> tuple[str, ...]:
     if not rows:
         return ()
     named = [f"{device} ({number(-times, 2)} times the noise)" for times, device in rows]
-    more = [f"{len(rows) - _MOST_NAMED} more"] if len(rows) > _MOST_NAMED else []
     fits, their, miss = ("fit", "its", "misses") if len(rows) == 1 else ("fits", "their", "miss")
     return (
-        f"The {fits} of {listing([*named[:_MOST_NAMED], *more])} {miss} {their} records: the model"
-        f" lacks something, {their} values bend to it, and {their} intervals are too short.",
+        f"The {fits} of {listing(named, most=_MOST_NAMED)} {miss} {their} records: the model lacks"
+        f" something, {their} values bend to it, and {their} intervals are too short.",
     )
 
 
