@@ -51,6 +51,7 @@ def batch(
     from psa_casadi.devices.executors import dask_client
     from psa_casadi.devices.jobs import jobs_given
     from psa_casadi.population.population import population
+    from psa_casadi.report.words.population_words import missed_sentences
 
     given.stiffness(stiffness)
     own = own_model(given, model, fitting)
@@ -82,6 +83,8 @@ def batch(
     kept = f"; {done.kept} of them were there before" if done.kept else ""
     show(f"{len(done.devices)} devices: {counts}{kept}.", given.quiet)
     tell_lost([row for d, row in rows if d.status != "done"], done.files[0], given.quiet)
+    for sentence in missed_sentences(done.findings):
+        show(sentence, given.quiet)
     tell_written(*done.files, report if found else None, quiet=given.quiet)
     if report is not None and found is None:
         show(f"{report} was not written: fewer than four devices tell a parameter.", given.quiet)

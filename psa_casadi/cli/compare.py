@@ -24,7 +24,7 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
     from psa_casadi.report.words.tables import Table
 
     tables: tuple[Table, ...] = ()
-    given.outputs({"--output": output}, files)
+    given.outputs({"--output": output}, files, page="--output")
     given.check()
     with working("comparing", given.quiet):
         if len(files) == 1 and files[0].is_dir():

@@ -58,7 +58,7 @@ def diagnose(
         patch: MODEL.json of the extended model with the unnamed correction, where one helps.
         json: DIAGNOSIS.json to write.
         report: HTML page to write.
-        figure: PNG picture to write.
+        figure: Picture to write, PNG, SVG or PDF as its name ends.
         next_: VOLTAGE.csv to write if the verdict is ambiguous and a further record would decide;
             by default next to the JSON file or the page.
         timings: Print what each stage took: time, processor time, simulations.

@@ -26,7 +26,8 @@ def effects(
     Options:
         quiet: Print names only.
         name: Name of one effect.
-        figure: PNG picture of the effect's signature to write; needs NAME.
+        figure: Picture of the effect's signature to write, PNG, SVG or PDF as its name ends; needs
+            NAME.
         model: MODEL.json of the stack for which NAME's size is told.
     """
     from psa_casadi.diagnosis.remedy import example

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from psa_casadi.records.read.columns import ColumnMap
 
 T = TypeVar("T")
+#: What an option writes, and what the names of such files end with.
+_PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".pdf")
 
 
 @dataclass(kw_only=True)
@@ -234,14 +236,26 @@ class Given:
                 " its data sheet, such as 5e7."
             )
 
-    def outputs(self, named: Mapping[str, Path | None], inputs: Sequence[Path | None]) -> None:
-        """Demand that every output can be written, and that no two are one file or an input."""
+    def outputs(
+        self,
+        named: Mapping[str, Path | None],
+        inputs: Sequence[Path | None],
+        page: str = "--report",
+    ) -> None:
+        """Demand that every output can be written, and that no two are one file or an input.
+
+        Where the names of the `page` and of a picture have an ending, it is one of theirs.
+        """
+        endings = {page: _PAGE, "--figure": _PICTURE}
         sources = {p.resolve() for p in inputs if p is not None}
         taken: dict[Path, str] = {}
         for option, path in named.items():
             if path is None:
                 continue
             where = path.resolve()
+            what, *known = endings.get(option, ("",))
+            if known and path.suffix and path.suffix.lower() not in known:
+                self.add(f"{path}: {option} writes {what}, {' or '.join(known)}; name it so.")
             if where in taken:
                 self.add(
                     f"{path}: both {taken[where]} and {option} name it; give each its own file."

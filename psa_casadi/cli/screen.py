@@ -69,6 +69,7 @@ def show_table(table: "Table", quiet: bool = False) -> None:
         show(table.fitted(width()))
         return
     console, drawn = Console(), RichTable(show_edge=False)
+    table = table.laid_out(console.width - 2, between=3)
     # two spaces in a column, a line between two of them
     widths = table.widths(console.width - 3 * len(table.head) + 1)
     for name, column in zip(table.head, widths, strict=True):

@@ -57,7 +57,7 @@ def web(
     path = output or Path("playground.html")
     if port is not None or no_browser:
         given.add("--port and --no-browser are of --diagnose; add that, or leave them out.")
-    given.outputs({"--output": path}, [model])
+    given.outputs({"--output": path}, [model], page="--output")
     chosen = given.model_or_stack(model, stack, needed=False)
     given.check()
     with working("compiling", given.quiet):

@@ -170,7 +170,8 @@ def write_summary(
     """Write the tables of devices; return the files.
 
     A parameter has the columns `NAME [UNIT]`, `NAME low` and `NAME high` (95 % interval, SI units),
-    empty where the records of a device do not determine it.
+    empty where the records of a device do not determine it. A column of numbers with a unit that no
+    device fills is left out.
     """
     own = ("device", "batch", "date", "work", "status", "seconds")
     table: list[dict[str, Any]] = [
@@ -179,7 +180,10 @@ def write_summary(
         | (finding_content(found) if found else {})
         for told, found in rows
     ]
-    columns = list(dict.fromkeys(name for row in table for name in row))
+    filled = {name for row in table for name, value in row.items() if value is not None}
+    every = dict.fromkeys(name for row in table for name in row)
+    columns = [name for name in every if name in filled or not name.endswith("]")]
+    table = [{name: row[name] for name in columns if name in row} for row in table]
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()

@@ -81,8 +81,9 @@ class Finding:
     """What was found of one device.
 
     `kind` is what found it. `rms_m` and `rms_percent` are the fit's error over its samples, [m] and
-    in % of the range, where an identification told them. `records` are the names and SHA-256 of the
-    files. What a file does not hold is empty or None.
+    in % of the range, where an identification told them; `warnings` are its doubts in words, and
+    `missed` is by how many times their noise it misses its records, None where it does not.
+    `records` are the names and SHA-256 of the files. What a file does not hold is empty or None.
     """
 
     device: str
@@ -101,6 +102,8 @@ class Finding:
     force_scale: str = ""
     trace: Trace | None = None
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    missed: float | None = None
 
 
 def replayed(model: Model) -> Trace | None:

@@ -117,6 +117,16 @@ def test_a_table_has_the_width_that_there_is(width: int) -> None:
         assert lines[2] == "a_long_name  it goes on and on and on"
 
 
+def test_a_table_is_turned_where_only_so_its_words_are_whole() -> None:
+    devices = tuple(f"device_{k}" for k in range(8))
+    table = Table(("parameter", *devices), (("mass", *map(str, range(8))),))
+    assert table.laid_out(100) is table
+    lines = table.fitted(40).splitlines()
+    assert [line.split() for line in lines[0:3:2]] == [["parameter", "mass"], ["device_0", "0"]]
+    assert lines[-1].split() == ["device_7", "7"]
+    assert table.laid_out(10) is table  # it is too narrow either way
+
+
 @pytest.mark.parametrize("terminal", [False, True])
 def test_a_table_on_a_terminal_is_neither_cut_nor_too_wide(
     terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -195,7 +195,16 @@ def test_examples_are_listed_shown_and_copied(tmp_path: Path) -> None:
 
 
 def test_an_effect_is_drawn_as_a_picture(tmp_path: Path) -> None:
-    done("effects", "sensor_delay", "--figure", tmp_path / "f.png", "--quiet")
+    for ending, begins in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
+        path = tmp_path / f"f.{ending}"
+        done("effects", "sensor_delay", "--figure", path, "--quiet")
+        assert path.read_bytes().startswith(begins)
+    words = refused("effects", "sensor_delay", "--figure", tmp_path / "f.txt", folder=tmp_path)
+    assert "f.txt: --figure writes a picture, .png or .svg or .pdf; name it so." in words
+    words = refused("batch", tmp_path, "-o", tmp_path / "out", "--report", tmp_path / "f.pdf")
+    assert "f.pdf: --report writes a page, .html or .htm; name it so." in words
+    words = refused("compare", tmp_path / "a.json", tmp_path / "b.json", "-o", tmp_path / "f.pdf")
+    assert "f.pdf: --output writes a page, .html or .htm; name it so." in words
     head = (tmp_path / "f.png").read_bytes()[:24]
     assert head.startswith(b"\x89PNG")
     width, height = (int.from_bytes(head[k : k + 4], "big") for k in (16, 20))

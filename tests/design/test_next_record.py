@@ -13,6 +13,7 @@ import psa_casadi as psa
 from psa_casadi.design import Limits, design_experiment
 from psa_casadi.design.experiment.experiment import Informative, Separated
 from psa_casadi.design.experiment.search import Effort
+from psa_casadi.report.words.design_words import design_tables
 from psa_casadi.units import FloatArray
 from tests.contract.helpers import done, refused, table
 from tests.tiers import slow
@@ -83,6 +84,16 @@ def test_inputs_keep_their_limits_and_begin_at_their_start_values() -> None:
     assert rate.max() <= 4e-5 * (1.0 + 1e-6)
     assert abs(np.corrcoef(record.columns["q"], record.columns["r"])[0, 1]) < 0.95
     assert min(sharp().factor.values()) > 1.0
+
+
+def test_no_interval_leaves_the_bounds_of_its_parameter() -> None:
+    for name, value in TRUTH.items():
+        assert sharp().before[name] == (1e-5, 1e-2)  # of its order of magnitude nothing is known
+        low, high = sharp().intervals[name]
+        assert 1e-5 < low < value < high < 1e-2
+        assert low * high == pytest.approx(value**2)  # on a logarithmic scale
+    (table, *_) = design_tables(sharp())
+    assert [row[3] for row in table.table.rows] == ["1.00e-5 to 0.0100"] * 3
 
 
 def test_identify_is_as_sure_on_the_designed_record_as_was_predicted() -> None:

@@ -37,6 +37,9 @@ def test_a_heavy_motor_stands_out_of_a_population(tmp_path: Path) -> None:
         assert parameter["value"] == pytest.approx(alone.model.values[name], rel=1e-6)
     saved = psa.load_model(tmp_path / "results" / "m1" / "model.json")
     assert saved.values == pytest.approx(alone.model.values, rel=1e-6)
+    summary = (tmp_path / "results" / "summary.csv").read_text("utf-8").splitlines()
+    assert "J [kg.m2]" in summary[0]
+    assert not [n for n in summary[0].split(",") if "[m]" in n or "[times" in n]  # nothing in them
     found = population(done.findings)
     assert {(o.device, o.parameter) for o in found.outliers} == {("m4", "J")}
     psa.write_population(found, tmp_path / "page.html")

@@ -18,6 +18,7 @@ from psa_casadi.report.documents.files import identification_file
 from psa_casadi.report.documents.findings import read_findings
 from psa_casadi.report.page.devices import MOST, write_comparison, write_population
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot
+from psa_casadi.report.words.population_words import missed_sentences, population_sentences
 from psa_casadi.strict_json import json_text
 from tests.model.evidence_models import evident_model
 from tests.report.browser import DARK, PHONE, Browser, find_browser, on_a_phone
@@ -158,10 +159,28 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
         assert apart["name"] == "stands out"
         assert [t.strip() for t in apart["text"]] == apart["hovertext"] == ["d5"]
         assert (len(others["x"]), set(others["text"])) == (39, {""})
+    axis = spread_plot(found, spread).layout["xaxis"]
+    assert axis["ticktext"] == [str(k + 1) for k in axis["tickvals"]]
+    few = population(devices()[:6])
+    plot = spread_plot(few, few.spreads[0])
+    axis = plot.layout["xaxis"]
+    marks = ((p["x"], p["hovertext"]) for p in plot.data)
+    named = {x: name for xs, names in marks for x, name in zip(xs, names, strict=True)}
+    assert [named[k] for k in axis["tickvals"]] == axis["ticktext"]
+    assert set(axis["ticktext"]) == {f"d{k}" for k in range(6)}
     # found in this parameter by itself, and not among all tests
     assert spread.far.found.sum() == 1
     (only,) = spread_plot(replace(found, outliers=()), spread).data
     assert (only["name"], len(only["x"])) == ("belongs to the others", 40)
+
+
+def test_a_population_says_whose_fits_miss_their_records() -> None:
+    assert missed_sentences(devices()) == ()
+    found = [replace(f, missed=2.0 + k) if k < 8 else f for k, f in enumerate(devices())]
+    (said,) = missed_sentences(found)
+    assert said in population_sentences(population(found))
+    assert "The fits of d7 (9.0 times the noise), d6" in said
+    assert "d2 (4.0 times the noise) and 2 more miss their records" in said
 
 
 @slow

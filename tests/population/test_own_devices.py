@@ -8,6 +8,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.report.documents.files import identification_file
+from psa_casadi.report.documents.findings import finding_content
 from psa_casadi.strict_json import json_text
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
@@ -50,6 +51,26 @@ def test_identifications_of_an_own_model_are_compared(tmp_path: Path) -> None:
     assert set(rows.index[rows["differs"]].get_level_values(0)) == {"J"}
     with pytest.raises(psa.InputError, match="One device is nothing to compare"):
         psa.compare(results[0])
+
+
+def test_a_fit_that_misses_its_record_is_told(tmp_path: Path) -> None:
+    """The second of two motors has dry friction, which the model lacks."""
+    given = [device("oiled", 2), device("dry", 1, friction=0.012)]
+    results = [psa.identify(motor(), record, starts=1) for record in given]
+    compared = psa.compare(*results)
+    oiled, dry = compared.findings
+    worst = max(rms / results[1].noise[name] for name, rms in results[1].rms.items())
+    assert (oiled.missed, oiled.warnings) == (None, ())
+    assert dry.missed == pytest.approx(worst, rel=0.05)
+    assert "The fit of dry (" in compared.sentence
+    assert "misses its records" in repr(compared)
+    compared.report(tmp_path / "page.html")
+    page = Page((tmp_path / "page.html").read_text("utf-8"))
+    assert "misses its records" in page.text
+    assert "dry: 'w' is missed by" in page.text
+    assert "dry: 'i' is missed by" in page.text
+    rows = [finding_content(f) for f in compared.findings]
+    assert [r["missed [times the noise]"] for r in rows] == [None, dry.missed]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The next experiment: best for chosen parameters, or for telling effects apart."""
 
+import math
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -109,8 +110,9 @@ class Informative:
     """A record that sharpens parameters.
 
     `intervals` are the predicted 95 % intervals with it (and the data at hand), `before` those
-    without, each in the parameter's unit; `factor` says by how much the mean standard error of the
-    criterion is smaller than with a usual voltage of the same length and amplitude.
+    without, each in the parameter's unit and within its bounds; `factor` says by how much the mean
+    standard error of the criterion is smaller than with a usual voltage of the same length and
+    amplitude.
     """
 
     record: Signals
@@ -452,5 +454,13 @@ def _slow(limits: Limits) -> bool:
 
 
 def _intervals(rival: Rival, errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    values = rival.model.values
-    return {n: (values[n] - _SURE * e, values[n] + _SURE * e) for n, e in errors.items()}
+    """Return 95 % intervals as those of a fit, of which nothing lies outside the bounds."""
+    found = {}
+    for name, error in errors.items():
+        value, half, p = rival.model.values[name], _SURE * error, rival.model.parameter(name)
+        low, high = value - half, value + half
+        if p.log and value > 0.0:
+            factor = math.exp(min(half / value, 50.0))
+            low, high = value / factor, value * factor
+        found[name] = max(low, min(p.bounds[0], value)), min(high, max(p.bounds[1], value))
+    return found

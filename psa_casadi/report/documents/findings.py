@@ -1,6 +1,7 @@
 """Files of diagnoses, identifications and models read as findings, those of one device joined."""
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -45,6 +46,8 @@ _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa 
 Result = Diagnosis | Identification
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
+#: How a warning of an identification tells that an output or a record is missed.
+_MISSED = re.compile(r"is missed by (\d[\d.e+]*) times its noise")
 #: Names of files that say what is in them, not of which device.
 _PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
 
@@ -173,6 +176,8 @@ def _identification(i: IdentificationFile) -> Finding:
         rms_m=i.rms_m if all(r.output == "displacement" for r in i.records) else None,
         rms_percent=max((r.rms_percent_of_range for r in i.records), default=None),
         notes=(*i.warnings, *i.notes),
+        warnings=i.warnings,
+        missed=max((float(n) for w in i.warnings for n in _MISSED.findall(w)), default=None),
     )
 
 
@@ -267,6 +272,7 @@ def finding_content(found: Finding) -> dict[str, Any]:
         for name in ("base", "extended", "noise"):
             row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = found.rms_m, found.rms_percent
+    row["missed [times the noise]"] = found.missed
     for name, p in found.parameters.items():
         if p.told and p.interval is not None:
             row[f"{name} [{p.unit}]"] = p.value

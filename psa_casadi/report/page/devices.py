@@ -44,7 +44,7 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """Which parameters differ beyond noise, and how the verdicts do."""
+        """Which parameters differ beyond noise, how the verdicts do, and which fits miss."""
         return words.difference_sentence(self.findings, self.differences)
 
     @property
@@ -133,6 +133,7 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
             verdict=words.difference_sentence(findings, rows),
             tiles=[_tile(f) for f in findings[:_MOST_TILES]],
             verdicts=words.verdict_table(findings, scale),
+            warnings=[f"{f.device}: {w}" for f in findings for w in f.warnings],
             budget=any(f.budget for f in findings)
             and {
                 "panel": plots.budget_plot(findings),

@@ -1,5 +1,6 @@
 """Plots over devices: parameters with intervals, error budgets, errors over time and voltage."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,6 +22,8 @@ _SYMBOLS = ("circle", "square", "diamond", "triangle-up")
 _HEIGHT = 340
 #: Devices that stand out and are named in a picture, those furthest out.
 _MOST_NAMED = 6
+#: Devices whose names stand along an axis, and letters of a name there.
+_MOST_TICKS, _LONGEST = 12, 16
 
 
 def _look(k: int) -> tuple[str, str, str]:
@@ -122,6 +125,15 @@ def spread_plot(p: Population, s: Spread) -> Panel:
     """
     order = np.argsort(s.estimates.theta)
     plot, shown = _over_devices(p, s, np.arange(order.size), order, "devices, in order")
+    names = [p.findings[s.estimates.places[k]].device for k in order]
+    if len(names) <= _MOST_TICKS:
+        places = list(range(len(names)))
+        ticks = [n if len(n) <= _LONGEST else f"{n[: _LONGEST - 3]}..." for n in names]
+    else:
+        every = math.ceil(len(names) / _MOST_TICKS)
+        places = list(range(every - 1, len(names), every))
+        ticks = [str(k + 1) for k in places]
+    plot.axes({"tickvals": places, "ticktext": ticks, "automargin": True})
     mean = float(s.common.b[0])
     reach = NORMAL_95 * s.common.tau
     middle, low, high = (float(v) for v in shown(np.array([mean, mean - reach, mean + reach])))

@@ -4,6 +4,7 @@ import os
 import textwrap
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -76,15 +77,22 @@ def save_figure(
     origin: str = "measured",
     narrow: bool = False,
 ) -> None:
-    """Write the picture of a diagnosis as a PNG of 1600 x 1000 points, whole or not at all.
+    """Write the picture of a diagnosis, 1600 x 1000 points, whole or not at all.
 
-    Of several records it shows the one that the base model misses most. `origin`, "measured" or
-    "synthetic", names the record's curve. A `narrow` one has two panels and 720 x 880 points, for
-    a phone. Raises InputError when `path` cannot be written to.
+    It is an SVG or a PDF where `path` ends so, else a PNG. Of several records it shows the one that
+    the base model misses most. `origin`, "measured" or "synthetic", names the record's curve. A
+    `narrow` one has two panels and 720 x 880 points, for a phone. Raises InputError when `path`
+    cannot be written to.
     """
     make = narrow_figure if narrow else diagnosis_figure
     with atomic_path(path) as temporary:
-        make(diagnosis, origin=origin).savefig(temporary, format="png")
+        make(diagnosis, origin=origin).savefig(temporary, format=picture_format(path))
+
+
+def picture_format(path: str | os.PathLike[str]) -> str:
+    """Return what the ending of a picture's name says: svg, pdf, else png."""
+    ending = Path(path).suffix.lower().removeprefix(".")
+    return ending if ending in ("svg", "pdf") else "png"
 
 
 def figure_of(result: Plotted) -> Figure:
@@ -425,10 +433,11 @@ def _draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
 
 
 def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[str]) -> None:
-    """Write the picture of an effect's signature as a PNG of 1300 x 620, whole or not at all.
+    """Write the picture of an effect's signature, 1300 x 620 points, whole or not at all.
 
-    Left the difference over time above the voltage's ghost, right against the coordinate that
-    tells it best. Raises InputError when `path` cannot be written to.
+    It is an SVG or a PDF where `path` ends so, else a PNG. Left the difference over time above the
+    voltage's ghost, right against the coordinate that tells it best. Raises InputError when `path`
+    cannot be written to.
     """
     figure = sheet((13.0, 6.2), DPI)
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
@@ -454,7 +463,7 @@ def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[s
     look = textwrap.fill(f"{phrases.plain(effect.name)}: {effect.looks_like}", 120)
     figure.suptitle(f"{look}\n{size_sentence(seen)}", fontsize=FONT + 1)
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI)
+        figure.savefig(temporary, format=picture_format(path), dpi=DPI)
 
 
 def size_sentence(seen: Signature) -> str:

@@ -139,8 +139,9 @@ def _intervals(design: Informative) -> Table:
         )
         value = number(convert(model.values[name], unit, display), 4)
         half = 0.5 * (after[1] - after[0]) / max(abs(model.values[name]), 1e-300)
+        told = half < 10 and after != model.parameter(name).bounds
         rows.append(
-            (name, value, display, *cells, f"{number(100.0 * half, 2)} %" if half < 10 else "open")
+            (name, value, display, *cells, f"{number(100.0 * half, 2)} %" if told else "open")
         )
     head = ("parameter", "value", "unit", "known before", "95 % interval after", "half width")
     return Table(head, tuple(rows))

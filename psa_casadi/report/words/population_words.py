@@ -104,7 +104,20 @@ def population_sentences(p: population.Population) -> tuple[str, ...]:
         sentences.append(
             f"The most frequent cause is {plain(c.what)}: {c.count} of {c.of} devices."
         )
-    return tuple(sentences)
+    return (*sentences, *missed_sentences(p.findings))
+
+
+def missed_sentences(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """Return which devices' fits miss their records, a sentence; none where no fit does."""
+    rows = sorted((-f.missed, f.device) for f in findings if f.missed is not None)
+    if not rows:
+        return ()
+    named = [f"{device} ({number(-times, 2)} times the noise)" for times, device in rows]
+    fits, their, miss = ("fit", "its", "misses") if len(rows) == 1 else ("fits", "their", "miss")
+    return (
+        f"The {fits} of {listing(named, most=_MOST_NAMED)} {miss} {their} records: the model lacks"
+        f" something, {their} values bend to it, and {their} intervals are too short.",
+    )
 
 
 def population_tables(p: population.Population) -> dict[str, Table]:
@@ -180,7 +193,7 @@ def left_out_sentence(p: population.Population) -> str:
 def difference_sentence(
     findings: Sequence[Finding], found: Sequence[population.Difference] | None = None
 ) -> str:
-    """Say which parameters differ beyond noise, and how the verdicts do."""
+    """Say which parameters differ beyond noise, how the verdicts do, and which fits miss."""
     rows = population.differences(findings) if found is None else found
     differing = [d.estimates.name for d in rows if d.differs]
     if not rows:
@@ -197,7 +210,7 @@ def difference_sentence(
     if len({f.verdict for f in findings if f.verdict}) > 1:
         told = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
         sentence += f" Verdicts differ ({listing(told)})."
-    return sentence
+    return " ".join((sentence, *missed_sentences(findings)))
 
 
 def error_scale(findings: Sequence[Finding]) -> Scale:
@@ -231,6 +244,8 @@ def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
     columns.append((f"fitted, rms [{scale.unit}]", *fitted))
     shares = (f.errors[0].extended_percent if f.errors else f.rms_percent for f in findings)
     columns.append(("% of range", *("" if s is None else number(s, 2) for s in shares)))
+    missed = ("" if f.missed is None else number(f.missed, 2) for f in findings)
+    columns.append(("missed, times the noise", *missed))
     top, *body = zip(*(c for c in columns if any(c[1:])), strict=True)
     return Table(top, tuple(body))
 

@@ -52,8 +52,29 @@ class Table:
     def fitted(self, width: float = math.inf) -> str:
         """Return the table in columns of plain text whose lines have `width` characters at most.
 
-        Cells go on in further lines where their column is narrower.
+        Cells go on in further lines where their column is narrower. `laid_out` says which way the
+        table lies.
         """
+        return self.laid_out(width)._lines(width)
+
+    def laid_out(self, width: float, between: int = 2) -> "Table":
+        """Return the table, or with rows for columns where only so its words are whole.
+
+        `width` is the room in characters, of which `between` lie between two columns.
+        """
+        columns = tuple(zip(self.head, *self.rows, strict=True))
+        turned = Table(columns[0], columns[1:]) if columns else self
+        if self._least(between) <= width or turned._least(between) > width:
+            return self
+        return turned
+
+    def _least(self, between: int) -> int:
+        """Return the width in which every word is whole."""
+        columns = zip(self.head, *self.rows, strict=True)
+        words = (max(map(len, " ".join(column).split()), default=0) for column in columns)
+        return sum(words) + between * (len(self.head) - 1)
+
+    def _lines(self, width: float) -> str:
         widths = self.widths(width - 2 * (len(self.head) - 1))
         lines: list[str] = []
         for row in (self.head, tuple("-" * w for w in widths), *self.rows):
