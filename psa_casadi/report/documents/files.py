@@ -29,6 +29,7 @@ from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.model_file import ModelFile
+from psa_casadi.notes import Note
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.report.words.fit_words import Degree, grade
 from psa_casadi.shown import Lined
@@ -404,6 +405,12 @@ class IdentificationFile:
     notes: tuple[str, ...]
     advice: tuple[AdvisedRecord, ...]
     profiles: Mapping[str, ProfileInterval]
+    #: By how many times its noise the model misses a record or an output, None where it does not.
+    missed: float | None = None
+
+
+#: The doubts that tell it, and the name of the figure in each.
+_MISSED = {"missed": "times", "output_missed": "ratio"}
 
 
 def identification_file(found: Identification, profiles: Iterable[Profile] = ()) -> dict[str, Any]:
@@ -438,6 +445,8 @@ def identification_file(found: Identification, profiles: Iterable[Profile] = ())
                     channel.column, channel.unit,
                 )
             )  # fmt: skip
+    doubts = [d for d in found.doubts if isinstance(d, Note) and d.code in _MISSED]
+    missed = [float(d.values[_MISSED[d.code]]) for d in doubts]
     content = IdentificationFile(
         format=IDENTIFICATION_FORMAT,
         package_version=__version__,
@@ -454,6 +463,7 @@ def identification_file(found: Identification, profiles: Iterable[Profile] = ())
             for a in (stack.advice if stack else ())
         ),
         profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
+        missed=max(missed, default=None),
     )
     return asdict(content)
 

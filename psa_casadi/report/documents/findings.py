@@ -1,7 +1,6 @@
 """Files of diagnoses, identifications and models read as findings, those of one device joined."""
 
 import os
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -46,8 +45,6 @@ _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa 
 Result = Diagnosis | Identification
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
-#: How a warning of an identification tells that an output or a record is missed.
-_MISSED = re.compile(r"is missed by (\d[\d.e+]*) times its noise")
 #: Names of files that say what is in them, not of which device.
 _PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
 
@@ -177,7 +174,7 @@ def _identification(i: IdentificationFile) -> Finding:
         rms_percent=max((r.rms_percent_of_range for r in i.records), default=None),
         notes=(*i.warnings, *i.notes),
         warnings=i.warnings,
-        missed=max((float(n) for w in i.warnings for n in _MISSED.findall(w)), default=None),
+        missed=i.missed,
     )
 
 
