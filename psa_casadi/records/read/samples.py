@@ -90,7 +90,8 @@ class Outcome:
     """The columns of one record in the units of the file, checked, or what is wrong.
 
     `units` names the columns in the order of `values`, shape (rows, columns), nan where there is no
-    reading; there are none where nothing is read. `notes` are sentences on what was taken for what.
+    reading; there are none where nothing is read. `notes` are sentences on what was taken for what,
+    `unread` the labels of other columns where one that a model has is missing.
     `tables` are the choices where there are several records, `offer` the columns and the sample
     time [s] with which the file is read.
     """
@@ -99,6 +100,7 @@ class Outcome:
     units: Mapping[str, str] = field(default_factory=dict)
     values: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     notes: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     offer: tuple[ColumnMap, float | None] | None = None
 
@@ -251,6 +253,7 @@ class _Try:
             [c.values * scales[n] if n in scales else c.values for n, c in found.items()]
         )
         self.outcome.units, self.outcome.notes = units, tuple(self.notes)
+        self.outcome.unread = self.choice.unread
 
     def _even_time(self, step: float, lines: NDArray[np.int64]) -> Located:
         if not 0.0 < step < 1e9:
