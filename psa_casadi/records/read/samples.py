@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
@@ -126,7 +126,7 @@ def samples_of(path: str, tables: Sequence[Table], request: Request) -> Outcome:
     if wanted in keys:
         return _of_one(keys[wanted], request, segment)
     if request.table and len(tables) > 1:
-        names = ", ".join(f"'{key}'" for key in parts)
+        names = quoted(parts)
         raise InputError(f"{path}: there is no table '{request.table}'; there are {names}.")
     whole = _of_one(tables[0], request, request.table)
     is_part = tables[0] in parts.values()
@@ -146,7 +146,7 @@ def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
     some = read or [key for key, outcome in found.items() if outcome.offer] or list(found)
     if len(some) == 1:
         return found[some[0]]
-    listed = ", ".join(f"'{key}'" for key in some[:MOST_NAMED])
+    listed = quoted(some[:MOST_NAMED])
     more = f" and {len(some) - MOST_NAMED} more" if len(some) > MOST_NAMED else ""
     problems = Problems()
     problems.add(
