@@ -1,6 +1,6 @@
 """What can go wrong for a user, said in sentences, all of it at once."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 class PsaError(Exception):
@@ -29,6 +29,11 @@ class InputError(PsaError, ValueError):
 
     def __str__(self) -> str:
         return "\n".join(self.problems)
+
+
+def quoted(names: Iterable[str]) -> str:
+    """Return names as a sentence lists them: 'a', 'b'."""
+    return ", ".join(f"'{n}'" for n in names)
 
 
 class Problems:

@@ -171,6 +171,9 @@ def test_a_diagnosis_is_loaded_back(verdict: Verdict, tmp_path: Path) -> None:
         assert other.to_json() == d.to_json()
         assert repr(other) == repr(d)
     assert verdict in again._repr_html_()
+    both = psa.compare(again, d).findings
+    assert [f.verdict for f in both] == [verdict, verdict]
+    assert both[0].causes == both[1].causes
 
 
 def test_what_is_no_diagnosis_is_not_loaded(tmp_path: Path) -> None:

@@ -166,11 +166,7 @@ def fmu(
     show(f"platforms: {', '.join(t.name for t in targets)}", given.quiet)
     show(f"start: {_start_words(kept)}", given.quiet)
     if seconds is None:
-        held = "none; a MODEL.json of `psa identify` or `psa diagnose` has it"
-        if kept.evidence is not None:
-            of = ", ".join(r.record for r in kept.evidence.runs)
-            held = f"documentation/evidence.html (records: {of}), {len(sets)} parameter sets"
-        show(f"evidence: {held}", given.quiet)
+        show(f"evidence: {_evidence_words(kept, len(sets))}", given.quiet)
     else:
         fixed = json.loads(zipfile.Path(output, FIXED_ENTRY).read_bytes())
         limit = fixed.get("voltage_limit", math.inf)
@@ -184,6 +180,18 @@ def fmu(
             given.quiet,
         )
     tell_written(output, quiet=given.quiet)
+
+
+def _evidence_words(model: "psa.Model", sets: int) -> str:
+    """Say which evidence an exported model carries, or why none."""
+    from psa_casadi.simulation.start import is_stack
+
+    if model.evidence is not None:
+        of = ", ".join(r.record for r in model.evidence.runs)
+        return f"documentation/evidence.html (records: {of}), {sets} parameter sets"
+    if not is_stack(model):
+        return "none; models of one's own carry none"
+    return "none; a MODEL.json of `psa identify` or `psa diagnose` has it"
 
 
 def _start_words(model: "psa.Model") -> str:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, quoted
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
@@ -84,11 +84,11 @@ def _made(file: Path, name: str) -> psa.Model:
         ) from error
     if not isinstance(model, psa.Model):
         own = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
-        there = f"; it has {', '.join(own)}" if own else ""
-        raise InputError(
-            f"--model: {file} has no function '{name}' that returns a model{there}. Name one that"
-            f" does, as {file}:{own[-1] if own else 'make'}."
-        )
+        there = f"; it has {quoted(own)}" if own else ""
+        lacks = f"{file} has no function '{name}' that returns a model{there}. Name one that does"
+        if not name:
+            lacks = f"say which function of {file} returns the model{there}"
+        raise InputError(f"--model: {lacks}, as {file}:{own[-1] if own else 'make'}.")
     return model
 
 

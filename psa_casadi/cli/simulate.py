@@ -63,13 +63,13 @@ def simulate(
     with working("simulating", given.quiet):
         inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
         if isinstance(record, psa.Record):
-            outputs, told = _of_a_stack(chosen, inputs, record, turns, begin, hold)
+            outputs, told = _of_a_stack(chosen, inputs, record, turns, begin, starts, hold)
         else:
             u = np.column_stack([np.empty((record.n, 0)), *inputs.values()])
             x0 = np.array([q.start for q in chosen.structure.states])
             y = psa.run(chosen, record.time - record.time[0], u, x0, hold=hold).y
             outputs = dict(zip(chosen.output_names, y.T, strict=True))
-            told = "the start values of the model", ""
+            told = _start_values(chosen, starts), ""
         shown = _as_displayed(chosen, record.time, {**inputs, **outputs})
         written = with_units({"time": record.time, **shown.columns}, {"time": "s", **shown.units})
         psa.write_record(output, written)
@@ -123,12 +123,24 @@ def _begun(model: "psa.Model", values: dict[str, float], starts: dict[str, float
     return model.with_values(values).with_starts(starts)
 
 
+def _start_values(model: "psa.Model", starts: dict[str, float]) -> str:
+    """Say that the model's start values hold, and which of them --start has given."""
+    from psa_casadi.report.words.phrases import with_unit
+
+    every: list[psa.State | psa.Input] = [*model.structure.states, *model.structure.inputs]
+    units = {v.name: v.unit for v in every}
+    given = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
+    others = f", but for {', '.join(given)}" if given else ""
+    return f"the start values of the model{others}"
+
+
 def _of_a_stack(
     model: "psa.Model",
     inputs: dict[str, Any],
     record: "psa.Record",
     turns: tuple[float, ...],
     begin: Start,
+    starts: dict[str, float],
     hold: str,
 ) -> tuple[dict[str, FloatArray], tuple[str, str]]:
     """Return the outputs of a stack, and in words where it begins and what it took."""
@@ -139,7 +151,8 @@ def _of_a_stack(
     found = psa.simulate(
         model, record.time, memory=memory, as_exported=as_exported, hold=hold, **inputs
     )
-    begins = start_sentence(model, record, begin.history, as_exported)
+    values = _start_values(model, starts) if as_exported else ""
+    begins = start_sentence(model, record, begin.history, values)
     return dict(found.outputs), (begins, f" in {found.steps} steps")
 
 
@@ -155,16 +168,19 @@ def _as_displayed(
 
 
 def start_sentence(
-    model: "psa.Model", record: "psa.Record", history: str | None, as_exported: bool
+    model: "psa.Model", record: "psa.Record", history: str | None, values: str
 ) -> str:
-    """Say where a simulation on a record begins, and how an exported FMU begins there too."""
+    """Say where a simulation on a record begins, and how an exported FMU begins there too.
+
+    `values` says that it begins at start values, and at which.
+    """
     from psa_casadi.simulation.start import initial_slope
 
     first = float(record.voltage[0])
-    if as_exported:
+    if values:
         held = next(i.start for i in model.structure.inputs if i.name == "voltage")
         step = f"; the record begins with a step from there to {first:.4g} V" * (held != first)
-        return f"the start values of the model, at {held:.4g} V, as an exported FMU has them{step}"
+        return f"{values}, at {held:.4g} V, as an exported FMU has them{step}"
     memory = "relaxed" if history is None else f"where the history {history} V leaves them"
     rate = initial_slope(record.time, record.voltage)
     moving = f", moving at {rate:.4g} V/s" if rate else ""

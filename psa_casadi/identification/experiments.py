@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.read.reading import signals_given
@@ -121,13 +122,17 @@ def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[No
     lines = [r for r in records if r.hold == "linear"]
     held = {n: tuple(s.name for s in lines if n in stairs(s, (n,))) for n in model.input_names}
     absent = [n for n in model.output_names if all(r.column(n) is None for r in records)]
+    spare = {n for r in records for n in (*r.columns, *r.unread)} - set(_units(model))
     stated, units = [n for n, unit in _units(model).items() if unit != "1"], list[Note]()
     for r in records:
         bare = tuple(n for n in stated if r.units.get(n) == "")
         units += [note("no_unit", record=r.name, names=bare)] if bare else []
     return (
         *(note("stairs", input=n, records=names) for n, names in held.items() if names),
-        *(note("no_column", output=n) for n in absent),
+        *(
+            note("no_column", output=n, near=tuple(get_close_matches(n, sorted(spare))))
+            for n in absent
+        ),
         *units,
         *(said for e in experiments for said in e.remarks),
     )
@@ -171,7 +176,7 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
         if name not in s.columns:
             problems.add(
                 f"signals '{s.name}' lack the input '{name}' of the model '{model.name}'; they have"
-                f" {sorted(s.columns)}. Name the column so."
+                f" {quoted(sorted(s.columns))}. Name the column so."
             )
         elif not np.isfinite(s.columns[name]).all():
             problems.add(
@@ -182,7 +187,7 @@ def _check(model: Model, s: Signals, problems: Problems) -> None:
     if not any(np.isfinite(s.columns[n]).sum() >= 8 for n in there):
         problems.add(
             f"signals '{s.name}' have no output of the model '{model.name}' with eight samples or"
-            f" more; the model's are {model.output_names}."
+            f" more; the model's are {quoted(model.output_names)}."
         )
 
 

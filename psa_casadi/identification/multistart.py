@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.errors import InputError, PsaError, quoted
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -126,7 +126,7 @@ def known_zeros(model: Model, zeros: Sequence[str]) -> tuple[str, ...]:
         if name not in model.output_names:
             raise InputError(
                 f"`zeros` has '{name}', which is no output of '{model.name}'; there are"
-                f" {model.output_names}."
+                f" {quoted(model.output_names)}."
             )
     return tuple(zeros)
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component, Expression
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, quoted
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.structure import Structure, structure_of
 from psa_casadi.shown import Celled
@@ -85,7 +85,9 @@ class Model(Celled):
         for parameter in self.structure.parameters:
             if parameter.name == name:
                 return parameter
-        raise InputError([f"The model has no parameter '{name}'; it has {self.parameter_names}."])
+        raise InputError(
+            f"The model has no parameter '{name}'; it has {quoted(self.parameter_names)}."
+        )
 
     def casadi(self) -> dict[str, Expression]:
         """Return the equations as CasADi names them: t, x, u, p, ode and y, columns of SX symbols.
@@ -180,7 +182,7 @@ class Model(Celled):
         s = self.structure
         known = {v.name for v in _starting(s)}
         problems = [
-            f"The model has no state or input '{n}' to start from; it has {sorted(known)}."
+            f"The model has no state or input '{n}' to start from; it has {quoted(sorted(known))}."
             if n not in known
             else f"The start of '{n}' is {v}; give a finite number."
             for n, v in starts.items()
@@ -238,7 +240,7 @@ def _check_values(structure: Structure, values: Mapping[str, float]) -> None:
     known = {p.name: p for p in structure.parameters}
     for name, value in values.items():
         if name not in known:
-            problems.append(f"The model has no parameter '{name}'; it has {sorted(known)}.")
+            problems.append(f"The model has no parameter '{name}'; it has {quoted(sorted(known))}.")
             continue
         low, high = known[name].bounds
         if not low <= value <= high:

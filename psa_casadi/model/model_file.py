@@ -14,7 +14,7 @@ from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.effects.patches import PATCHES
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Evidence, contradictions
@@ -297,7 +297,8 @@ def _listed(content: dict[str, Any], key: str) -> list[Any]:
 
 def _unknown(reference: str | OwnEffect, key: str, table: Mapping[str, Component]) -> str:
     if isinstance(reference, str):
-        return f"unknown name {shown(reference)} in {key}; the known ones are {sorted(table)}."
+        known = quoted(sorted(table))
+        return f"unknown name {shown(reference)} in {key}; the known ones are {known}."
     module = reference.module[:80]
     return (
         f"has the effect {shown(reference.name)} of the module {module}, which was not named; give"

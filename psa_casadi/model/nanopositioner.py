@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.model.parts import compensator_for, part_model
 from psa_casadi.model.stacks import stack_model
@@ -196,13 +196,14 @@ def _check(
     problems = Problems()
     if len(plant.input_names) != 1 or plant.structure.sampled:
         problems.add(
-            f"The plant '{plant.name}' has the inputs {plant.input_names} and the sampled states"
-            f" {plant.sampled_names}; give one with one input, the command, and none sampled."
+            f"The plant '{plant.name}' has the inputs {quoted(plant.input_names)} and the sampled"
+            f" states {quoted(plant.sampled_names) or 'none'}; give one with one input, the"
+            " command, and none sampled."
         )
     if position not in plant.output_names and (position or len(plant.output_names) != 1):
         problems.add(
             f"The position is '{position}' but the outputs of '{plant.name}' are"
-            f" {plant.output_names}; name one of them."
+            f" {quoted(plant.output_names)}; name one of them."
         )
     if not 0.0 < period < 10.0:
         problems.add(f"sample_time is {period:g} s; give a positive period such as 5e-5.")

@@ -15,7 +15,7 @@ from psa_casadi.component import (
     Foreign,
     Symbols,
 )
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.variables import Input, Output, Parameter, State
 
 
@@ -216,7 +216,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
             if name not in sums:
                 raise InputError(
                     f"Component '{component.name}' adds to '{name}', which is no balance;"
-                    f" the balances are {sorted(sums)}."
+                    f" the balances are {quoted(sorted(sums))}."
                 )
             balances[name] = balances[name] + term if name in balances else ca.SX(term)
     der, out, switches, following = (

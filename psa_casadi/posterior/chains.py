@@ -15,7 +15,7 @@ import scipy
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
-from psa_casadi.interruption import current_work
+from psa_casadi.interruption import current_work, raise_if_stopped
 from psa_casadi.posterior.task import Block, Task
 from psa_casadi.records.split import DISPLACEMENT, Channel
 from psa_casadi.units import FloatArray
@@ -180,7 +180,14 @@ def chains_of(
 
     def make() -> Callable[..., Any]:  # a density for each chain's thread, in the caller's context
         own = context.copy()
-        return lambda u: own.run(density, np.asarray(u))
+
+        def value(u: npt.ArrayLike) -> tuple[float, FloatArray]:
+            try:
+                return own.run(density, np.asarray(u))
+            except KeyboardInterrupt:  # in the sampler's thread; the caller's raises it
+                return -np.inf, np.zeros(size)
+
+        return value
 
     model = nutpie.compiled_pyfunc.from_pyfunc(
         ndim=size,
@@ -203,9 +210,13 @@ def chains_of(
         while found is None:
             with suppress(TimeoutError):
                 found = running.wait(timeout=_LOOK)
-    except KeyboardInterrupt:
-        current_work().stop()
-        running.cancel()
+            raise_if_stopped()
+    except BaseException as error:  # a chain may end at the interrupt before this thread knows
+        if isinstance(error, KeyboardInterrupt):
+            current_work().stop()
+        with suppress(Exception):
+            running.cancel()
+        raise_if_stopped()
         raise
     statistics = {
         ours: found.sample_stats[theirs].to_numpy()

@@ -29,7 +29,8 @@ class Signals(Plotted):
     names that the model gives them, in `units`, where one is missing in the model's; nan marks a
     missing sample of an output. Between samples the inputs are linear (`hold="linear"`) or constant
     (`hold="zero"`). `sha256` is that of the file at `source`, or of the arrays where there is no
-    file. `notes` are sentences on what the reader took for what.
+    file. `notes` are sentences on what the reader took for what, `unread` the names of the file's
+    other columns where one that the model has is missing.
 
     Raises:
         InputError: fewer than eight samples; a time that stands still or goes back; a column of
@@ -44,6 +45,7 @@ class Signals(Plotted):
     sha256: str = ""
     source: str = ""
     notes: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         time = frozen(self.time)

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError
+from psa_casadi.errors import InputError, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.device import Numbers, Summary, Task, device_module, run_on_device
@@ -89,7 +89,7 @@ def simulate_many(
     named = REDUCTIONS.get(reduce) if isinstance(reduce, str) else None
     if isinstance(reduce, str) and named is None:
         raise InputError(
-            f"There is no reduction {reduce!r}; choose one of {tuple(REDUCTIONS)}, or give a"
+            f"There is no reduction {reduce!r}; choose one of {quoted(REDUCTIONS)}, or give a"
             " function of a displacement."
         )
     meant = record.displacement if reduce == "misfit" else np.zeros(record.n)

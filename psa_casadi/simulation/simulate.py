@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.shown import Shown, frame, with_units
@@ -243,8 +243,8 @@ def _check(model: Model, t: FloatArray, given: Mapping[str, FloatArray]) -> None
     for name, samples in given.items():
         if name not in model.input_names:
             problems.add(
-                f"The model has no input '{name}', it has {model.input_names}; use `run` for models"
-                " other than a stack."
+                f"The model has no input '{name}', it has {quoted(model.input_names)}; use `run`"
+                " for models other than a stack."
             )
         if samples.shape != t.shape:
             problems.add(f"{name} has {samples.size} samples for {t.size} times; give one each.")
@@ -341,7 +341,7 @@ def settled_at(
     """
     if "voltage" not in model.input_names:
         raise InputError(
-            f"The model has no input 'voltage' to be held at; it has {model.input_names}."
+            f"The model has no input 'voltage' to be held at; it has {quoted(model.input_names)}."
         )
     memory = memory_after(model, history, at=voltage, sweep=sweep, rest=rest)
     x = start_state(model, _held(model, voltage), memory=memory).x

@@ -14,7 +14,7 @@ import pytest
 from scipy.io import savemat
 
 import psa_casadi as psa
-from psa_casadi.identification.experiments import experiments_of, given_to
+from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -231,6 +231,20 @@ def test_a_unit_that_is_not_stated_is_told() -> None:
     record = plants.motor(2, friction=0.0)
     found = psa.identify(motor(), {"time": record.time, **record.columns}, starts=1)
     assert found.warnings == ("record states no unit of w and i; the model's are taken.",)
+
+
+def test_a_column_that_is_like_a_missing_output_is_named(tmp_path: Path) -> None:
+    columns = {**COLUMNS, "ol_temp [K]": WARM}
+    del columns["Oil-Temp [°C]"]
+    file = _csv(tmp_path / "p.csv")
+    file.write_text(file.read_text("utf-8").replace("Oil-Temp", "ol_temp", 1), "utf-8")
+    by_hand = psa.Signals(
+        name="hand", time=T, columns={"valve": VALVE, "flow": FLOW, "Speed": SPEED, "ol_temp": WARM}
+    )
+    for given in (columns, file, by_hand):
+        said = " ".join(map(str, told_of_columns(_pump(), [_run(given)])))
+        assert "No record has a column 'oil_temp'; that output is not compared." in said
+        assert "The records have 'ol_temp'; name the column 'oil_temp' if it is that." in said
 
 
 def test_columns_are_named_where_the_header_does_not(tmp_path: Path) -> None:

@@ -363,6 +363,7 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     words = ("--report", page, "--json", told, *left_out, "-o", kept)
     said = done("diagnose", record, *asked, *words, "--expect", "cause_named").out
     assert "cause named" in said
+    assert f"psa export fmu --model {kept} -o " in page.read_text("utf-8")
     found = json.loads(told.read_text("utf-8"))
     assert [cause["effect"] for cause in found["causes"]] == ["bend_of_warmth"]
     assert found["values"]["T"] == pytest.approx(5.0, rel=0.01)
@@ -406,6 +407,9 @@ def test_what_a_model_of_ones_own_does_not_have_is_told(tmp_path: Path) -> None:
     assert "--profile is not there for a model of your own" in said
     assert "'w', which --columns names for 'warmth', is not in the header" in said
     assert "oven.py has no function 'mak'" in refused("diagnose", record, "--model", f"{model}:mak")
+    said = refused("diagnose", record, "--model", model)
+    assert "say which function of" in said
+    assert "it has 'make', as" in said
     assert "there is no file" in refused("diagnose", record, "--model", "none.py:make")
     said = refused("identify", record, "--hold", "zero")
     assert "--hold is said of a model of your own; add --model FILE.py:FUNCTION." in said

@@ -365,7 +365,7 @@ def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
     np.testing.assert_allclose(columns["place [mm]"], 1e3 * expected, rtol=1e-5)
     np.testing.assert_allclose(columns["force [N]"], time, rtol=1e-12)
     plan = ("simulate", "--model", tmp_path / "m.json", "--input", ramp, "-o", tmp_path / "x.csv")
-    done(
+    said = done(
         *plan,
         "--hold",
         "zero",
@@ -375,7 +375,8 @@ def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
         "k=5",
         "--figure",
         tmp_path / "p.png",
-    )
+    ).words
+    assert "start: the start values of the model, but for x = 0.3 m" in said
     held = [0.3]
     for u in time[:-1]:  # x' = u - 5 x with u constant over 0.01 s
         held.append(held[-1] * np.exp(-0.05) + u / 5.0 * (1.0 - np.exp(-0.05)))

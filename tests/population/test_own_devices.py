@@ -97,6 +97,9 @@ def test_diagnoses_of_an_own_model_are_compared(tmp_path: Path) -> None:
     assert "w, base, held out [rad/s]" in page.text
     # a result at hand has all parameters of its model, a file those of its causes
     assert set(found[1].parameters) == {"R", "k", "J", "b"}
+    loaded = psa.compare(psa.load_diagnosis(path), oiled)
+    assert [f.verdict for f in loaded.findings] == ["cause_named", "adequate"]
+    assert loaded.findings[0].parameters == found[0].parameters
     plain = tmp_path / "oiled.json"
     plain.write_text(oiled.to_json(), encoding="utf-8")
     words = done("compare", path, plain, "-o", tmp_path / "two.html").words

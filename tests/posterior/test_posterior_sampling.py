@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
+from psa_casadi.interruption import interruptible_work, raise_if_stopped
 from psa_casadi.posterior import chains
 from psa_casadi.posterior.chains import chains_of
 from psa_casadi.posterior.task import Block, Density, Task, Within, task_of
@@ -57,6 +58,24 @@ def test_a_normal_posterior_is_found() -> None:
     np.testing.assert_allclose((theta.mean(axis=0) - mean) / spread, 0.0, atol=5.0 / 1000**0.5)
     np.testing.assert_allclose(theta.std(axis=0) / spread, 1.0, atol=5.0 / 2000**0.5)
     assert found.divergences == 0
+
+
+def test_an_interrupt_ends_the_chains(capfd: pytest.CaptureFixture[str]) -> None:
+    """The density raises it in the sampler's threads, as a simulation does; nothing panics."""
+
+    class Interrupted:
+        size, calls = 2, 0
+
+        def __call__(self, u: FloatArray) -> tuple[float, FloatArray]:
+            self.calls += 1
+            if self.calls == 300:
+                work.stop()
+            raise_if_stopped()
+            return -0.5 * float(u @ u), -u
+
+    with interruptible_work() as work, pytest.raises(KeyboardInterrupt):
+        chains_of(Interrupted(), chains=2, draws=10**6, seed=1, cores=2)
+    assert "panic" not in capfd.readouterr().err
 
 
 def test_an_unknown_level_gives_students_t() -> None:

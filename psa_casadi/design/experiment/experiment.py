@@ -29,7 +29,7 @@ from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
-from psa_casadi.errors import InputError, Problems, PsaError
+from psa_casadi.errors import InputError, Problems, PsaError, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import note
 from psa_casadi.records.excitation import sine, triangle
@@ -289,7 +289,7 @@ def _plan(model: Model, limits: Limited, noise: Noisy) -> _Plan:
         if name not in model.input_names:
             problems.add(
                 f"There are limits of '{name}', which is no input of '{model.name}'; it has"
-                f" {model.input_names}."
+                f" {quoted(model.input_names)}."
             )
     lengths = {(own.duration, own.samples) for own in every.values()}
     if len(lengths) != 1:

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Component, Equations, Expression, FmuUsed, Symbols
-from psa_casadi.errors import InputError, Problems, PsaError
+from psa_casadi.errors import InputError, Problems, PsaError, quoted
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.imported import (
     Imported,
@@ -124,7 +124,7 @@ def _free(
         if not bounded:
             problems.add(
                 f"No parameter of {fmu.path.name} has a least and a greatest value; name those to"
-                f" identify with bounds, free={{name: (low, high)}}; it has {sorted(own)}."
+                f" identify with bounds, free={{name: (low, high)}}; it has {quoted(sorted(own))}."
             )
         return {n: fmu.bounds[n] for n in table if n in bounded}
     given = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
@@ -133,7 +133,7 @@ def _free(
         if name not in own:
             problems.add(
                 f"`free` has '{name}', which is no real parameter of {fmu.path.name}; it has"
-                f" {sorted(own)}."
+                f" {quoted(sorted(own))}."
             )
         elif bounds is None and name not in bounded:
             problems.add(

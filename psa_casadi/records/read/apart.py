@@ -64,6 +64,7 @@ class Answer:
     head: Head | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     sha256: str = ""
 
@@ -112,7 +113,9 @@ def read(path: str, request: Request) -> tuple[Outcome, str]:
         return samples_of(path, tables, request), digest
     with temporary_folder() as folder:
         told = answered_apart(Asked(path, request, str(folder)))
-        outcome = Outcome(units=told.units, notes=told.notes, tables=told.tables)
+        outcome = Outcome(
+            units=told.units, notes=told.notes, unread=told.unread, tables=told.tables
+        )
         for sentence in told.problems:
             outcome.problems.add(sentence)
         if told.units:
@@ -205,7 +208,13 @@ def answered(asked: Asked) -> Answer:
     if outcome.units:
         np.save(Path(asked.out) / "values.npy", outcome.values)
     return Answer(
-        outcome.problems.sentences(), None, outcome.units, outcome.notes, outcome.tables, digest
+        outcome.problems.sentences(),
+        None,
+        outcome.units,
+        outcome.notes,
+        outcome.unread,
+        outcome.tables,
+        digest,
     )
 
 

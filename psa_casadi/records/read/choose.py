@@ -143,6 +143,7 @@ class Choice:
         self.table, self.required, self.wanted = table, required, wanted
         self.problems, self.fields = problems, dict[str, Field]()
         self.left, self.open, self.sources = list[Cell](), list[Question](), dict[str, Source]()
+        self.unread: tuple[str, ...] = ()
         if table.headless and not wanted:
             self._count()
             return
@@ -420,7 +421,8 @@ class ByName:
 
     A name is found whatever its case, its spaces and underscores, and the unit behind it; none is
     guessed from its unit. `names` are the model's, `required` what must be there.
-    The unit of a field is "" where the table states none, but that of the time "s". `open`,
+    The unit of a field is "" where the table states none, but that of the time "s". `unread` are
+    the labels of other columns where a name is missing. `open`,
     `sources`, `wanted` and `problems` are those of `Choice`.
     """
 
@@ -440,6 +442,7 @@ class ByName:
         if "time" not in found and (time := self._time(found)) is not None:
             found["time"] = time
         self.fields = {name: found[name] for name in self.names if name in found}
+        self.unread = self._others(found) if len(found) < len(self.names) else ()
         if "time" in found:
             where = f"{table.where}, column 'time'"
             check_unit(COLUMNS["time"], found["time"].unit, where, problems)
@@ -530,10 +533,12 @@ class ByName:
         text = self.table.header[index]
         return last_name(text) if self.table.sizes else text
 
-    def _listed(self, known: Mapping[str, Field]) -> str:
+    def _others(self, known: Mapping[str, Field]) -> tuple[str, ...]:
         others = set(self._cells()) - {field.index for field in known.values()}
-        labels = [self.table.labels[k] for k in sorted(others)]
-        return ", ".join(filter(None, [*known, *labels]))[:120] or "nothing"
+        return tuple(filter(None, (self.table.labels[k] for k in sorted(others))))
+
+    def _listed(self, known: Mapping[str, Field]) -> str:
+        return ", ".join([*known, *self._others(known)])[:120] or "nothing"
 
     @staticmethod
     def _usual(name: str) -> str:

@@ -505,7 +505,7 @@ def _signals(
     time = to_si(columns.pop("time"), outcome.units["time"])
     _check_instants(path, time)
     units = {name: outcome.units[name] for name in columns}
-    return Signals(time=time, columns=columns, units=units, **whence)
+    return Signals(time=time, columns=columns, units=units, unread=outcome.unread, **whence)
 
 
 def _samples(

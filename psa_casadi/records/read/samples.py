@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.file_bytes import check_size
@@ -90,7 +90,8 @@ class Outcome:
     """The columns of one record in the units of the file, checked, or what is wrong.
 
     `units` names the columns in the order of `values`, shape (rows, columns), nan where there is no
-    reading; there are none where nothing is read. `notes` are sentences on what was taken for what.
+    reading; there are none where nothing is read. `notes` are sentences on what was taken for what,
+    `unread` the labels of other columns where one that a model has is missing.
     `tables` are the choices where there are several records, `offer` the columns and the sample
     time [s] with which the file is read.
     """
@@ -99,6 +100,7 @@ class Outcome:
     units: Mapping[str, str] = field(default_factory=dict)
     values: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     notes: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     offer: tuple[ColumnMap, float | None] | None = None
 
@@ -124,7 +126,7 @@ def samples_of(path: str, tables: Sequence[Table], request: Request) -> Outcome:
     if wanted in keys:
         return _of_one(keys[wanted], request, segment)
     if request.table and len(tables) > 1:
-        names = ", ".join(f"'{key}'" for key in parts)
+        names = quoted(parts)
         raise InputError(f"{path}: there is no table '{request.table}'; there are {names}.")
     whole = _of_one(tables[0], request, request.table)
     is_part = tables[0] in parts.values()
@@ -144,7 +146,7 @@ def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
     some = read or [key for key, outcome in found.items() if outcome.offer] or list(found)
     if len(some) == 1:
         return found[some[0]]
-    listed = ", ".join(f"'{key}'" for key in some[:MOST_NAMED])
+    listed = quoted(some[:MOST_NAMED])
     more = f" and {len(some) - MOST_NAMED} more" if len(some) > MOST_NAMED else ""
     problems = Problems()
     problems.add(
@@ -251,6 +253,7 @@ class _Try:
             [c.values * scales[n] if n in scales else c.values for n, c in found.items()]
         )
         self.outcome.units, self.outcome.notes = units, tuple(self.notes)
+        self.outcome.unread = self.choice.unread
 
     def _even_time(self, step: float, lines: NDArray[np.int64]) -> Located:
         if not 0.0 < step < 1e9:

@@ -41,8 +41,8 @@ from psa_casadi.strict_json import decode, read_json
 #: The file in a device's folder that says how its work ended.
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
-#: What `identify` and `diagnose` return.
-Result = Diagnosis | Identification
+#: What `identify`, `diagnose` and `load_diagnosis` return.
+Result = Diagnosis | Identification | AnyDiagnosisFile
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
@@ -57,11 +57,11 @@ def read_findings(
 ) -> tuple[Finding, ...]:
     """Return the findings in files, or of results at hand, in their order.
 
-    A result, of a stack or of a model of one's own, is what `identify` and `diagnose` return; it
-    has the name of its first record. A path is a DIAGNOSIS.json, what `psa identify --json` wrote,
-    a MODEL.json, or a device's folder of `psa batch`. A model of the same records as a diagnosis or
-    identification is part of it. `traces` says whether models play the records that their files
-    carry. `effects` are own ones.
+    A result, of a stack or of a model of one's own, is what `identify`, `diagnose` and
+    `load_diagnosis` return; it has the name of its first record. A path is a DIAGNOSIS.json, what
+    `psa identify --json` wrote, a MODEL.json, or a device's folder of `psa batch`. A model of the
+    same records as a diagnosis or identification is part of it. `traces` says whether models play
+    the records that their files carry. `effects` are own ones.
 
     Raises:
         InputError: what cannot be read, all of it.
@@ -94,6 +94,8 @@ def _read(
     given: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
 ) -> list[_Read]:
     content: Any
+    if isinstance(given, AnyDiagnosisFile):
+        return [(Path(given.records[0].name), _diagnosis(given))]
     if isinstance(given, Identification):
         path, source = Path(given.experiments[0].record.name), "identification"
         content = identification_file(given)

@@ -91,8 +91,8 @@ def compare(
 ) -> Comparison:
     """Compare two devices or more, stacks or of a model of one's own.
 
-    `results` are what `identify` and `diagnose` return, or files of these (`read_findings`);
-    `effects` are own ones that MODEL.json names.
+    `results` are what `identify`, `diagnose` and `load_diagnosis` return, or files of these
+    (`read_findings`); `effects` are own ones that MODEL.json names.
 
     Raises InputError for fewer than two, and for what cannot be read.
     """

@@ -10,15 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.errors import quoted
 from psa_casadi.identification.advice import Advice, Plan
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.report.words.phrases import listing
 from psa_casadi.units import convert
-
-
-def _quoted(names: Sequence[str]) -> str:
-    return ", ".join(f"'{n}'" for n in names)
 
 
 def _branches(missing: Sequence[str]) -> str:
@@ -67,11 +64,11 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
     "interrupted": "The search was interrupted; this is the best fit so far, and its values are not"
     " final.",
     "not_unique": lambda names: (
-        f"Two starts led to equally good fits that differ in {_quoted(names)}: these records cannot"
+        f"Two starts led to equally good fits that differ in {quoted(names)}: these records cannot"
         " tell which is right."
     ),
     "undetermined": lambda names: (
-        f"{_quoted(names)} {'is' if len(names) == 1 else 'are'} not determined by these records."
+        f"{quoted(names)} {'is' if len(names) == 1 else 'are'} not determined by these records."
     ),
     "missed": "Record '{record}' is missed by {times:.2g} times its noise: the model lacks"
     " something there; `psa diagnose` looks for the cause.",
@@ -112,11 +109,11 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
     " {frequency:.3g} Hz, which the method counts as hysteresis: A, delta, n, beta and gamma are"
     " off. Give slower loops.",
     "not_from_rest": lambda names: (
-        f"{_quoted(names)} do not begin at 0 V, though the method needs h = 0 at the start; their"
+        f"{quoted(names)} do not begin at 0 V, though the method needs h = 0 at the start; their"
         " first sample is taken for rest. Give loops from rest at 0 V."
     ),
     "bridged": lambda names: (
-        f"Missing samples were bridged by straight lines in {_quoted(names)}; derivatives there are"
+        f"Missing samples were bridged by straight lines in {quoted(names)}; derivatives there are"
         " not measured."
     ),
     "out_of_range": "{name} = {value:.3g} {unit} is outside of its range, {low:g} to {high:g};"
@@ -164,11 +161,11 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
     "diverged": "{count} of {transitions} transitions diverged: a part of the posterior may be"
     " missing. Draw more with another seed, or hold what is open (--free).",
     "chains_disagree": lambda names, limit: (
-        f"The chains disagree about {_quoted(names)} (r-hat above {limit}); take more draws"
+        f"The chains disagree about {quoted(names)} (r-hat above {limit}); take more draws"
         " (--draws, --tune)."
     ),
     "few_draws": lambda names, limit: (
-        f"Fewer than {limit:.0f} effective draws per chain of {_quoted(names)}: ends of intervals"
+        f"Fewer than {limit:.0f} effective draws per chain of {quoted(names)}: ends of intervals"
         " are rough; take more draws (--draws)."
     ),
     "start_cut_off": "The fit that the chains start from was cut off before it converged.",
@@ -178,7 +175,7 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
         " cause."
     ),
     "of_the_prior": lambda names: (
-        f"The records hardly tell {_quoted(names)}: the posterior is that of the prior."
+        f"The records hardly tell {quoted(names)}: the posterior is that of the prior."
     ),
     "prior_fails": "{count} of {draws} draws of the prior cannot be simulated; they are left out"
     " of the prior's groups.",

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from string import Formatter
 from typing import Any
 
+from psa_casadi.errors import quoted
 from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
@@ -317,9 +318,13 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     "stairs": (
         "The input '{input}' stands still between jumps in {records}, and each jump is read as a"
         " ramp of one sampling interval; if it is held between samples, as by a digital controller,"
-        ' say so of these records: psa.Signals(..., hold="zero").'
+        ' say so: --hold zero, in Python psa.Signals(..., hold="zero").'
     ),
-    "no_column": "No record has a column '{output}'; that output is not compared.",
+    "no_column": lambda output, near=(): (
+        f"No record has a column '{output}'; that output is not compared."
+        + f" The records have {quoted(near)}; name the column '{output}' if it is that."
+        * bool(near)
+    ),
     "no_unit": lambda record, names: (
         f"{record} states no unit of {listing(names)}; the model's are taken."
     ),
@@ -334,7 +339,7 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     "on_bound": "'{name}' sits on a bound of its range; its interval means nothing.",
     "output_missed": (
         "'{output}' is missed by {ratio:.2g} times its noise: the model lacks something, so that"
-        " the values bend to it, and their errors are too small; psa.diagnose looks for the cause."
+        " the values bend to it, and their errors are too small; psa diagnose looks for the cause."
     ),
     "output_not_followed": (
         "'{output}' is left with {share:.0p} % of its own movement: see that its column, and those"

@@ -176,10 +176,6 @@ def _amount(size: Size, length: Scale) -> str:
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.
 _FILES = ("model.json", "extended.json")
-#: What a program does with an extended model of any kind.
-_IN_PYTHON = (
-    "`result.model` is the extended model: psa.export_fmu(result.model, PATH) exports it.",
-)
 #: Causes whose remedies are told, and rivals of each.
 _CAUSES, _RIVALS = 3, 2
 
@@ -202,7 +198,7 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
         ))  # fmt: skip
     stack = d if isinstance(d, StackDiagnosis) else None
     errors, noise = _sizes(d)
-    commands, beside = _commands(stack, model_file) if stack else ((), _IN_PYTHON * added(d))
+    commands, beside = _commands(d, model_file)
     if d.verdict == "adequate" and d.doubt:
         said = "Use the model within these records only: their held-out samples cannot confirm it."
         return Advice((said,), beside, commands[:1])
@@ -255,19 +251,21 @@ def _further(d: Diagnosis) -> str:
     )
 
 
-def _commands(d: StackDiagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the commands that take the model further, and what must be said of its file."""
+    stack = d if isinstance(d, StackDiagnosis) else None
+    if not (stack or model_file or added(d)):
+        return (), ()  # what there is of one's own is its equations
     file = model_file or _FILES[added(d)]
     fmu = shlex.quote(str(PurePath(file).with_suffix(".fmu")))
     model = f"--model {shlex.quote(file)}"
     commands = [f"psa export fmu {model} -o {fmu}"]
     outside = [c for c in d.causes if c.belongs_to in ("sensor", "environment")]
-    if d.verdict in ("adequate", "cause_named", "partly_explained") and len(outside) < max(
-        len(d.causes), 1
-    ):
+    usable = d.verdict in ("adequate", "cause_named", "partly_explained")
+    if stack and usable and len(outside) < max(len(d.causes), 1):
         commands.append(f"psa design input {model} --target PATH.csv -o VOLTAGE.csv")
     open_ones = [c for c in d.causes if c.cannot_be_told_from]
-    if open_ones and d.next_experiment.voltage_csv is None:
+    if stack and open_ones and stack.next_experiment.voltage_csv is None:
         first = open_ones[0]
         names = " ".join((first.effect, *first.cannot_be_told_from[:_RIVALS]))
         commands.append(
