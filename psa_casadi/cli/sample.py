@@ -51,11 +51,11 @@ def sample(
         tune: Draws before these, to adapt step and metric.
         seed: Seed of all that is random.
         json: JSON file of the figures to write.
-        figure: Picture of prior and posterior to write, PNG.
+        figure: Picture of prior and posterior to write, PNG, SVG or PDF as its name ends.
         report: HTML page to write.
     """
     from psa_casadi.report.documents.files import posterior_file
-    from psa_casadi.report.plots.figures import DPI, posterior_figure
+    from psa_casadi.report.plots.figures import DPI, picture_format, posterior_figure
     from psa_casadi.report.words.text import posterior_text
     from psa_casadi.strict_json import json_text
 
@@ -87,7 +87,7 @@ def sample(
             atomic_write(json, json_text(posterior_file(found)))
         if figure is not None:
             with atomic_path(figure) as temporary:
-                posterior_figure(found).savefig(temporary, format="png", dpi=DPI)
+                posterior_figure(found).savefig(temporary, format=picture_format(figure), dpi=DPI)
         if report is not None:
             psa.report(found, report)
     show(posterior_text(found, origin=origin, width=width()), given.quiet)

@@ -44,12 +44,13 @@ def simulate(
         value: Parameter in place of the model's, NAME=VALUE in SI units; repeat for several.
         start: Start of a state, NAME=VALUE in SI units; repeat for several.
         hold: What the inputs do between samples.
-        figure: Picture of all inputs and outputs to write, PNG.
+        figure: Picture of all inputs and outputs to write, PNG, SVG or PDF as its name
+            ends.
         start_voltage: Voltage [V] that holds the stack when it starts, as in `psa export fmu`; by
             default the first one of the record.
     """
     from psa_casadi.files import atomic_path
-    from psa_casadi.report.plots.figures import DPI
+    from psa_casadi.report.plots.figures import DPI, columns_figure, picture_format
 
     given.outputs({"--output": output, "--figure": figure}, [model, input_])
     chosen, record = _read(given, model, stack, input_, begin, reading)
@@ -75,7 +76,8 @@ def simulate(
         psa.write_record(output, written)
         if figure is not None:
             with atomic_path(figure) as temporary:
-                shown.plot().savefig(temporary, format="png", dpi=DPI)
+                drawn = columns_figure(shown, [n for n in chosen.output_names if n in outputs])
+                drawn.savefig(temporary, format=picture_format(figure), dpi=DPI)
     begins, took = told
     show(f"start: {begins}", given.quiet)
     show(f"{record.n} samples over {record.duration:.6g} s{took}", given.quiet)

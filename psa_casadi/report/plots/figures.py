@@ -159,9 +159,12 @@ def outputs_figure(outputs: Sequence[Series], *, origin: str = "measured") -> Fi
     return figure
 
 
-def columns_figure(record: Signals) -> Figure:
-    """Return the picture of all columns of a record over time, the one to show first."""
-    names = [record.shown, *(n for n in record.columns if n != record.shown)][:_MOST_ROWS]
+def columns_figure(record: Signals, first: Sequence[str] = ()) -> Figure:
+    """Return the picture of all columns of a record over time.
+
+    Those named in `first` come first, where none is named the column to show.
+    """
+    names = [*dict.fromkeys((*(first or (record.shown,)), *record.columns))][:_MOST_ROWS]
     figure = sheet((9.0, max(4.5, 2.2 * len(names))), 100)
     for name, axes in zip(names, np.ravel(figure.subplots(len(names), 1)), strict=True):
         _curve(axes, record.time, record.columns[name], name, record.units.get(name, ""))
