@@ -363,7 +363,10 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     words = ("--report", page, "--json", told, *left_out, "-o", kept)
     said = done("diagnose", record, *asked, *words, "--expect", "cause_named").out
     assert "cause named" in said
-    assert f"psa export fmu --model {kept} -o " in page.read_text("utf-8")
+    export = f"psa export fmu --model {kept} -o {kept.with_suffix('.fmu')}"
+    assert export in page.read_text("utf-8")
+    said = done(*export.split()[1:]).out
+    assert "evidence: none; models of one's own carry none" in said
     found = json.loads(told.read_text("utf-8"))
     assert [cause["effect"] for cause in found["causes"]] == ["bend_of_warmth"]
     assert found["values"]["T"] == pytest.approx(5.0, rel=0.01)
