@@ -44,6 +44,7 @@ from psa_casadi.simulation.simulate import (
     TIGHTEST,
 )
 from psa_casadi.simulation.stepper import SOURCES
+from psa_casadi.symbolic import in_turn
 
 _PAGE_SOURCES = ("page/page.c", "page/settle.c", "page/library.c")
 #: What a page calls, and how many bytes of stack it has.
@@ -111,6 +112,7 @@ def _compiled(structure: Structure) -> Callable[[], bytes]:
     return lambda: cached("web", name, lambda work: _compile(work, texts)).read_bytes()
 
 
+@in_turn
 def module_texts(structure: Structure) -> Mapping[str, str]:
     """Return the generated files of a module by their names."""
     s = structure

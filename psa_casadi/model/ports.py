@@ -17,6 +17,7 @@ import casadi as ca
 
 from psa_casadi.component import Balance, Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
+from psa_casadi.symbolic import in_turn
 from psa_casadi.units import rate_unit, si_unit
 
 Kind = Literal["input", "rate", "output"]
@@ -49,6 +50,7 @@ def true_output(name: str) -> str:
     return f"true_{name}"
 
 
+@in_turn
 def ports_of(model: Model) -> tuple[Port, ...]:
     """Return the ports of a model: its inputs, the rates of its own physics' states, its outputs.
 

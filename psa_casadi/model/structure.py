@@ -16,6 +16,7 @@ from psa_casadi.component import (
     Symbols,
 )
 from psa_casadi.errors import InputError, Problems, quoted
+from psa_casadi.symbolic import in_turn
 from psa_casadi.variables import Input, Output, Parameter, State
 
 
@@ -163,6 +164,7 @@ class Structure:
         return [self.time, self.x, self.u, self.p, *([self.z] if self.sampled else [])]
 
     @cached_property
+    @in_turn
     def f(self) -> ca.Function:
         """Casadi function `(time, x, u, p) -> (xdot, y)`; columns of nx, nu, np and nx, ny.
 
@@ -171,11 +173,13 @@ class Structure:
         names = ["time", "x", "u", "p", "z"][: len(self.arguments)]
         return ca.Function("f", self.arguments, [self.xdot, self.y], names, ["xdot", "y"])
 
+    @in_turn
     def balance(self, name: str) -> ca.Function:
         """Return the casadi function `(time, x, u, p) -> sum` of one balance, in its unit."""
         return ca.Function(name, self.arguments, [self.sums[name]])
 
     @cached_property
+    @in_turn
     def slopes(self) -> ca.Function:
         """Casadi function of the same arguments `-> (A, B, C, D)`: xdot and y by x and u.
 
@@ -185,6 +189,7 @@ class Structure:
         return ca.Function("slopes", self.arguments, blocks)
 
     @cached_property
+    @in_turn
     def g(self) -> ca.Function:
         """Casadi function `(time, x, u, p, z) -> z_next`: the sampled states after an instant."""
         arguments = [self.time, self.x, self.u, self.p, self.z]
@@ -193,6 +198,7 @@ class Structure:
 
 
 @cache
+@in_turn
 def structure_of(components: tuple[Component, ...]) -> Structure:
     """Add up the components' terms, order the balances and substitute them.
 

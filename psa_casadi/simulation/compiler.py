@@ -29,6 +29,7 @@ from psa_casadi.component import Expression
 from psa_casadi.errors import MachineError
 from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Structure
+from psa_casadi.symbolic import in_turn
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")
@@ -275,6 +276,7 @@ int fwd1_{name}(const double **arg, double **res, long long int *iw, double *w, 
 """
 
 
+@in_turn
 def functions_of(structure: Structure, *, sensitivities: bool) -> dict[str, ca.Function]:
     """Return the CasADi functions behind `model.h`, all of arguments (time, x, u, p).
 
@@ -319,6 +321,7 @@ def c_slopes(structure: Structure) -> Expression:
     return structure.xdot if structure.states else ca.SX(0)
 
 
+@in_turn
 def generate_c(structure: Structure, *, sensitivities: bool) -> dict[str, str]:
     """Return the generated files of a model: {"model.c": ..., "model_config.h": ...}."""
     functions = functions_of(structure, sensitivities=sensitivities)
@@ -343,6 +346,7 @@ def c_code(name: str, functions: Collection[ca.Function]) -> str:
     return PRAGMAS + body
 
 
+@in_turn
 def fingerprint(structure: Structure) -> str:
     """Return text that differs where the generated files differ, in a thirtieth of their time."""
     s = structure

@@ -15,6 +15,7 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import begun
 from psa_casadi.simulation.stepper import run
+from psa_casadi.symbolic import in_turn
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -107,6 +108,7 @@ def resized(component: Component, sizes: tuple[float, ...]) -> Component:
 
 
 @cache
+@in_turn
 def _rates(structure: Structure) -> ca.Function:
     arguments = [structure.time, structure.x, structure.u, structure.p]
     return ca.Function("rates", arguments, [structure.xdot, structure.y])

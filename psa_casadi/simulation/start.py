@@ -16,6 +16,7 @@ import numpy.typing as npt
 from psa_casadi.component import Expression
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model, Structure
+from psa_casadi.symbolic import in_turn
 from psa_casadi.units import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -135,6 +136,7 @@ def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float])
 
 
 @cache
+@in_turn
 def _rest(structure: Structure) -> ca.Function:
     """Casadi function (t, x, u, p) -> rates of the resting states, their slopes by x and by p."""
     names = resting_states(structure)
@@ -291,6 +293,7 @@ def settling_time(model: Model) -> float:
 
 
 @cache
+@in_turn
 def _start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return a Newton step for all that settles, one for the states without memory, the motion."""
     s = structure
@@ -332,6 +335,7 @@ def _start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca
 
 
 @lru_cache(maxsize=64)
+@in_turn
 def _functions_of_many(
     structure: Structure, sets: int
 ) -> tuple[ca.Function, ca.Function, ca.Function]:

@@ -28,6 +28,7 @@ from psa_casadi.simulation.exact.split import closure, dependence, split_of
 from psa_casadi.simulation.simulate import LOOSEST, Way, trace
 from psa_casadi.simulation.start import begun
 from psa_casadi.simulation.stepper import run
+from psa_casadi.symbolic import in_turn
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Input, Parameter
 
@@ -116,6 +117,7 @@ class Law:
 
 
 @cache
+@in_turn
 def law_of(structure: Structure, effect: Component) -> Law | None:
     """Return the law of an effect of a composed model; None of one that must be simulated in full.
 

@@ -22,6 +22,7 @@ from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import doubles, unit_columns, which_of
 from psa_casadi.simulation.timings import count_run, count_steps
+from psa_casadi.symbolic import in_turn
 from psa_casadi.units import FloatArray
 
 #: A sample is halved so many times at most; what then misses the tolerance is counted as forced.
@@ -93,6 +94,7 @@ def _unfit(structure: Structure, outputs: tuple[str, ...]) -> str | None:
     return "it calls an FMU, which has no formula" if structure.foreign else None
 
 
+@in_turn
 def model_text(structure: Structure, outputs: tuple[str, ...]) -> str:
     """Return a model's generated C (`exact_model.h`); raises NotExact where there is none."""
     split = _unfit(structure, outputs) or split_of(structure)

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Expression
 from psa_casadi.model.structure import Structure
+from psa_casadi.symbolic import in_turn
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -205,6 +206,7 @@ class Split:
 
 
 @cache
+@in_turn
 def split_of(structure: Structure) -> Split | str:
     """Return how a model splits, or a sentence that says why it does not."""
     try:
