@@ -114,9 +114,8 @@ def _told(
     experiments: Sequence[Experiment],
 ) -> FreeFunction:
     """Return a fitted function, and what it adds beside the variable that it follows most."""
-    component, values = attached.component, {}
-    for n in law.names:
-        values[n] = _along(h.fit, component.fitted, experiments, n)
+    component = attached.component
+    values = _along(h.fit, component.fitted, experiments, law.names)
     added = np.asarray(
         sum(
             h.fit.model.values[c] * prod(values[n] / law.scales[n] for n in term)
@@ -149,22 +148,26 @@ def _told(
 
 
 def _along(
-    fit: Fit, coefficients: Sequence[str], experiments: Sequence[Experiment], name: str
-) -> FloatArray:
-    """Return a variable along all records: an input, a state, or an output before its sensor."""
-    model = fit.model
-    if name in model.input_names:
-        return np.concatenate([e.record.column(name) for e in experiments])
-    if name in model.state_names:
-        k, theta = model.state_names.index(name), fit.placed(experiments)
-        rows = [
-            states_of(model, e, fit.unknowns.start(theta, r), fit.way.step_rtol)[:, k]
+    fit: Fit, coefficients: Sequence[str], experiments: Sequence[Experiment], names: Sequence[str]
+) -> dict[str, FloatArray]:
+    """Return variables along all records: inputs, states, or outputs before their sensors."""
+    model, found = fit.model, dict[str, FloatArray]()
+    inputs = [n for n in names if n in model.input_names]
+    for n in inputs:
+        found[n] = np.concatenate([e.record.column(n) for e in experiments])
+    states = [n for n in names if n in model.state_names and n not in found]
+    if states:
+        theta = fit.placed(experiments)
+        x = np.vstack([
+            states_of(model, e, fit.unknowns.start(theta, r), fit.way.step_rtol)
             for r, e in enumerate(experiments)
-        ]
-        return np.concatenate(rows)
-    none = fit.at(dict.fromkeys(coefficients, 0.0))
-    k = model.output_names.index(name)
-    return np.concatenate([y[:, k] for y in none.outputs(experiments)])
+        ])  # fmt: skip
+        found |= {n: x[:, model.state_names.index(n)] for n in states}
+    outputs = [n for n in names if n not in found]
+    if outputs:
+        y = np.vstack(fit.at(dict.fromkeys(coefficients, 0.0)).outputs(experiments))
+        found |= {n: y[:, model.output_names.index(n)] for n in outputs}
+    return {n: found[n] for n in names}
 
 
 def _decrease(view: View, attached: Attached, experiments: Sequence[Experiment]) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
@@ -34,6 +35,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment, missed_rms
 from psa_casadi.simulation.timings import stage
+from psa_casadi.units import FloatArray
 
 #: Verdicts that name causes.
 NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
@@ -423,9 +425,17 @@ class ModelJudge(Judge):
     def _noise(self, step: Step) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
         return noise_told(step.fit, step.screening.colour, self.experiments)
 
+    @cached_property
+    def extended(self) -> tuple[FloatArray, ...]:
+        """What the extended model shows of every output along every record (n, ny)."""
+        return tuple(self.final.fit.outputs(self.experiments))
+
+    def _changes(self, effects: Sequence[Component]) -> tuple[Size, ...]:
+        return changes(effects, self.final.fit, self.experiments, self.extended)
+
     def named(self, step: Step) -> Cause:
         """Return a cause with its port, and what it changes of every output."""
-        sizes = changes([step.cause], self.final.fit, self.experiments)
+        sizes = self._changes([step.cause])
         return self.cause(step, sizes, self.table[step.cause.name].port.words)
 
     @property
@@ -438,8 +448,7 @@ class ModelJudge(Judge):
         """Return the output that one of several causes changes much more than all of them do."""
         if len(self.causes) < 2:
             return ()
-        every = [s.cause for s in self.kept]
-        whole = changes(every, self.final.fit, self.experiments)
+        whole = self._changes([s.cause for s in self.kept])
         rows = [
             (size.value / max(both.value, 1e-300), cause.effect, size, both)
             for cause in self.causes
@@ -485,7 +494,8 @@ class ModelJudge(Judge):
             )
             for o, level in zip(final.fit.channels, noise, strict=True)
         )
-        base, extended = (tuple(s.fit.outputs(self.experiments)) for s in (first, final))
+        extended = self.extended
+        base = tuple(first.fit.outputs(self.experiments)) if self.kept else extended
         return Diagnosis(
             errors=errors, remarks=self.said, experiments=experiments, base=base,
             extended=extended, **self.common,

@@ -268,17 +268,20 @@ def sizes(
 
 
 def changes(
-    effects: Sequence[Component], fit: Fit, experiments: Sequence[Experiment]
+    effects: Sequence[Component],
+    fit: Fit,
+    experiments: Sequence[Experiment],
+    shown: Sequence[FloatArray],
 ) -> tuple[Size, ...]:
     """Return by how much effects of any model change each measured output within a record.
 
-    It is the range of the difference of two runs from the same start, with the effects and with
-    their gains at 0; nothing where the latter cannot be simulated.
+    It is the range of the difference of two runs from the same start: `shown` (n, ny), the outputs
+    of the fit, and those with the effects' gains at 0; nothing where these cannot be simulated.
     """
     columns = [fit.model.output_names.index(o.channel.outputs[0]) for o in fit.channels]
     without = fit.at({e.gain: 0.0 for e in effects if e.gain})
     try:
-        pairs = zip(fit.outputs(experiments), without.outputs(experiments), strict=True)
+        pairs = zip(shown, without.outputs(experiments), strict=True)
         most = np.max([np.ptp(a - b, axis=0)[columns] for a, b in pairs], axis=0)
     except PsaError:
         return ()
