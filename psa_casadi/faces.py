@@ -18,13 +18,11 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
-from psa_casadi.progress import on_a_terminal
+from psa_casadi.progress import Progress, on_a_terminal
 from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 from psa_casadi.simulation.start import is_stack
-
-Progress = Callable[[str], None]
 
 
 def _told_of(own: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -1,6 +1,5 @@
 """What long work tells while it runs, on a terminal where it is given nothing else."""
 
-import inspect
 import shutil
 import sys
 from collections.abc import Callable
@@ -43,5 +42,4 @@ def on_a_terminal(work: Callable[P, R]) -> Callable[P, R]:
             sys.stderr.write(_CLEAR)
             sys.stderr.flush()
 
-    run.__signature__ = inspect.signature(work)  # type: ignore[attr-defined]
     return run

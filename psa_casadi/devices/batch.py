@@ -39,11 +39,10 @@ from psa_casadi.devices.jobs import (
 )
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_path, atomic_write, make_folder
-from psa_casadi.identification.refitting import Progress
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding
-from psa_casadi.progress import on_a_terminal
+from psa_casadi.progress import Progress, on_a_terminal, silent
 from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
 from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of
 from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding, finding_content
@@ -235,7 +234,7 @@ def batch(
     executor: Executor | None = None,
     workers: int | None = None,
     at_once: int | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> BatchRun:
     """Identify or diagnose many devices; write each result to the folder `output` when it is there.
 

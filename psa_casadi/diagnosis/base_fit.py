@@ -32,11 +32,12 @@ from psa_casadi.identification.exchanges import force_of, without_blur
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import trace_record
 from psa_casadi.identification.force_start import retuned
-from psa_casadi.identification.refitting import Progress, quick_from, refit
+from psa_casadi.identification.refitting import quick_from, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.identification.start.starting_points import linear_start, resolved
 from psa_casadi.notes import Note, note
+from psa_casadi.progress import Progress
 from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted

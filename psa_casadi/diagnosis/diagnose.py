@@ -24,7 +24,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import unfinished
 from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
-from psa_casadi.identification.refitting import Progress, relevelled
+from psa_casadi.identification.refitting import relevelled
 from psa_casadi.identification.search import (
     LOAD,
     fit_base,
@@ -51,6 +51,7 @@ from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
 from psa_casadi.notes import Note, note, texts
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
@@ -277,7 +278,7 @@ def diagnose(
     hysteresis: Hysteresis | None = None,
     effects: Sequence[Component] | None = None,
     method: Method | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
     watch: Callable[[Tried], None] = lambda _: None,
 ) -> StackDiagnosis:
     """Find what the base model gets wrong on the records, name the cause, measure the gain.

@@ -22,12 +22,12 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.identification.refitting import (
-    Progress,
     differing,
     equal,
     quick_from,
     refit_or_keep,
 )
+from psa_casadi.progress import Progress
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs, simulate_record

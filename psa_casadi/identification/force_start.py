@@ -20,13 +20,13 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.refitting import (
-    Progress,
     quick_from,
     record_rms,
     refit,
     residual_noise,
 )
 from psa_casadi.identification.start.starting_points import Excerpt, fastest_part, placed, sought
+from psa_casadi.progress import Progress
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.units import FloatArray
 

@@ -11,7 +11,7 @@ from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, de
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
-from psa_casadi.identification.refitting import Progress, record_rms, refit, relevelled
+from psa_casadi.identification.refitting import record_rms, refit, relevelled
 from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
 from psa_casadi.identification.search import loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
@@ -36,6 +36,7 @@ from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.notes import Note, note, texts
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -79,7 +80,7 @@ def identify(
     model: Model | None = None,
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> StackIdentification:
     """Fit the base model, or `model`, to all samples of all records.
 

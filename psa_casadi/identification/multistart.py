@@ -163,7 +163,7 @@ def search_starts(
     free: Sequence[str],
     *,
     starts: int,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]]:
     """Return the best fit from several starts, the experiments with their noise, and the starts.
 

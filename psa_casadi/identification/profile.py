@@ -1,6 +1,6 @@
 """Profile likelihood: how the best fit worsens as one parameter is held away from its estimate."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,10 +8,9 @@ import numpy as np
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
-
-Progress = Callable[[str], None]
 
 _EVALUATIONS = 40
 #: A step out is at most this many times the distance that has been covered.
@@ -162,7 +161,7 @@ def profile(
     name: str,
     *,
     points: int = 10,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Profile:
     """Return the profile likelihood of a free parameter of a fit, with up to `points` on each side.
 

@@ -1,6 +1,6 @@
 """Continuing a fit: refits, noise levels, shares of the noise, whether two fits are as good."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,8 +27,6 @@ _EQUAL = 3.84
 _OF_EXCESS = 0.05
 #: ... and they differ where a parameter is this many standard errors apart.
 _APART = 4.0
-
-Progress = Callable[[str], None]
 
 
 def noise_levels(experiments: Sequence[Experiment]) -> list[float]:

@@ -23,7 +23,6 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.force_start import retuned
 from psa_casadi.identification.multistart import fits_from
 from psa_casadi.identification.refitting import (
-    Progress,
     differing,
     equal,
     noise_levels,
@@ -42,6 +41,7 @@ from psa_casadi.identification.start.starting_points import (
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
@@ -89,7 +89,7 @@ def free_parameters(model: Model, records: Sequence[Record] = ()) -> list[str]:
 
 @stage("base fit")
 def fit_base(
-    model: Model, experiments: Sequence[Experiment], *, progress: Progress = lambda _: None
+    model: Model, experiments: Sequence[Experiment], *, progress: Progress = silent
 ) -> Fit:
     """Return the best fit of `search`, without the account of its starts."""
     return search(model, experiments, progress=progress).best
@@ -101,7 +101,7 @@ def search(
     *,
     linear: Sequence[LinearCandidate] = (),
     thorough: bool = False,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Search:
     """Fit the core parameters from several starts, then whatever else the data can tell.
 
@@ -241,7 +241,7 @@ def search_forms(
     *,
     linear: Sequence[LinearCandidate] = (),
     thorough: bool = False,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> tuple[Search, Note | None]:
     """Search from each model, and return the search that the records prefer, and why.
 

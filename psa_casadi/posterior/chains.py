@@ -17,6 +17,7 @@ from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.interruption import current_work, raise_if_stopped
 from psa_casadi.posterior.task import Block, Task
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.split import DISPLACEMENT, Channel
 from psa_casadi.units import FloatArray
 from psa_casadi.version import __version__
@@ -115,8 +116,6 @@ def predictive(
     )
 
 
-Progress = Callable[[str], None]
-
 #: Spread of the chains' starts, in standard deviations of the fit.
 _SPREAD = 1.0
 #: Share of proposals that the step is tuned to accept.
@@ -167,7 +166,7 @@ def chains_of(
     tune: int = 500,
     seed: int = 0,
     cores: int | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Chains:
     """Draw from a density, `tune` draws to adapt step and metric first, which are thrown away.
 

@@ -1,7 +1,7 @@
 """`psa.sample`: the whole posterior of a model's parameters, given its records."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from psa_casadi.posterior.chains import (
     sampler_and_arviz,
 )
 from psa_casadi.posterior.task import Task, own_task_of, task_of
-from psa_casadi.progress import on_a_terminal
+from psa_casadi.progress import Progress, on_a_terminal, silent
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import DISPLACEMENT
 from psa_casadi.shown import Reported, frame
@@ -168,8 +168,6 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
     return tuple(doubts)
 
 
-Progress = Callable[[str], None]
-
 #: Draws that are predicted, and draws of the prior.
 _PREDICTED = 100
 
@@ -189,7 +187,7 @@ def sample(
     tune: int = 500,
     seed: int = 0,
     cores: int | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
     **words: Any,
 ) -> Posterior:
     """Draw parameters, initial states and offsets of a model from their posterior.

@@ -23,7 +23,7 @@ from psa_casadi.design.experiment.criteria import (
     rival_of_model,
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
-from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, Progress, coarse, search
+from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, coarse, search
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
@@ -32,6 +32,7 @@ from psa_casadi.diagnosis.task import FAST, LIMITS
 from psa_casadi.errors import InputError, Problems, PsaError, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import note
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
@@ -311,7 +312,7 @@ def separating_experiment(
     base: Rival | None = None,
     kinds: Sequence[Kind] = KINDS,
     effort: Effort | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Separated:
     """Return the inputs that best separate rivals, each fitted again to the others.
 
@@ -365,7 +366,7 @@ def informative_experiment(
     optimality: Optimality = "D",
     kinds: Sequence[Kind] = KINDS,
     effort: Effort | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Informative:
     """Return the inputs that best determine the named parameters, all free ones by default.
 
@@ -407,7 +408,7 @@ def resolving_experiment(
     *,
     limits: Limits | None = None,
     effort: Effort | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Separated:
     """Return the record that would tell which of an ambiguous diagnosis' effects is the cause.
 

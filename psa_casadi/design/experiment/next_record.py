@@ -26,7 +26,7 @@ from psa_casadi.design.experiment.experiment import (
     usual_inputs,
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits
-from psa_casadi.design.experiment.search import Effort, Progress
+from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.generic.attached import Attached, extended, of_ones_own
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.pack import Pack, Task
@@ -41,7 +41,7 @@ from psa_casadi.identification.search import CORE
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
-from psa_casadi.progress import on_a_terminal
+from psa_casadi.progress import Progress, on_a_terminal, silent
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.sizes import sized, sizes_of
@@ -70,7 +70,7 @@ def design_experiment(
     known_start: bool = False,
     kinds: Sequence[Kind] = KINDS,
     effort: Effort | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Informative | Separated:
     """Return the record to measure next with any model: the inputs within their limits.
 
@@ -179,7 +179,7 @@ def rivals_of(
     zeros: Sequence[str] = (),
     hold: Hold | None = None,
     known_start: bool = False,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]:
     """Return the models that a record is designed for, the base, and the noise that a fit leaves.
 

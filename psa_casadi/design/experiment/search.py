@@ -10,12 +10,12 @@ import scipy
 from psa_casadi.design.experiment.criteria import Criterion, Point
 from psa_casadi.design.experiment.limits import KINDS, Drive, Kind, Limits, draw
 from psa_casadi.errors import PsaError
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.signals import Signals
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra, side_by_side
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
-Progress = Callable[[str], None]
 #: Makes a planned record: its name, instants (n,) [s], inputs (n,) by name.
 Make = Callable[[str, FloatArray, Mapping[str, FloatArray]], Signals]
 
@@ -59,7 +59,7 @@ def search(
     kinds: Sequence[Kind] = KINDS,
     effort: Effort | None = None,
     enough: Callable[[Signals], bool] = lambda _: False,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> Best:
     """Draw waveforms of the families, improve the best ones, return the best of all.
 

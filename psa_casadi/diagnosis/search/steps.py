@@ -30,11 +30,11 @@ from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import as_read
-from psa_casadi.identification.refitting import Progress
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
+from psa_casadi.progress import Progress, silent
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 
@@ -228,7 +228,7 @@ def fit_contenders(
     effects: Sequence[Component],
     *,
     model: Model | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = silent,
 ) -> tuple[Fit, tuple[Contender, ...], tuple[Experiment, ...]]:
     """Fit the base and each of the named effects to records in full, without a verdict.
 
