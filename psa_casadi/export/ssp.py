@@ -11,7 +11,6 @@ from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import scipy
@@ -23,7 +22,7 @@ from matplotlib.patches import Circle, Rectangle
 from psa_casadi.characters import check_text
 from psa_casadi.errors import InputError
 from psa_casadi.export.common import markup
-from psa_casadi.export.common.parameter_sets import parameter_set
+from psa_casadi.export.common.parameter_sets import Row, parameter_rows, set_text
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.files import atomic_path, temporary_folder
@@ -351,9 +350,6 @@ def _place(value: float) -> str:
     return f"{round(value, 6):.6g}"
 
 
-_VALUES = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
-_MAPPING = "http://ssp-standard.org/SSP1/SystemStructureParameterMapping"
-_COMMON = "http://ssp-standard.org/SSP1/SystemStructureCommon"
 _FOLDER = "resources"
 
 
@@ -376,50 +372,27 @@ def parameter_files(
 ) -> tuple[dict[str, bytes], tuple[Binding, ...]]:
     """Return the files of all parameter sets by their place in the archive, and their bindings."""
     shared = shared_parameters(parts)
-    sets = {part: ET.fromstring(parameter_set(model)) for part, model in parts.items()}
-    units = {
-        u.get("name", ""): u for root in sets.values() for u in root.iter(f"{{{_COMMON}}}Unit")
-    }
-    entries: dict[str, bytes] = {}
-    bindings = []
-    lifted: dict[str, ET.Element] = {}
-    for part, root in sets.items():
+    entries: dict[str, str] = {}
+    bindings, lifted = [], dict[str, Row]()
+    for part, model in parts.items():
         own = []
-        for element in root.iter(f"{{{_VALUES}}}Parameter"):
-            named = element.get("name", "")
-            if part in shared.get(named, ()):
-                lifted.setdefault(named, element)
+        for row in parameter_rows(model):
+            if part in shared.get(row[0], ()):
+                lifted.setdefault(row[0], row)
             else:
-                own.append(element)
+                own.append(row)
         if own:
             place = f"{_FOLDER}/{part}.ssv"
-            entries[place] = _set_text(parts[part].name, own, units)
+            entries[place] = set_text(model.name, own)
             bindings.append(Binding(part, place))
     if lifted:
         values, mapping = f"{_FOLDER}/shared.ssv", f"{_FOLDER}/shared.ssm"
-        elements = [lifted[n] for n in sorted(lifted)]
-        entries[values] = _set_text(f"{name}_shared", elements, units)
-        ET.register_namespace("ssm", _MAPPING)
-        attributes = {"version": "1.0", "generationTool": markup.generation_tool()}
-        root = ET.Element(f"{{{_MAPPING}}}ParameterMapping", attributes)
-        for source in sorted(shared):
-            for part in shared[source]:
-                target = {"source": source, "target": f"{part}.{source}"}
-                ET.SubElement(root, f"{{{_MAPPING}}}MappingEntry", target)
-        entries[mapping] = markup.xml_text(root).encode("utf-8")
+        entries[values] = set_text(f"{name}_shared", [lifted[n] for n in sorted(lifted)])
+        pairs = [(n, f"{part}.{n}") for n in sorted(shared) for part in shared[n]]
+        tool = markup.generation_tool()
+        entries[mapping] = markup.xml_text("shared.xml", tool=tool, pairs=pairs)
         bindings.append(Binding(OUTSIDE, values, mapping))
-    return entries, tuple(bindings)
-
-
-def _set_text(name: str, elements: Sequence[ET.Element], units: Mapping[str, ET.Element]) -> bytes:
-    """Return a parameter set of some parameters, with the units that they have."""
-    attributes = {"version": "1.0", "name": name, "generationTool": markup.generation_tool()}
-    root = ET.Element(f"{{{_VALUES}}}ParameterSet", attributes)
-    ET.SubElement(root, f"{{{_VALUES}}}Parameters").extend(elements)
-    used = {e.get("unit", "") for e in root.iter(f"{{{_VALUES}}}Real")} - {""}
-    if used:
-        ET.SubElement(root, f"{{{_VALUES}}}Units").extend([units[n] for n in sorted(used)])
-    return markup.xml_text(root).encode("utf-8")
+    return {place: text.encode("utf-8") for place, text in entries.items()}, tuple(bindings)
 
 
 #: Growth of a step below which a system counts as stable: memories have the radius 1 itself.

@@ -1,5 +1,6 @@
 """What the descriptions of FMI 2.0 and FMI 3.0 have in common, and pages of HTML."""
 
+import re
 from collections.abc import Iterable
 from xml.etree import ElementTree as ET
 
@@ -73,15 +74,21 @@ def number(value: float) -> str:
     return repr(float(value))
 
 
-def xml_text(root: ET.Element) -> str:
-    """Return an indented XML document that ends with a line end.
+def xml_text(template: str, **given: object) -> str:
+    """Return an XML document from a template, indented anew; it ends with a line end.
 
     Raises InputError for a character that XML cannot carry, which a parser would stop at.
     """
+    text = filled(template, **given)
+    check_text(text, f"{re.findall(r'<(?:[a-z]+:)?([A-Za-z]+)', text)[0]}, an XML file,")
+    for prefix, space in re.findall(r'xmlns:([a-z-]+)="([^"]+)"', text):
+        ET.register_namespace(prefix, space)
+    root = ET.fromstring(text)
+    for element in root.iter():
+        if (element.text or "").isspace():
+            element.text = None
     ET.indent(root)
-    text = ET.tostring(root, encoding="unicode")
-    check_text(text, f"{root.tag.rpartition('}')[2]}, an XML file,")
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ET.tostring(root, encoding="unicode")}\n'
 
 
 def default_span(model: Model) -> float:

@@ -11,9 +11,8 @@ Source: SSP 1.0, section 6 (system structure parameter values).
 
 import math
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import NormalDist
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +21,8 @@ from psa_casadi.export.common.markup import base_unit, generation_tool, number, 
 from psa_casadi.model.compose import Model
 from psa_casadi.units import parse_unit
 
-_VALUES = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
-_COMMON = "http://ssp-standard.org/SSP1/SystemStructureCommon"
+#: Name, meaning, value and unit of a parameter.
+Row = tuple[str, str, float, str]
 
 
 def parameter_set(
@@ -38,33 +37,36 @@ def parameter_set(
     With `values`, those of these parameters only, which stand in the set of that `name`. `states`
     are start values of states to add.
     """
-    ET.register_namespace("ssv", _VALUES)
-    ET.register_namespace("ssc", _COMMON)
-    attributes = {"version": "1.0", "name": name or model.name, "generationTool": generation_tool()}
-    root = ET.Element(f"{{{_VALUES}}}ParameterSet", attributes)
+    starts = states or {}
+    rows = [
+        (q.name, f"start of the {q.description}", starts[q.name], q.unit)
+        for q in model.structure.states
+        if q.name in starts
+    ]
+    return set_text(name or model.name, [*parameter_rows(model, values), *rows])
+
+
+def parameter_rows(model: Model, values: Mapping[str, float] | None = None) -> list[Row]:
+    """Return all parameters, with their 95 % intervals where known, or those with `values`."""
     intervals = model.provenance.intervals if values is None else {}
-    chosen, starts = model.values if values is None else values, states or {}
-    rows = []
+    chosen, rows = model.values if values is None else values, []
     for p in (p for p in model.structure.parameters if p.name in chosen):
         found, meaning = intervals.get(p.name), p.description
         if found:
             meaning += f"; 95 % interval {found.low:.6g} to {found.high:.6g} {p.unit}"
         rows.append((p.name, meaning, chosen[p.name], p.unit))
-    rows += [
-        (q.name, f"start of the {q.description}", starts[q.name], q.unit)
-        for q in model.structure.states
-        if q.name in starts
-    ]
-    listed = ET.SubElement(root, f"{{{_VALUES}}}Parameters")
-    for title, meaning, value, unit in rows:
-        head = {"name": title, "description": meaning}
-        element = ET.SubElement(listed, f"{{{_VALUES}}}Parameter", head)
-        ET.SubElement(element, f"{{{_VALUES}}}Real", {"value": number(value), "unit": unit})
-    units = ET.SubElement(root, f"{{{_VALUES}}}Units") if rows else root
-    for unit in sorted({unit for *_, unit in rows}):
-        definition = ET.SubElement(units, f"{{{_COMMON}}}Unit", {"name": unit})
-        ET.SubElement(definition, f"{{{_COMMON}}}BaseUnit", base_unit(parse_unit(unit)))
-    return xml_text(root)
+    return rows
+
+
+def set_text(name: str, rows: Sequence[Row]) -> str:
+    """Return a parameter set (SSV), with the definitions of its units."""
+    return xml_text(
+        "parameters.xml",
+        name=name,
+        tool=generation_tool(),
+        rows=[(title, meaning, number(value), unit) for title, meaning, value, unit in rows],
+        units={unit: base_unit(parse_unit(unit)) for unit in sorted({unit for *_, unit in rows})},
+    )
 
 
 FloatArray = npt.NDArray[np.float64]

@@ -1,9 +1,14 @@
 """Texts of an export that are made from templates: C, Modelica, HTML."""
 
 import textwrap
+from collections.abc import Mapping
 from functools import cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+#: What a parser of XML would take for a space in an attribute.
+_LINE_ENDS = {ord(c): f"&#{ord(c)};" for c in "\t\n\r"}
 
 
 def filled(template: str, **given: object) -> str:
@@ -16,13 +21,21 @@ def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("psa_casadi.export"),
         undefined=StrictUndefined,
-        autoescape=lambda name: name is not None and name.endswith((".html", ".ssd")),
+        autoescape=lambda name: name is not None and name.endswith((".html", ".ssd", ".xml")),
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"wrapped": _wrapped, "comment": _comment, "words": comment_text}
+    environment.filters |= {
+        "wrapped": _wrapped, "comment": _comment, "words": comment_text, "stated": _stated,
+    }  # fmt: skip
     return environment
+
+
+def _stated(attributes: Mapping[str, str | None]) -> Markup:
+    """Return the attributes of an element of XML that have a value, with their line ends."""
+    texts = ((name, escape(text)) for name, text in attributes.items() if text is not None)
+    return Markup("".join(f' {name}="{text.translate(_LINE_ENDS)}"' for name, text in texts))
 
 
 def _wrapped(text: str, indent: str = "") -> str:

@@ -9,7 +9,6 @@ FMI 3.0.2, sections 2.4, 3.3 and 4.3.
 import math
 from collections.abc import Iterable, Sequence
 from functools import cache
-from xml.etree import ElementTree as ET
 
 import casadi as ca
 
@@ -30,7 +29,7 @@ from psa_casadi.export.common.variable_table import (
 )
 from psa_casadi.export.fixed_step.export import FixedStep
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.units import parse_unit
+from psa_casadi.units import Unit, parse_unit
 
 Key = tuple[str, int]
 
@@ -145,17 +144,20 @@ def model_description(
     `fixed` step there is no model exchange, and parameters are constants.
     """
     second, table = fmi == 2, variable_table(model)
-    said = describe(model)
+    said, span = describe(model), default_span(model)
+    size = span / 1000.0
     if fixed:
         said += (
             f" Co-simulation by a fixed step of {fixed.plan.step:g} s, of which a communication"
             f" step is a multiple; largest error {fixed.worst.error:.1e} of the range"
             f" ({fixed.worst.voltage})."
         )
-    root = ET.Element(
-        "fmiModelDescription",
-        {
-            "fmiVersion": f"{fmi}.0",
+        size = max(1, round(size / fixed.plan.step)) * fixed.plan.step
+    units = sorted({v.unit for v in table})
+    return xml_text(
+        "modelDescription.xml",
+        fmi=fmi,
+        head={
             "modelName": model.name,
             "guid" if second else "instantiationToken": token,
             "description": said,
@@ -163,34 +165,25 @@ def model_description(
             "generationTool": generation_tool(),
             "variableNamingConvention": "structured",
         },
+        events=len(model.structure.switches),
+        interfaces=_interfaces(identifier, fmi, fixed),
+        sources=sorted(sources),
+        units=_units(table),
+        types=sorted((name, unit) for unit in units if (name := _type_name(unit))),
+        categories=LOG_CATEGORIES,
+        span=number(span),
+        size=number(size),
+        variables=[
+            _variable(k, v, second=second, fixed=fixed is not None) for k, v in enumerate(table, 1)
+        ],
+        structure=_structure(model, table, second=second, fixed=fixed is not None),
     )
-    if second:
-        root.set("numberOfEventIndicators", str(len(model.structure.switches)))
-    _interfaces(root, identifier, sources, fmi, fixed)
-    _units(root, table)
-    _types(root, table, second=second)
-    categories = ET.SubElement(root, "LogCategories")
-    for name, meaning in LOG_CATEGORIES.items():
-        ET.SubElement(categories, "Category", {"name": name, "description": meaning})
-    span = default_span(model)
-    experiment = {"startTime": "0", "stopTime": number(span), "tolerance": "1e-05"}
-    size = span / 1000.0
-    if fixed:
-        size = max(1, round(size / fixed.plan.step)) * fixed.plan.step
-    ET.SubElement(root, "DefaultExperiment", {**experiment, "stepSize": number(size)})
-    variables = ET.SubElement(root, "ModelVariables")
-    for reference, variable in enumerate(table, start=1):
-        _variable(variables, reference, variable, second=second, fixed=fixed is not None)
-    structure = ET.SubElement(root, "ModelStructure")
-    _structure(structure, model, table, second=second, fixed=fixed is not None)
-    return xml_text(root)
 
 
-def _interfaces(
-    root: ET.Element, identifier: str, sources: Sequence[str], fmi: int, fixed: FixedStep | None
-) -> None:
-    """Append ModelExchange and CoSimulation: what they are capable of."""
+def _interfaces(identifier: str, fmi: int, fixed: FixedStep | None) -> dict[str, dict[str, str]]:
+    """Return ModelExchange and CoSimulation: what they are capable of."""
     always, stepping, not_fixed = _ABLE[fmi]
+    found = {}
     for tag in ("CoSimulation",) if fixed else ("ModelExchange", "CoSimulation"):
         able = (*always, *stepping) if tag == "CoSimulation" else always
         left_out = not_fixed if fixed else ()
@@ -202,31 +195,35 @@ def _interfaces(
             flags["needsCompletedIntegratorStep"] = "false"
         if fixed and fmi == 3:
             flags["fixedInternalStepSize"] = number(fixed.plan.step)
-        interface = ET.SubElement(root, tag, flags)
-        files = ET.SubElement(interface, "SourceFiles") if fmi == 2 else interface
-        for name in sorted(sources) if fmi == 2 else ():
-            ET.SubElement(files, "File", {"name": name})
+        found[tag] = flags
+    return found
 
 
-def _units(root: ET.Element, table: Iterable[Variable]) -> None:
-    """Append the UnitDefinitions: each unit in use and each display unit, sorted."""
+Attributes = dict[str, str | None]
+
+
+def _units(table: Iterable[Variable]) -> list[tuple[str, dict[str, str] | None, list[Attributes]]]:
+    """Return each unit in use, what it is in base units, and its display units, sorted."""
     displays: dict[str, set[str]] = {}
     for variable in table:
         if variable.unit:
             shown = displays.setdefault(variable.unit, set())
             shown |= {variable.display_unit} if variable.display_unit else set()
-    definitions = ET.SubElement(root, "UnitDefinitions")
+
+    def display(name: str, unit: Unit) -> Attributes:
+        other = parse_unit(name)  # value shown = factor * value + offset
+        offset = number((unit.offset - other.offset) / other.factor)
+        factor = number(float(unit.ratio / other.ratio))
+        moved = unit.offset != other.offset
+        return {"name": name, "factor": factor, "offset": offset if moved else None}
+
+    found = []
     for name in sorted(displays):
         unit = parse_unit(name)
-        element = ET.SubElement(definitions, "Unit", {"name": name})
-        if all(isinstance(power, int) for power in unit.exponents):  # FMI has no m2.5
-            ET.SubElement(element, "BaseUnit", base_unit(unit))
-        for shown_name in sorted(displays[name]):
-            other = parse_unit(shown_name)  # value shown = factor * value + offset
-            factor = number(float(unit.ratio / other.ratio))
-            display = ET.SubElement(element, "DisplayUnit", {"name": shown_name, "factor": factor})
-            if unit.offset != other.offset:
-                display.set("offset", number((unit.offset - other.offset) / other.factor))
+        whole = all(isinstance(power, int) for power in unit.exponents)  # FMI has no m2.5
+        ways = [display(other, unit) for other in sorted(displays[name])]
+        found.append((name, base_unit(unit) if whole else None, ways))
+    return found
 
 
 def _type_name(unit: str) -> str | None:
@@ -235,53 +232,36 @@ def _type_name(unit: str) -> str | None:
     return quantity.title().replace(" ", "") if quantity else None
 
 
-def _types(root: ET.Element, table: Iterable[Variable], *, second: bool) -> None:
-    definitions = ET.SubElement(root, "TypeDefinitions")
-    units = sorted({v.unit for v in table})
-    for name, unit in sorted((name, unit) for unit in units if (name := _type_name(unit))):
-        declared = {"quantity": name, "unit": unit}
-        if second:
-            simple = ET.SubElement(definitions, "SimpleType", {"name": name})
-            ET.SubElement(simple, "Real", declared)
-        else:
-            ET.SubElement(definitions, "Float64Type", {"name": name, **declared})
-
-
 def _variable(
-    parent: ET.Element, reference: int, it: Variable, *, second: bool, fixed: bool
-) -> None:
+    reference: int, it: Variable, *, second: bool, fixed: bool
+) -> tuple[Attributes, Attributes]:
+    """Return what a variable is, and what its value is."""
     constant = fixed and it.kind == "parameter"
-    head = {
+    head: Attributes = {
         "name": it.name,
         "valueReference": str(reference),
         "description": it.description,
         **_CAUSALITY["constant" if constant else it.kind],
     }
     low, high = it.bounds or (-math.inf, math.inf)
-    stated = {
-        "unit": it.unit,
+    within = not (second or fixed) and it.kind in ("state", "derivative", "input", "output")
+    return head, {
+        "unit": it.unit or None,
         "declaredType": _type_name(it.unit),
-        "displayUnit": it.display_unit,
+        "displayUnit": it.display_unit or None,
         "min": number(low) if math.isfinite(low) else None,
         "max": number(high) if math.isfinite(high) else None,
         "nominal": None if it.nominal is None else number(abs(it.nominal)),
         "start": None if it.start is None else number(it.start),
+        "intermediateUpdate": "true" if within else None,
+        "derivative": str(it.index + 2) if it.kind == "derivative" else None,
     }
-    if not (second or fixed) and it.kind in ("state", "derivative", "input", "output"):
-        stated["intermediateUpdate"] = "true"
-    if it.kind == "derivative":
-        stated["derivative"] = str(it.index + 2)
-    value = {name: text for name, text in stated.items() if text}
-    if second:
-        ET.SubElement(ET.SubElement(parent, "ScalarVariable", head), "Real", value)
-    else:
-        ET.SubElement(parent, "Float64", {**head, **value})
 
 
 def _structure(
-    parent: ET.Element, model: Model, table: Sequence[Variable], *, second: bool, fixed: bool
-) -> None:
-    """Append the unknowns by what they are, in the order of the standard.
+    model: Model, table: Sequence[Variable], *, second: bool, fixed: bool
+) -> list[tuple[str, list[Attributes]]]:
+    """Return the unknowns by what they are, in the order of the standard.
 
     An InitialUnknown knows no "tunable": there it is "dependent".
     """
@@ -291,29 +271,29 @@ def _structure(
         [key for key in places if key[0] == kind] for kind in ("output", "derivative", "indicator")
     )
     initial = sorted([*outputs, *rates], key=places.__getitem__)
-    groups = {"Outputs": outputs, "Derivatives": rates, "InitialUnknowns": initial}
-    if not second:
-        groups = {
-            "Output": outputs,
-            "ContinuousStateDerivative": rates,
-            "InitialUnknown": initial,
-            "EventIndicator": [] if fixed else indicators,
+
+    def stated(unknown: Key, *, initially: bool) -> Attributes:
+        listed = at_start[unknown] if initially else without_sampled(found[unknown])
+        known = sorted(
+            (places[key], "dependent" if initially and kind != "constant" else kind)
+            for key, kind in listed.items()
+            if not (fixed and key[0] == "parameter")
+        )
+        kinds = " ".join(kind for _, kind in known)
+        return {
+            "index" if second else "valueReference": str(places[unknown]),
+            "dependencies": " ".join(str(place) for place, _ in known),
+            "dependenciesKind": None if second and initially else kinds,
         }
-    for tag, unknowns in groups.items():
-        element = ET.SubElement(parent, tag) if second and unknowns else parent
-        initially = unknowns is initial
-        for unknown in unknowns:
-            listed = at_start[unknown] if initially else without_sampled(found[unknown])
-            known = sorted(
-                (places[key], kind)
-                for key, kind in listed.items()
-                if not (fixed and key[0] == "parameter")
-            )
-            attributes = {
-                "index" if second else "valueReference": str(places[unknown]),
-                "dependencies": " ".join(str(place) for place, _ in known),
-            }
-            if not (second and initially):
-                kinds = [k if k == "constant" or not initially else "dependent" for _, k in known]
-                attributes["dependenciesKind"] = " ".join(kinds)
-            ET.SubElement(element, "Unknown" if second else tag, attributes)
+
+    groups = (
+        ("Outputs", "Output", outputs),
+        ("Derivatives", "ContinuousStateDerivative", rates),
+        ("InitialUnknowns", "InitialUnknown", initial),
+        ("", "EventIndicator", [] if second or fixed else indicators),
+    )
+    return [
+        (old if second else new, [stated(u, initially=unknowns is initial) for u in unknowns])
+        for old, new, unknowns in groups
+        if unknowns
+    ]

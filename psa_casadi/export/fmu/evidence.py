@@ -7,7 +7,6 @@ Sources: SSP Traceability 1.0 (SRMD and its place in an FMU), FMI-LS-REF 1.0.0-b
 import math
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import numpy.typing as npt
@@ -206,8 +205,6 @@ RELATED: dict[str, Related] = {
         EXP, "experiment/uncertainty-analysis",
         "the same voltage with each parameter set, from the FMU's own start"),
 }  # fmt: skip
-_SRMD = "http://ssp-standard.org/SSPTraceability1/SimulationResourceMetaData"
-_STC = "http://ssp-standard.org/SSPTraceability1/SSPTraceabilityCommon"
 
 
 def evidence_files(model: Model, samples: int) -> dict[str, bytes]:
@@ -292,23 +289,12 @@ def evidence_page(model: Model) -> str:
 
 def meta_data(model: Model) -> str:
     """Return the SRMD file: a classification for each part of the evidence."""
-    ET.register_namespace("srmd", _SRMD)
-    ET.register_namespace("stc", _STC)
     stated = model.publication.stated
     if "version" in stated:
         stated["fileversion"] = stated.pop("version")
-    attributes = {"version": "1.0.0", "name": f"evidence of {model.name}", **stated}
-    root = ET.Element(
-        f"{{{_SRMD}}}SimulationResourceMetaData",
-        {**attributes, "generationTool": generation_tool()},
-    )
-    for name, _, said in chapters(model):
-        kind = {"type": f"psa_casadi.{name}"}
-        element = ET.SubElement(root, f"{{{_STC}}}Classification", kind)
-        for keyword, text in said:
-            entry = ET.SubElement(element, f"{{{_STC}}}ClassificationEntry", {"keyword": keyword})
-            entry.text = text
-    return xml_text(root)
+    parts = [(f"psa_casadi.{name}", said) for name, _, said in chapters(model)]
+    head = {"name": f"evidence of {model.name}", **stated, "generationTool": generation_tool()}
+    return xml_text("resourceMetaData.xml", head=head, parts=parts)
 
 
 def run_start(model: Model) -> dict[str, float]:

@@ -17,7 +17,6 @@ a period).
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +36,6 @@ INPUTS, OUTPUTS, PARAMETERS, EXPERIMENTS = "in.csv", "ref.csv", "parameters.ssv"
 #: Relative tolerance that the experiment asks for, and the one the outputs were computed to.
 TOLERANCE = 1e-6
 OWN_TOLERANCE = 1e-12
-_NAMESPACE = "http://fmi-standard.org/fmi-ls-manifest"
 _SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
 _STEPS_PER_SEGMENT = 100
 _DIGITS = 7
@@ -148,35 +146,23 @@ def experiments(
     Each has a name, a meaning, and files by what they are: "Parameters", "Stimuli" and
     "References", in this order.
     """
-    root = ET.Element("Experiments", {"name": name})
-    for title, description, files in listed:
-        attributes = {
-            "name": title,
-            "description": description,
-            "startTime": number(times[0]),
-            "stopTime": number(times[-1]),
-            "tolerance": number(TOLERANCE),
-            "stepSize": number(times[1] - times[0]),
-        }
-        experiment = ET.SubElement(root, "Experiment", attributes)
-        for tag, source in files.items():
-            ET.SubElement(experiment, tag, {"source": source})
-    return xml_text(root)
+    common = {
+        "startTime": number(times[0]),
+        "stopTime": number(times[-1]),
+        "tolerance": number(TOLERANCE),
+        "stepSize": number(times[1] - times[0]),
+    }
+    return xml_text("experiments.xml", name=name, listed=list(listed), common=common)
 
 
 def _manifest(listed: Mapping[str, Related]) -> str:
     """Return fmi-ls-manifest.xml, which lists the files: their kind, role and meaning."""
-    ET.register_namespace("fmi-ls", _NAMESPACE)
-    said = "Layered Standard providing information on related files included in an FMU."
-    name = {"name": "org.fmi-standard.fmi-ls-ref", "version": "1.0.0-beta.1", "description": said}
-    attributes = {f"{{{_NAMESPACE}}}fmi-ls-{key}": value for key, value in name.items()}
-    root = ET.Element("fmiReferences", attributes)
+    related = []
     for place, (kind, role, meaning) in listed.items():
         inside = place.startswith(f"{FOLDER}/")
         source = place.removeprefix(f"{FOLDER}/") if inside else f"../../{place}"
-        file = {"type": kind, "source": source, "role": role, "description": meaning}
-        ET.SubElement(root, "Related", file)
-    return xml_text(root)
+        related.append({"type": kind, "source": source, "role": role, "description": meaning})
+    return xml_text("fmi-ls-manifest.xml", related=related)
 
 
 #: Error that the step must meet, over the range of the output.

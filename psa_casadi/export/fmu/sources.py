@@ -13,7 +13,6 @@ import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 import casadi as ca
 import numpy as np
@@ -96,13 +95,8 @@ def source_files(
     flags = " ".join(OPTIMISE)
     texts["README.txt"] = _README.format(name=identifier, flags=flags, files=" ".join(names))
     texts[SOURCES_NOTICE] = code_license()
-    root = ET.Element("fmiBuildDescription", {"fmiVersion": "3.0"})  # which FMI 2 ignores
-    configuration = ET.SubElement(root, "BuildConfiguration", {"modelIdentifier": identifier})
-    group = ET.SubElement(configuration, "SourceFileSet", {"language": "C99"})
-    for name in names:
-        ET.SubElement(group, "SourceFile", {"name": name})
-    ET.SubElement(configuration, "Library", {"name": "m"})
-    texts["buildDescription.xml"] = xml_text(root)
+    build = "buildDescription.xml"  # which FMI 2 ignores
+    texts[build] = xml_text(build, identifier=identifier, names=names)
     return {n: t.replace("\r\n", "\n") for n, t in texts.items()}
 
 

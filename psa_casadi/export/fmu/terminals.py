@@ -4,7 +4,6 @@ Source: FMI 3.0.2, section 2.4.9 (terminals and icons).
 """
 
 from typing import NamedTuple
-from xml.etree import ElementTree as ET
 
 from psa_casadi.export.common.icon import ICONS, drawing_of, png, svg
 from psa_casadi.export.common.markup import xml_text
@@ -57,24 +56,11 @@ def terminals_of(model: Model) -> tuple[Terminal, ...]:
 
 def terminals_and_icons(model: Model) -> str:
     """Return the XML text of terminalsAndIcons.xml."""
-    root = ET.Element("fmiTerminalsAndIcons", {"fmiVersion": "3.0"})
-    drawing = ET.SubElement(root, "GraphicalRepresentation")
-    corners = {"x1": "-100", "y1": "-100", "x2": "100", "y2": "100"}
-    ET.SubElement(drawing, "CoordinateSystem", {**corners, "suggestedScalingFactorTo_mm": "0.1"})
-    ET.SubElement(drawing, "Icon", corners)
-    terminals = terminals_of(model)
-    listed = ET.SubElement(root, "Terminals") if terminals else root
-    for t in terminals:
-        head = {"name": t.name, "matchingRule": "plug", "description": t.description}
-        element = ET.SubElement(listed, "Terminal", head)
-        for variable, member, kind in t.members:
-            names = {"variableName": variable, "memberName": member, "variableKind": kind}
-            ET.SubElement(element, "TerminalMemberVariable", names)
-        wire = {"defaultConnectionColor": _COLOURS[t.icon], "defaultConnectionStrokeSize": "1"}
-        place = {"x1": f"{t.side - 10:g}", "y1": "-10", "x2": f"{t.side + 10:g}", "y2": "10"}
-        drawn = {**wire, **place, "iconBaseName": t.icon}
-        ET.SubElement(element, "TerminalGraphicalRepresentation", drawn)
-    return xml_text(root)
+    drawn = [
+        (t, {"x1": f"{t.side - 10:g}", "y1": "-10", "x2": f"{t.side + 10:g}", "y2": "10"})
+        for t in terminals_of(model)
+    ]
+    return xml_text("terminalsAndIcons.xml", terminals=drawn, colours=_COLOURS)
 
 
 def terminal_entries(model: Model) -> dict[str, bytes]:
