@@ -19,6 +19,7 @@ import casadi as ca
 
 from psa_casadi.cache import cached
 from psa_casadi.errors import InputError, MachineError
+from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import (
     c_arguments,
@@ -144,17 +145,13 @@ def _config(structure: Structure, by_input: ca.Function, *, exact: bool) -> str:
         "GAINS": len(gains), "SZ_ARG": max(4, by_input.sz_arg()), "SZ_RES": by_input.sz_res(),
         "SZ_IW": max(1, by_input.sz_iw()), "SZ_W": max(1, by_input.sz_w()),
     }  # fmt: skip
-    lists = {
-        "memory": [int(q.memory) for q in s.states],
-        "settles": [int(q.settles) for q in s.states],
-        "gains": gains,
+    arrays = {
+        "page_memory": [int(q.memory) for q in s.states],
+        "page_settles": [int(q.settles) for q in s.states],
+        "page_gains": gains,
     }
-    lines = ["#ifndef PAGE_CONFIG_H", "#define PAGE_CONFIG_H"]
-    lines += [f"#define PAGE_{name} {value}" for name, value in numbers.items()]
-    for name, values in lists.items():
-        body = ", ".join(map(str, [*values, 0]))
-        lines.append(f"static const int page_{name}[] __attribute__((unused)) = {{{body}}};")
-    return "\n".join([*lines, "#endif", ""])
+    defined = {f"PAGE_{name}": value for name, value in numbers.items()}
+    return filled("config.h", guard="PAGE_CONFIG_H", defined=defined, arrays=arrays)
 
 
 def _compile(work: Path, texts: Mapping[str, str]) -> Path:

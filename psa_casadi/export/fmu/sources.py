@@ -20,6 +20,7 @@ import numpy as np
 from psa_casadi.component import Expression
 from psa_casadi.export.common.markup import at_rest, xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
+from psa_casadi.export.common.templates import filled
 from psa_casadi.export.common.variable_table import starts_at_voltage, variable_table
 from psa_casadi.export.fixed_step.code import bounded, function_code, limit_words
 from psa_casadi.export.fixed_step.export import STEPS, FixedStep, shown_output
@@ -134,20 +135,17 @@ def _derivatives(structure: Structure) -> tuple[ca.Function, ca.Function]:
 
 
 def _config(model: Model, functions: Sequence[ca.Function], fixed: FixedStep | None) -> str:
-    sizes = {
-        "ARG": max(8, *(f.sz_arg() for f in functions)),
-        "RES": max(4, *(f.sz_res() for f in functions)),
-        "IW": max(1, *(f.sz_iw() for f in functions)),
-        "W": max(1, *(f.sz_w() for f in functions)),
-    }
-    lines = [f"#define PSA_DERIVATIVES_SZ_{name} {size}" for name, size in sizes.items()]
     place = model.input_names.index("voltage") if starts_at_voltage(model) else -1
-    lines.append(f"#define PSA_VOLTAGE ({place})")
+    defined = {
+        f"PSA_DERIVATIVES_SZ_{n}": max(least, *(getattr(f, f"sz_{n.lower()}")() for f in functions))
+        for n, least in (("ARG", 8), ("RES", 4), ("IW", 1), ("W", 1))
+    }
+    defined["PSA_VOLTAGE"] = f"({place})"
     if fixed:
-        lines.append(f"#define PSA_FIXED_STEP {fixed.plan.step!r}")
+        defined["PSA_FIXED_STEP"] = repr(fixed.plan.step)
     if fixed and bounded(fixed.plan):
-        lines.append(f"#define PSA_FIXED_LIMIT {fixed.plan.limit!r}")
-    return "\n".join(["#ifndef PSA_FMI_CONFIG_H", "#define PSA_FMI_CONFIG_H", *lines, "#endif", ""])
+        defined["PSA_FIXED_LIMIT"] = repr(fixed.plan.limit)
+    return filled("config.h", guard="PSA_FMI_CONFIG_H", defined=defined, arrays={})
 
 
 def _number(value: float) -> str:
@@ -171,49 +169,32 @@ def _data(model: Model, identifier: str, token: str) -> str:
     def starts(*kinds: str) -> list[float]:
         return [v.start or 0.0 for kind in kinds for v in table if v.kind == kind]
 
-    def array(kind: str, name: str, size: str, items: Iterable[str], last: str) -> str:
-        body = ", ".join([*items, last])
-        return f"const {kind} psa_{name}[PSA_{size} + 1] = {{{body}}};"
+    def numbers(values: Sequence[float]) -> list[str]:
+        return [*map(_number, values), "0.0"]
 
-    def vector(name: str, size: str, values: Iterable[float]) -> str:
-        return array("double", name, size, map(_number, values), "0.0")
-
+    usual = [abs(q) for q in model.state_nominals()]
     nominals = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
-    kinds = ["STAYS" if not q.settles else "SETTLES" for q in s.states]
-    memory = [
-        f"PSA_MEMORY_{kind if q.memory else 'NONE'}"
-        for kind, q in zip(kinds, s.states, strict=True)
-    ]
+    kinds = [("SETTLES" if q.settles else "STAYS") if q.memory else "NONE" for q in s.states]
     gains = {c.gain for c in model.effects}
     seen = [f"{{{', '.join(map(_number, row))}}}" for row in seen_inputs(model)]
-    duration = model.evidence.seen.duration if model.evidence else math.inf
-    lines = [
-        '#include "fmi_data.h"',
-        "",
-        "#include <math.h>",
-        "",
-        f'const char psa_token[] = "{token}";',
-        f'const char psa_model_identifier[] = "{identifier}";',
-        "const psa_variable psa_variables[PSA_VARIABLES] = {",
-    ]
-    for v in table:
-        low, high = map(_number, v.bounds or (-math.inf, math.inf))
-        lines.append(f'    {{"{v.name}", PSA_{v.kind.upper()}, {v.index}, {low}, {high}}},')
-    return "\n".join([
-        *lines,
-        "};",
-        vector("start_states", "NX", starts("state")),
-        vector("start_inputs", "NU", starts("input")),
-        vector("start_parameters", "HELD", starts("parameter", "sampled")),
-        vector("state_nominals", "NX", [abs(q) for q in model.state_nominals()] or [1.0]),
-        vector("told_nominals", "NX", nominals or [1.0]),
-        array("int", "memory", "NX", memory, "0"),
-        array("int", "gains", "NP", (str(int(n in gains)) for n in model.parameter_names), "0"),
-        vector("switch_scales", "NZ", switch_scales(model, nominals)),
-        array("psa_range", "seen", "NU", seen, "{0.0, 0.0, 0.0}"),
-        f"const double psa_seen_duration = {_number(duration)};",
-        "",
-    ])  # fmt: skip
+    return filled(
+        "fmi_data.c",
+        token=token,
+        identifier=identifier,
+        table=[(v, *map(_number, v.bounds or (-math.inf, math.inf))) for v in table],
+        arrays=(
+            ("double", "start_states", "NX", numbers(starts("state"))),
+            ("double", "start_inputs", "NU", numbers(starts("input"))),
+            ("double", "start_parameters", "HELD", numbers(starts("parameter", "sampled"))),
+            ("double", "state_nominals", "NX", numbers(usual or [1.0])),
+            ("double", "told_nominals", "NX", numbers(nominals or [1.0])),
+            ("int", "memory", "NX", [*(f"PSA_MEMORY_{kind}" for kind in kinds), "0"]),
+            ("int", "gains", "NP", [*(str(int(n in gains)) for n in model.parameter_names), "0"]),
+            ("double", "switch_scales", "NZ", numbers(switch_scales(model, nominals))),
+            ("psa_range", "seen", "NU", [*seen, "{0.0, 0.0, 0.0}"]),
+        ),
+        duration=_number(model.evidence.seen.duration if model.evidence else math.inf),
+    )
 
 
 #: Where an FMU carries the step [s], its substeps and the measured errors by voltage.
