@@ -1,14 +1,13 @@
 """`psa effects`: what real stacks do that the base model does not."""
 
 import contextlib
-import difflib
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Given, similar
 from psa_casadi.cli.options import names
 from psa_casadi.cli.screen import show, show_table, tell_written, width
 
@@ -50,8 +49,7 @@ def effects(
             f" `psa effects {next(iter(known))} --figure {figure}`."
         )
     if name is not None and wanted not in known:
-        near = difflib.get_close_matches(wanted, known, n=3, cutoff=0.4)
-        meant = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}."
+        meant = similar(wanted, known, f"there are {', '.join(known)}.")
         given.add(f"There is no effect named '{name}'; {meant}")
     given.check()
     if name is None and quiet:

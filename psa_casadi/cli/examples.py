@@ -1,13 +1,12 @@
 """`psa examples`: worked examples and recipes for other tools, shown, copied or run."""
 
-import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Given, similar
 from psa_casadi.cli.options import names
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.files import make_folder
@@ -37,8 +36,7 @@ def examples(
         given.add("--copy-only needs a folder to copy to; name it with -o.")
     wanted = (name or "").strip().lower().replace("-", "_").removesuffix(".py").removesuffix(".md")
     if name is not None and wanted not in known:
-        near = difflib.get_close_matches(wanted, known, n=3, cutoff=0.4)
-        meant = f"did you mean {' or '.join(near)}?" if near else "`psa examples` lists them."
+        meant = similar(wanted, known, "`psa examples` lists them.")
         given.add(f"There is no example or recipe named '{name}'; {meant}")
     given.check()
     if name is None and quiet:

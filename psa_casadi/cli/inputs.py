@@ -278,6 +278,12 @@ def meant(word: str, known: Iterable[str]) -> str:
     return f"is '{near[0]}' meant? " if near else ""
 
 
+def similar(word: str, known: Iterable[str], otherwise: str) -> str:
+    """Return the question which of the known words is meant, or what is said where none is like."""
+    near = difflib.get_close_matches(word, list(known), n=3, cutoff=0.4)
+    return f"did you mean {' or '.join(near)}?" if near else otherwise
+
+
 def step_seconds(text: str) -> float:
     """Return the time [s] of a step that is given as a number with its unit; none is guessed.
 
