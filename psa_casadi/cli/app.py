@@ -4,6 +4,7 @@ import inspect
 import shlex
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -31,25 +32,16 @@ from psa_casadi.cli.web import web
 from psa_casadi.command_line import typed
 from psa_casadi.version import __version__
 
-app = typer.Typer(
+_group = partial(typer.Typer, no_args_is_help=True, rich_markup_mode=None)
+app = _group(
     name="psa",
     help="Models of piezoelectric stack actuators: identify, diagnose what is missing, export.",
     epilog="Start with: psa demo",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-export = typer.Typer(
-    help="Write a model in a format that other tools read.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
-design = typer.Typer(
-    help="Design an experiment, a voltage for a path, or a mounting.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
+export = _group(help="Write a model in a format that other tools read.")
+design = _group(help="Design an experiment, a voltage for a path, or a mounting.")
 
 
 def _print_version(wanted: bool) -> None:

@@ -123,9 +123,7 @@ def experiment(
             given.add(sentence)
     limits = given.attempt(lambda: _limits(chosen, records, input_ or [], wanted))
     level = given.attempt(lambda: _noise(chosen, noise or []))
-    given.check()
-    if chosen is None or not limits:
-        return
+    chosen, limits = given.ready(chosen), given.ready(limits)
     with working("designing an experiment", given.quiet) as progress:
         design = design_experiment(
             chosen, limits, records=records, separate=effects, parameters=parameter or [],

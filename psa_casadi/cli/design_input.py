@@ -62,10 +62,8 @@ def input_(
     path = given.attempt(lambda: read_target(target)) if target is not None else None
     trial = given.records([measured], Reading()) if measured is not None else []
     chosen = given.model_or_stack(model, stack)
-    given.check()
-    if chosen is None or limits is None:
-        return
-    task = runs.Task(chosen.plant(), limits, output, report, still, check_fmu, given.quiet)
+    plant, limits = given.ready(chosen).plant(), given.ready(limits)
+    task = runs.Task(plant, limits, output, report, still, check_fmu, given.quiet)
     if move is not None:
         runs.move(task, move)
     elif path is not None and trial:

@@ -65,13 +65,11 @@ def mechanism(
     limits = Limits(loss or 0.0, max_force, (min_mass, max_mass), (0.0, max_damping))
     if wanted is not None:
         given.attempt(lambda: check_goals(damping, bandwidth, wanted, limits, starts))
-    given.check()
-    if chosen is None or wanted is None:
-        return
+    chosen, goals = given.ready(chosen), given.ready(wanted)
     with working("designing", given.quiet) as progress:
         progress(f"{starts} starts")
         design = psa.design_mechanism(
-            chosen, damping=damping, bandwidth=bandwidth, poles=wanted, limits=limits,
+            chosen, damping=damping, bandwidth=bandwidth, poles=goals, limits=limits,
             acts_on=acts_on, starts=starts,
         )  # fmt: skip
     psa.save_model(psa.mechanism_model(design), output)

@@ -53,21 +53,19 @@ def c(
         base = chosen = given.model_or_stack(model, stack, any_model=True)
     if part is not None and seconds is not None and bool(model or stack) == (base is not None):
         chosen = given.attempt(lambda: psa.part_for(part, base, period=seconds))
-    chosen = given.published(given.started(chosen, start), published)
-    given.check()
-    if chosen is None or seconds is None:
-        return
+    chosen = given.ready(given.published(given.started(chosen, start), published))
+    period = given.ready(seconds)
     with working("generating", given.quiet) as progress:
         progress("compiling and comparing")
         found = psa.export_c(
-            chosen, output, step=seconds, precision=precision, name=name,
+            chosen, output, step=period, precision=precision, name=name,
             include_sensor=include_sensor, hold=hold, substeps=substeps,
         )  # fmt: skip
     _show_inside(chosen, include_sensor, given.quiet)
     for note in chosen.provenance.notes if part else ():
         show(note, given.quiet)
     errors = {e.voltage: e.error for e in found.errors}
-    _show_step(f"{seconds:g} s", found.substeps, precision, errors, found.limit, given.quiet)
+    _show_step(f"{period:g} s", found.substeps, precision, errors, found.limit, given.quiet)
     tell_written(found.header, found.source, quiet=given.quiet)
 
 
@@ -146,10 +144,8 @@ def fmu(
         else None
     )
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
-    chosen = given.published(given.started(chosen, start), published)
-    given.check()
-    if chosen is None or targets is None:
-        return
+    chosen = given.ready(given.published(given.started(chosen, start), published))
+    targets = given.ready(targets)
     with working("compiling", given.quiet) as progress:
         progress(", ".join(t.name for t in targets))
         psa.export_fmu(
@@ -226,10 +222,7 @@ def modelica(
 
     given.outputs({"--output": output}, [model])
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
-    chosen = given.published(given.started(chosen, start), published)
-    given.check()
-    if chosen is None:
-        return
+    chosen = given.ready(given.published(given.started(chosen, start), published))
     psa.export_modelica(chosen, output, name=name, include_sensor=include_sensor)
     kept = _show_inside(chosen, include_sensor, given.quiet)
     show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", given.quiet)

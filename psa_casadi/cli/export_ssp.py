@@ -1,5 +1,6 @@
 """`psa export ssp`: a closed-loop nanopositioner around a stack as an SSP archive."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -47,10 +48,9 @@ def ssp(
     chosen = given.published(chosen, published)
     system = None
     if chosen is not None:
-        system = given.attempt(lambda: psa.nanopositioner(chosen, compensated=not no_compensator))
-    given.check()
-    if chosen is None or system is None:
-        return
+        made = partial(psa.nanopositioner, chosen, compensated=not no_compensator)
+        system = given.attempt(made)
+    chosen, system = given.ready(chosen), given.ready(system)
     with working("compiling", given.quiet) as progress:
         progress(", ".join(system.parts))
         psa.export_ssp(system, output, platforms=wanted, publication=chosen.publication)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import psa_casadi as psa
 from psa_casadi.cli.options import Published, Reading, Start
@@ -69,6 +69,11 @@ class Given:
         """Raise an `InputError` with all problems, if there are any."""
         if self._problems or self._misfits:
             raise InputError([*self._problems, *self._misfits])
+
+    def ready(self, value: T | None) -> T:
+        """Return what was read, None only with a problem; raises all of these as `check`."""
+        self.check()
+        return cast("T", value)
 
     def records(
         self, paths: Sequence[Path], reading: Reading, held_out: Sequence[Path] = ()

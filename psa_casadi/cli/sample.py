@@ -72,9 +72,7 @@ def sample(
     else:
         measured = given.records(records, reading)
         start = given.model_or_stack(model, stack)
-    given.check()
-    if start is None:
-        return
+    start = given.ready(start)
     with working("sampling", given.quiet) as progress:
         found = psa.sample(
             start, measured, prior=centres, widths=widths, chains=chains, draws=draws, tune=tune,

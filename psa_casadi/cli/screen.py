@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -16,6 +16,11 @@ from psa_casadi.cli.steps import PLAIN, Course, Told
 
 if TYPE_CHECKING:
     from psa_casadi.report.words.tables import Table
+
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="No progress and no summary; errors still show.")
+]
+
 
 def width() -> int:
     """Return the columns to write in: the terminal's up to 110, or 80 where there is none."""

@@ -58,9 +58,7 @@ def simulate(
     values, starts = given.numbers("--value", value), given.numbers("--start", start)
     if chosen is not None:
         chosen = given.attempt(partial(_begun, chosen, values, starts))
-    given.check()
-    if chosen is None or record is None:
-        return
+    chosen, record = given.ready(chosen), given.ready(record)
     with working("simulating", given.quiet):
         inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
         if isinstance(record, psa.Record):

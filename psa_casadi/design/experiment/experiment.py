@@ -4,7 +4,7 @@ import math
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import scipy
@@ -58,12 +58,19 @@ class Pair:
     usual: Mapping[str, float]
 
 
-class Designed(Protocol):
-    """What all designed records have."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Designed:
+    """What all designed records have: inputs to play and no outputs, and how they were found.
 
-    @property
-    def record(self) -> Signals:
-        """The planned record: inputs and no outputs."""
+    `kind` is the family of the inputs, `limits` are those of every one.
+    """
+
+    record: Signals
+    kind: str
+    limits: Mapping[str, Limits]
+    rivals: tuple[Rival, ...]
+    evaluations: int
+    seconds: float
 
 
 def columns_to_play(design: Designed) -> dict[str, FloatArray]:
@@ -72,28 +79,21 @@ def columns_to_play(design: Designed) -> dict[str, FloatArray]:
     return with_units({"time": record.time, **record.columns}, {"time": "s", **record.units})
 
 
-@dataclass(frozen=True, eq=False)
-class Separated:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Separated(Designed):
     """A record that tells effects apart.
 
-    `record` has the inputs to play and no outputs, of the family `kind` ("sine" or "triangle" where
-    no designed one was better); `limits` are those of every input; `chance` is for each
+    Its `kind` is "sine" or "triangle" where no designed one was better; `chance` is for each
     effect the probability that a diagnosis of the data at hand with the record names it alone if it
     is the cause, as the rivals' fits predict it; `usual_chance` the same with sine and triangle.
     `plays` is how often the record must be played, each time from rest, until every chance is at
     least 90 %; None where `PLAYS[-1]` times are not enough.
     """
 
-    record: Signals
-    kind: str
-    limits: Mapping[str, Limits]
-    rivals: tuple[Rival, ...]
     pairs: tuple[Pair, ...]
     chance: Mapping[str, float]
     usual_chance: Mapping[str, Mapping[str, float]]
     plays: int | None
-    evaluations: int
-    seconds: float
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -106,8 +106,8 @@ class Separated:
         return least / max(min(p.usual[usual] for p in self.pairs), 1e-12)
 
 
-@dataclass(frozen=True, eq=False)
-class Informative:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Informative(Designed):
     """A record that sharpens parameters.
 
     `intervals` are the predicted 95 % intervals with it (and the data at hand), `before` those
@@ -116,16 +116,10 @@ class Informative:
     amplitude.
     """
 
-    record: Signals
-    kind: str
-    limits: Mapping[str, Limits]
-    rivals: tuple[Rival, ...]
     optimality: Optimality
     intervals: Mapping[str, tuple[float, float]]
     before: Mapping[str, tuple[float, float]]
     factor: Mapping[str, float]
-    evaluations: int
-    seconds: float
 
 
 #: Chance to be named from which on no better voltage is looked for, at distances this many times

@@ -170,21 +170,16 @@ class Response:
     force: FloatArray
 
 
-def step_response(
-    mechanics: Mechanics, mounting: Mounting, time: FloatArray, *, amplifier: bool = True
-) -> Response:
+def step_response(mechanics: Mechanics, mounting: Mounting, time: FloatArray) -> Response:
     """Return the linear answer to a step of the rated voltage, by partial fractions.
 
     `x(t) = sum_i R_i (e^(s_i t) - 1)/s_i` over the poles s_i of (45), with the drive's pole
-    -1/(R_s C_p) unless `amplifier` is False (the voltage at the electrodes then jumps). `force` is
-    `m x'' + c x' + k x`, what the mechanism takes. Poles must be simple; equal ones are taken apart
-    by a millionth.
+    -1/(R_s C_p). `force` is `m x'' + c x' + k x`, what the mechanism takes. Poles must be simple;
+    equal ones are taken apart by a millionth.
     """
-    poles = [*mechanical_poles(mechanics, mounting), -1.0 / mechanics.lag]
+    poles = [*mechanical_poles(mechanics, mounting), -1.0 / mechanics.lag, -1.0 / mechanics.drive]
     gain = mechanics.force / (closed_polynomial(mechanics, mounting)[0] * mechanics.lag)
-    if amplifier:
-        poles.append(-1.0 / mechanics.drive)
-        gain /= mechanics.drive
+    gain /= mechanics.drive
     s = _simple(np.array(poles, dtype=np.complex128))
     motion = np.zeros((3, len(time)))
     for i, pole in enumerate(s):

@@ -169,14 +169,13 @@ class LinearMove:
         decay = np.exp(-h / (p["R_s"] * p["C_p"]))
         later = 1.0 - p["R_s"] * p["C_p"] / h * (1.0 - decay)
         before = 1.0 - decay - later
-        u, free = np.zeros((self.n, self.n)), np.zeros(self.n)
-        row, left = np.zeros(self.n), self.rest
-        for k in range(self.n):
-            row, left = decay * row, decay * left + (before * self.rest if k == 0 else 0.0)
-            if k:
-                row[k - 1] += before
-            row[k] += later
-            u[k], free[k] = row, left
+        upper, lower, rest = (
+            [later, before],
+            [1.0, -decay],
+            [decay * self.rest + before * self.rest],
+        )
+        u = scipy.signal.lfilter(upper, lower, np.eye(self.n), axis=0)
+        free = scipy.signal.lfilter(upper, lower, np.zeros(self.n), zi=rest)[0]
         scale = p["G"] / p["R_s"]
         return scale * (np.eye(self.n) - u), -scale * free
 
