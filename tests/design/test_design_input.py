@@ -117,9 +117,8 @@ def test_a_quickest_move_is_near_the_bound_of_the_linear_part(payload: float) ->
 
 @slow
 def test_a_quickest_move_is_near_what_hysteresis_and_creep_allow() -> None:
-    """Downwards; the moves above go up."""
+    """Downwards that is 21 % over the bound of the linear part; a bang-bang move has no ramps."""
     begin, end = 10e-6, 2e-6
-    """Downward that is 21 % over the bound of the linear part; a bang-bang move has no ramps."""
     model = scanner(0.0)
     found = quickest_move(model, begin, end, LIMITS)
     own = own_bang_bang(model, found)

@@ -15,12 +15,10 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import casadi as ca
-import fmpy
 import matplotlib.image
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fmpy.validation import validate_fmu
 from lxml import etree  # type: ignore[import-untyped]
 
 import psa_casadi as psa
@@ -113,22 +111,6 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     own = replace(linux, target=None)  # a machine's own compiler may change without a new name
     found |= {compile_library(texts, "psa", own) for _ in range(2)}
     assert len(found) == len(calls) == 7
-
-
-@pytest.mark.usefixtures("without_binary")
-@pytest.mark.parametrize(
-    "name", slow_but([STACK, "flexure"], [STACK, "PTBS200", "flexure", "single_mass"])
-)
-def test_archives_are_valid(name: str, tmp_path: Path) -> None:
-    """What is checked are the description and the list of sources."""
-    model = model_named(name)
-    for fmi in (2, 3):
-        path = tmp_path / f"{fmi}.fmu"
-        psa.export_fmu(model, path, name="m", fmi=fmi, include_sensor=True)
-        assert validate_fmu(str(path)) == []
-        description = fmpy.read_model_description(str(path))
-        assert description.fmiVersion == f"{fmi}.0"
-        assert len(description.modelVariables) == len(variable_table(model))
 
 
 @pytest.mark.usefixtures("without_binary")
@@ -324,9 +306,6 @@ def table(content: bytes) -> Table:
     names, *rows = content.decode().splitlines()
     columns = np.array([[float(v) for v in row.split(",")] for row in rows]).T
     return dict(zip(names.split(","), columns, strict=True))
-
-
-# Parameter sets
 
 
 # The reference run
