@@ -100,7 +100,7 @@ class Box:
 class Layout:
     """A drawing: its extent, the boxes, the places of all ports, and the way of each wire.
 
-    `paths` holds the corners of each wire, both ends included, in the order of the wires.
+    `paths` holds the corners of each wire, both ends included, in the order of the wiring's.
     """
 
     lower: float
@@ -108,7 +108,6 @@ class Layout:
     width: float
     boxes: tuple[Box, ...]
     places: Mapping[Port, Point]
-    wires: tuple[Wire, ...]
     paths: tuple[tuple[Point, ...], ...]
 
     def relative(self, port: Port) -> Point:
@@ -151,7 +150,7 @@ def layout_of(wiring: WiredParts) -> Layout:
         paths.append(_corners(corners))
     heights = [y for path in paths for _, y in path]
     lower, upper = min([*heights, bottom]) - _PITCH, max([*heights, 0.0]) + _PITCH
-    return Layout(lower, upper, width, boxes, places, wiring.wires, tuple(paths))
+    return Layout(lower, upper, width, boxes, places, tuple(paths))
 
 
 def _routes(wiring: WiredParts) -> tuple[list[tuple[tuple[int, int], tuple[int, int]]], list[int]]:
@@ -236,7 +235,7 @@ def _figure(wiring: WiredParts, layout: Layout) -> Figure:
     axes.set_ylim(bottom, bottom + height)
     axes.set_axis_off()
     order = {b.name: k for k, b in enumerate(layout.boxes)}
-    for w, path in zip(layout.wires, layout.paths, strict=True):  # what leads back stands out
+    for w, path in zip(wiring.wires, layout.paths, strict=True):  # what leads back stands out
         back = order.get(w.end.part, len(order)) <= order.get(w.start.part, -1)
         axes.plot(*zip(*path, strict=True), color=_FEEDBACK if back else _LANE, linewidth=1.4)
     style: dict[str, Any] = {"va": "center", "color": _INK, "zorder": 4}
@@ -292,45 +291,22 @@ def structure_description(
     OMSimulator reads, and without which it opens no archive. A SystemGeometry is one that it
     refuses; without it the drawing extends over all elements, as the standard has it.
     """
-
-    def connection(wire: Wire, path: Sequence[Point]) -> tuple[dict[str, str], list[str]]:
-        """Return the ends of a wire, and the coordinates of its inner corners."""
-        ends = {}
-        for side, port in (("start", wire.start), ("end", wire.end)):
-            if port.part != OUTSIDE:
-                ends[f"{side}Element"] = port.part
-            ends[f"{side}Connector"] = port.name
-        return ends, [" ".join(map(_place, along)) for along in zip(*path[1:-1], strict=True)]
-
-    def ports(part: str) -> list[tuple[str, ...]]:
-        found = [(Port(part, name), kind) for name, kind in wiring.ports(part)]
-        return [
-            (p.name, kind, wiring.unit(p), *map(_place, layout.relative(p))) for p, kind in found
-        ]
-
-    parts = [
-        {
-            "name": box.name,
-            "about": markup.describe(wiring.parts[box.name]),
-            "ports": ports(box.name),
-            "corners": {n: _place(getattr(box, n)) for n in ("x1", "y1", "x2", "y2")},
-        }
-        for box in layout.boxes
-    ]
     used = {wiring.unit(port) for wire in wiring.wires for port in (wire.start, wire.end)} - {""}
     names = (name.replace("_", " ") for name in wiring.parts)
     text = filled(
         "SystemStructure.ssd",
-        name=wiring.name,
+        wiring=wiring,
+        layout=layout,
+        bindings=bindings,
         published={
             _PUBLISHED.get(name, name): said for name, said in wiring.publication.stated.items()
         },
         tool=markup.generation_tool(),
         about=f"{wiring.name.replace('_', ' ')}: {', '.join(names)}",
-        ports=ports(OUTSIDE),
-        bindings=bindings,
-        parts=parts,
-        wires=[connection(*pair) for pair in zip(layout.wires, layout.paths, strict=True)],
+        port=Port,
+        place=_place,
+        describe=markup.describe,
+        wires=list(zip(wiring.wires, layout.paths, strict=True)),
         step=_decimal(step),
         tolerance=_decimal(TOLERANCE),
         units={name: markup.base_unit(parse_unit(name)) for name in sorted(used)},
@@ -346,8 +322,8 @@ def _decimal(value: float) -> str:
     return f"{value:.15f}".rstrip("0")
 
 
-def _place(value: float) -> str:
-    return f"{round(value, 6):.6g}"
+def _place(*values: float) -> str:
+    return " ".join(f"{round(value, 6):.6g}" for value in values)
 
 
 _FOLDER = "resources"

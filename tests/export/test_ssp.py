@@ -110,10 +110,11 @@ def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
 
 
 def test_no_wire_runs_through_a_part_or_on_another_wire() -> None:
-    layout = layout_of(wiring_of(closed_loop()))
+    wiring = wiring_of(closed_loop())
+    layout = layout_of(wiring)
     pieces = [
         (wire, *np.sort(ends, axis=0))
-        for wire, path in zip(layout.wires, layout.paths, strict=True)
+        for wire, path in zip(wiring.wires, layout.paths, strict=True)
         for ends in pairwise(path)
     ]
     for wire, low, high in pieces:
