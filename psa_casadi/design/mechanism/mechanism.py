@@ -6,11 +6,7 @@ from math import inf, isfinite
 
 import numpy as np
 
-from psa_casadi.components.surroundings import (
-    PRESTRESS_MECHANISM,
-    PRESTRESS_MOUNTS,
-    PRESTRESS_PORT,
-)
+from psa_casadi.components.surroundings import PRESTRESS_MECHANISM, PRESTRESS_MOUNTS, PRESTRESS_PORT
 from psa_casadi.design.mechanism.loop import (
     ComplexArray,
     Mechanics,

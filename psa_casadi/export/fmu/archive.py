@@ -14,20 +14,10 @@ from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text, re
 from psa_casadi.export.fixed_step.export import FixedStep, fixed_step
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.documentation import documentation
-from psa_casadi.export.fmu.evidence import (
-    evidence_files,
-    related_files,
-    with_validity,
-)
+from psa_casadi.export.fmu.evidence import evidence_files, related_files, with_validity
 from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
 from psa_casadi.export.fmu.reference_run import held_step, reference_entries
-from psa_casadi.export.fmu.sources import (
-    FACES,
-    FIXED_ENTRY,
-    exported_texts,
-    fixed_entry,
-    use_of,
-)
+from psa_casadi.export.fmu.sources import FACES, FIXED_ENTRY, exported_texts, fixed_entry, use_of
 from psa_casadi.export.fmu.terminals import terminal_entries
 from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model

@@ -14,13 +14,7 @@ import numpy as np
 from psa_casadi.component import Component, Equations, Expression, FmuUsed, Symbols
 from psa_casadi.errors import InputError, Problems, PsaError, quoted
 from psa_casadi.export.importer.fmu import Fmu
-from psa_casadi.export.importer.imported import (
-    Imported,
-    Selected,
-    digest_of,
-    imported_of,
-    opened,
-)
+from psa_casadi.export.importer.imported import Imported, Selected, digest_of, imported_of, opened
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
