@@ -20,8 +20,7 @@ from psa_casadi.cli.design_mechanism import mechanism
 from psa_casadi.cli.diagnose import diagnose
 from psa_casadi.cli.effects import effects
 from psa_casadi.cli.examples import examples
-from psa_casadi.cli.export import c, fmu, modelica
-from psa_casadi.cli.export_ssp import ssp
+from psa_casadi.cli.export import c, fmu, modelica, ssp
 from psa_casadi.cli.failures import guarded, prepare
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.options import command
