@@ -19,12 +19,10 @@ import pytest
 
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import (
-    CO_SIMULATION,
     DISCARD,
     ERROR,
     MODEL_EXCHANGE,
     OK,
-    Fmu,
     Instance,
 )
 from psa_casadi.model.compose import Model
@@ -93,26 +91,6 @@ def _worst(found: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
     effects = np.abs(truth * scales)
     rows = np.maximum(effects.max(axis=1), 1e-300)
     return float((np.abs((found - truth) * scales) / rows[:, None]).max())
-
-
-def test_both_versions_interfaces_and_directions_agree_at_a_point() -> None:
-    """That they are exact: `test_jacobians`, and `psa check` for the indicators."""
-    name = MODELS[0]
-    kinds, point = _names(name), _point(name)
-    unknowns = [*kinds["derivative"], *kinds["output"], *kinds["indicator"]]
-    knowns = [*kinds["state"], *kinds["input"], *kinds["parameter"]]
-    with (
-        Instance3(loaded(name), MODEL_EXCHANGE) as exchange,
-        Instance3(loaded(name), CO_SIMULATION) as stepping,
-        Fmu(exported(name)) as fmu,
-        fmu.start(CO_SIMULATION, values=point) as older,
-    ):
-        for instance in (exchange, stepping):
-            instance.start(point)
-        found = [_jacobian(i, unknowns, knowns) for i in (exchange, stepping, older)]
-        assert found[0].tobytes() == found[1].tobytes() == found[2].tobytes()
-        back = _jacobian(exchange, unknowns, knowns, backwards=True)
-    assert _worst(back, found[0], _scales(knowns, name)) < 1e-13
 
 
 def test_what_cannot_be_differentiated_is_refused() -> None:

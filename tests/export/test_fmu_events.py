@@ -2,7 +2,6 @@
 
 import html
 import re
-from ctypes import c_double, c_size_t
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -10,7 +9,6 @@ from itertools import pairwise
 import fmpy
 import numpy as np
 import pytest
-from fmpy import simulate_fmu
 
 import psa_casadi as psa
 from psa_casadi import reference
@@ -20,20 +18,17 @@ from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     ERROR,
     MODEL_EXCHANGE,
-    OK,
     Fmu,
     FmuError,
     Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.units import FloatArray
-from tests.export import fmi3_instances as fmi3
-from tests.export.fmi3_instances import Instance3
+from tests.export.fmi3_instances import Instance3, loaded
 from tests.export.fmu_models import entries, exported, model_named
 from tests.tiers import slow, slow_but
 
 STACK = "P-885.51"
-(SWITCH,) = [v.name for v in variable_table(model_named(STACK)) if v.kind == "indicator"]
 
 
 def _rate(u: float, voltage: float) -> float:
@@ -49,26 +44,11 @@ def _margin(tolerance: float = 1e-5) -> float:
     return 5.0 * tolerance * float(nominal or 0.0) / (values["R_s"] * values["C_p"])
 
 
-def test_indicator_is_the_rate_of_the_voltage_in_fmi_2() -> None:
-    with Fmu(exported(STACK)) as fmu, fmu.start(MODEL_EXCHANGE) as instance:
-        assert fmu.description.numberOfEventIndicators == 1
-        z = (c_double * 2)()
-        for u, voltage in ((30.0, 50.0), (50.0, 30.0)):
-            instance.set({"u": u, "voltage": voltage})
-            instance.require("GetEventIndicators", z, c_size_t(1))
-            assert z[0] == pytest.approx(_rate(u, voltage) + _margin(), rel=1e-12)
-            assert instance.get([SWITCH])[0] == z[0]
-        assert instance.call("GetEventIndicators", z, c_size_t(2)) == ERROR
-        assert "1 event indicators" in instance.messages[-1]
-        assert instance.call("GetEventIndicators", None, c_size_t(1)) == ERROR
-        assert instance.call("EnterEventMode") == OK
-
-
 def test_indicator_faces_the_other_way_after_an_event_and_noise_makes_none() -> None:
     """Beyond the margin an event update turns it round; within the margin it does not."""
     values = model_named(STACK).values
     step = 2.0 * _margin() * values["R_s"] * values["C_p"]  # [V], two margins of the rate
-    with fmi3.Instance3(fmi3.loaded(STACK), MODEL_EXCHANGE) as instance:
+    with Instance3(loaded(STACK), MODEL_EXCHANGE) as instance:
         instance.start({"u": 50.0, "voltage": 50.0})
         for share, facing in ((0.2, 1.0), (1.0, -1.0), (-0.2, -1.0), (-1.0, 1.0)):
             instance.require("EnterEventMode")
@@ -104,7 +84,7 @@ def errors(
     model = model_named(name)
     volts = model.values["u_rated"] * np.array(shares)
     signal = np.array(list(zip(times, volts, strict=True)), [("time", float), ("voltage", float)])
-    found = simulate_fmu(
+    found = fmpy.simulate_fmu(
         str(exported(name, fmi)), fmi_type="ModelExchange", stop_time=times[-1],
         output_interval=interval, input=signal, record_events=False, solver="CVode",
         output=["displacement", "velocity"],
