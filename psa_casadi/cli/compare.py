@@ -5,7 +5,7 @@ from pathlib import Path
 import psa_casadi as psa
 from psa_casadi.cli.batch import tell_lost
 from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.cli.screen import show_results, tell_written, working
 
 
 def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Given) -> None:
@@ -37,9 +37,5 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
             compared = psa.compare(*files, effects=given.own)
             compared.report(output)
             told, tables = (compared.sentence,), compared.tables
-    for sentence in told:
-        show(sentence, given.quiet)
-    for table in tables:
-        show("", given.quiet)
-        show_table(table, given.quiet)
+    show_results(told, tables, given.quiet)
     tell_written(output, quiet=given.quiet)

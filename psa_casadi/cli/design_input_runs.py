@@ -9,7 +9,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
-from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.cli.screen import show_results, tell_written, working
 from psa_casadi.design.tracking import targets
 from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
@@ -181,9 +181,5 @@ def _finish(
                 task.report, title=title, summary=summary, tables=tables, figures=pictures,
                 badges=badges, live=live,
             )  # fmt: skip
-    for sentence in summary:
-        show(sentence, task.quiet)
-    for titled in tables:
-        show("", task.quiet)
-        show_table(titled.table, task.quiet)
+    show_results(summary, (titled.table for titled in tables), task.quiet)
     tell_written(task.output, task.report, quiet=task.quiet)

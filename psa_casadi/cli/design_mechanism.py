@@ -6,7 +6,7 @@ from typing import Literal
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import StackName
-from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.cli.screen import show_results, tell_written, working
 from psa_casadi.errors import InputError
 
 
@@ -77,11 +77,8 @@ def mechanism(
         psa.save_model(psa.port_model(chosen), port)
     if report is not None:
         write_mechanism_page(design, report, chosen, still=still)
-    for sentence in mechanism_sentences(design):
-        show(sentence, given.quiet)
-    for table in (mechanism_table(design), pole_table(design)):
-        show("", given.quiet)
-        show_table(table, given.quiet)
+    tables = mechanism_table(design), pole_table(design)
+    show_results(mechanism_sentences(design), tables, given.quiet)
     tell_written(output, port, report, quiet=given.quiet)
 
 

@@ -1,7 +1,7 @@
 """What a command shows: results on stdout, progress on stderr."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
@@ -78,6 +78,15 @@ def show_table(table: "Table", quiet: bool = False) -> None:
     for row in table.rows:
         drawn.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
     console.print(drawn)
+
+
+def show_results(sentences: Iterable[str], tables: Iterable["Table"], quiet: bool) -> None:
+    """Print sentences, then tables, each behind an empty line."""
+    for sentence in sentences:
+        show(sentence, quiet)
+    for table in tables:
+        show("", quiet)
+        show_table(table, quiet)
 
 
 def tell_written(*paths: object, quiet: bool = False) -> None:

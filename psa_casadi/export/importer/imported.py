@@ -27,17 +27,13 @@ from psa_casadi.simulation.compiler import shared_library
 _PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))
 #: As often an FMU may ask for another update of its discrete states after initialization.
 _UPDATES = 100
-#: Functions of `psa_imported` in its order: name of a field, version, name in the standard.
-_FUNCTIONS = (
-    ("set_time", 0, "SetTime"),
-    ("set_states", 0, "SetContinuousStates"),
-    ("get_rates", 2, "GetDerivatives"),
-    ("get_rates", 3, "GetContinuousStateDerivatives"),
-    ("set_real2", 2, "SetReal"),
-    ("set_real3", 3, "SetFloat64"),
-    ("get_real2", 2, "GetReal"),
-    ("get_real3", 3, "GetFloat64"),
-)
+#: Functions of `psa_imported` by version: name of a field, name in the standard.
+_BOTH = {"set_time": "SetTime", "set_states": "SetContinuousStates"}
+_FUNCTIONS = {
+    2: {**_BOTH, "get_rates": "GetDerivatives", "set_real2": "SetReal", "get_real2": "GetReal"},
+    3: {**_BOTH, "get_rates": "GetContinuousStateDerivatives", "set_real3": "SetFloat64",
+        "get_real3": "GetFloat64"},
+}  # fmt: skip
 
 
 class _Given(ctypes.Structure):
@@ -108,10 +104,10 @@ class Imported:
             name: (c_uint * len(names))(*(of[n] for n in names)) for name, names in known.items()
         }
         arrays["sizes"] = (c_double * len(self.sizes))(*self.sizes)
-        functions = [(f, n) for f, v, n in _FUNCTIONS if v in (0, version)]
+        functions = dict(_FUNCTIONS[version])
         if fmu.description.modelExchange.providesDirectionalDerivative:
-            functions.append((f"slope{version}", "GetDirectionalDerivative"))
-        called = {f: getattr(fmu.library, f"fmi{version}{name}") for f, name in functions}
+            functions[f"slope{version}"] = "GetDirectionalDerivative"
+        called = {f: getattr(fmu.library, f"fmi{version}{n}") for f, n in functions.items()}
         pointers = {k: ctypes.cast(q, c_void_p) for k, q in (called | arrays).items()}
         prepare = _PREPARE(self._prepared)
         self._kept = arrays, prepare  # C points to these
