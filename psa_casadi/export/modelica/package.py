@@ -12,6 +12,7 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from psa_casadi.characters import check_text
 from psa_casadi.effects.mechanics import RECIPROCAL_COUPLING
@@ -248,16 +249,11 @@ def documentation(paragraphs: Sequence[str], table: str = "") -> str:
 
 def equations_table(model: Model) -> str:
     """Return an HTML table of the components: what they are, their equations, their sources."""
-    rows = [("component", "what it is", "equation", "source")]
-    rows += [
+    told = (
         (c.name, c.description, c.equation_text, c.source.rstrip(".")) for c in model.components
-    ]
-    lines = ["<table>"]
-    for k, row in enumerate(rows):
-        tag = "td" if k else "th"
-        cells = (f"<{tag}>{escape(cell, quote=False)}</{tag}>" for cell in row)
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    return "\n".join([*lines, "</table>", ""])
+    )
+    rows = [[Markup(escape(cell, quote=False)) for cell in row] for row in told]
+    return filled("equations.html", components=rows)
 
 
 def about(model: Model) -> list[str]:
