@@ -9,6 +9,7 @@ Source: FMI 2.0.5, section 2.3, and FMI 3.0.2, section 2.5.1.2 (documentation/li
 from importlib.resources import files
 
 from psa_casadi.errors import InputError, PsaError
+from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
 from psa_casadi.simulation.compiler import sources_directory
@@ -19,26 +20,6 @@ LICENSE_ENTRY = "documentation/licenses/license.txt"
 SOURCES_NOTICE = "LICENSE.txt"
 _CODE_LICENSE = f"C code: BSD 3-Clause, see {LICENSE_ENTRY}"
 _HEADERS = {2: "fmi2Functions.h", 3: "fmi3Functions.h"}
-
-_LICENSES = """\
-What this FMU holds, and on what terms
-======================================
-
-1. The model '{name}' and its values
-{model}
-2. The C code in sources and in binaries, by psa_casadi: BSD 3-Clause licence, section A below
-3. The headers of the FMI standard: BSD 2-Clause licence, section B below
-
-
-A. C code
----------
-
-{code}
-
-B. Headers of the FMI standard
-------------------------------
-
-{headers}"""
 
 
 def published(model: Model) -> dict[str, str]:
@@ -73,11 +54,12 @@ def license_text(model: Model, fmi: int) -> str:
     lines = [f"   {name}: {text}\n" for name, text in model.publication.stated.items()]
     header = (files("fmpy") / "c-code" / _HEADERS[fmi]).read_text(encoding="utf-8")
     notice = header[header.index("Copyright") :].partition("*/")[0].splitlines()  # first comment
-    return _LICENSES.format(
+    return filled(
+        "license.txt",
         name=model.name,
         model="".join(lines) or "   no terms are stated: ask whoever gave you this FMU\n",
         code=code_license(),
-        headers="\n".join(line.strip() for line in notice).rstrip() + "\n",
+        headers="\n".join(line.strip() for line in notice).rstrip(),
     )
 
 

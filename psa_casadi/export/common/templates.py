@@ -28,6 +28,7 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "wrapped": _wrapped, "comment": _comment, "words": comment_text, "stated": _stated,
+        "joined": _joined,
     }  # fmt: skip
     return environment
 
@@ -42,6 +43,11 @@ def _wrapped(text: str, indent: str = "") -> str:
     """Return a text in lines, the further ones indented."""
     lines = textwrap.wrap(text.strip("\n"), 96, subsequent_indent=indent, break_long_words=False)
     return "\n".join(lines)
+
+
+def _joined(text: Markup) -> Markup:
+    """Return a text of HTML on one line."""
+    return Markup(" ").join(text.split())
 
 
 def _comment(text: str) -> str:

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from psa_casadi.export.common.markup import number, time_scale, xml_text
 from psa_casadi.export.common.parameter_sets import parameter_set
+from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.stepper import run
 from psa_casadi.variables import nominal_value
@@ -39,23 +40,6 @@ OWN_TOLERANCE = 1e-12
 _SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
 _STEPS_PER_SEGMENT = 100
 _DIGITS = 7
-
-_NOTES = """\
-Reference run of '{name}'
-
-One smoke test: every input follows straight lines with kinks every {segment:g} s, from 0 to
-{stop:g} s, and starts at its start value; so does every state. {inputs} holds the inputs, linear
-between its rows; {outputs} the outputs to expect at the same times; {parameters} the parameter
-values, which are also the start values in modelDescription.xml. All in SI units.
-
-The outputs were computed by psa_casadi to a relative tolerance of {own:g} and rounded to {digits}
-digits of their largest value. An importer that stops at the kinks (model exchange), or passes on
-the slope of the inputs (co-simulation of FMI 2), meets them to its own tolerance. One that holds
-the inputs over a communication step of {step:g} s is late by half a step: up to a hundredth of
-the range of displacement, charge and force, and more for current and velocity, which jump at the
-kinks.
-"""
-
 
 #: MIME type, role and meaning of a file in the archive, for the manifest.
 Related = tuple[str, str, str]
@@ -89,9 +73,9 @@ def reference_entries(model: Model, more: Mapping[str, Related]) -> dict[str, by
         EXPERIMENTS: experiments("smoke test", times, [("segments", said, files)]),
         "fmi-ls-manifest.xml": _manifest({**_RELATED, **more}),
     }
-    notes = _NOTES.format(
-        name=model.name, segment=_segment(model), stop=times[-1], step=times[1], inputs=INPUTS,
-        outputs=OUTPUTS, parameters=PARAMETERS, own=OWN_TOLERANCE, digits=_DIGITS,
+    notes = filled(
+        "fmi-ls-ref.txt", name=model.name, segment=_segment(model), stop=times[-1], step=times[1],
+        inputs=INPUTS, outputs=OUTPUTS, parameters=PARAMETERS, own=OWN_TOLERANCE, digits=_DIGITS,
     )  # fmt: skip
     entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
     return {**entries, NOTES: notes.encode("utf-8")}

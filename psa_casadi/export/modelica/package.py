@@ -7,7 +7,7 @@ is none, since its bonding layers do not push back on the wafers. The class has 
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from html import escape
 from pathlib import Path
 
@@ -41,23 +41,6 @@ from psa_casadi.model.compose import Model
 from psa_casadi.scales import stiffness_scale
 from psa_casadi.variables import Input, nominal_value
 
-_WIRING = (
-    "The pins are the terminals behind the amplifier's gain G: between them is G times the voltage"
-    " command, and the current is what flows into the stack. The motion does not act back on the"
-    " charge. The flange is the stack's output, its position the displacement from rest, with the"
-    " other end clamped."
-)
-_USE = (
-    "Signal needs no library. Acausal has pins and flanges of the Modelica Standard Library 4. All"
-    " quantities are in SI units; "
-)
-_SAMPLING = (
-    "The sampled states change at the multiples of their period from time 0 on, as sample(0, T)"
-    " says, and are constant in between."
-)
-_RESTS = "states start at rest."
-_MOVES = "states start at their start values, from where they move even if the inputs do not."
-
 
 def export_modelica(
     model: Model,
@@ -86,19 +69,18 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
     exported = model if include_sensor else model.plant()
     _refuse(exported)
     connectors, drawing = connectors_of(exported), drawing_of(exported)
-    signal = documentation(about(exported), equations_table(exported))
+    signal = documentation(exported, components=components_of(exported))
     classes = [class_text(exported, "Signal", "the model with plain inputs and outputs", signal)]
     if connectors:
         connected = reciprocal(exported)
-        wiring = _WIRING if "output" in connectors else ""
-        texts = [*about(connected), wiring, _cascade_note(connected)]
         meaning = "the model with connectors of the Modelica Standard Library 4"
-        acausal = documentation(texts, equations_table(connected))
+        acausal = documentation(
+            connected, components=components_of(connected), wiring="output" in connectors,
+            cascade=_is_cascade(connected),
+        )  # fmt: skip
         classes.append(class_text(connected, "Acausal", meaning, acausal, connectors))
     rates = exported.structure.f(*exported.at_start())[0]
     rests = all(float(rate) == 0.0 for rate in rates.elements())
-    used = _USE + (_RESTS if rests else _MOVES)
-    sampled = [_SAMPLING] if exported.sampled_names else []
     version = model.publication.version
     whole = filled(
         "package.mo",
@@ -110,7 +92,7 @@ def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: boo
         wired=_wired(exported) if _can_be_wired(exported) else None,
         drawing=drawing,
         rectangles=[_rectangle(*shape) for shape in ICONS[drawing]],
-        annotation=documentation([*about(exported), used, *sampled]),
+        annotation=documentation(exported, rests=rests, sampled=bool(exported.sampled_names)),
         version=string(version) if version else "",
     )
     check_text(whole, f"The Modelica package {name}")
@@ -140,25 +122,6 @@ def reciprocal(model: Model) -> Model:
 
 def _is_cascade(model: Model) -> bool:
     return "cascade_mechanics" in (c.name for c in model.components)
-
-
-def _cascade_note(model: Model) -> str:
-    """Return what the reaction changes; empty for a single mass."""
-    if not _is_cascade(model):
-        return ""
-    k_P, k_B = model.values["k_P"], model.values["k_B"]
-    share = k_B / (k_P + k_B)
-    return (
-        "The paper's one-way cascade has no reaction of the bonding layers on the wafers, so that"
-        " it cannot be a two-port. This class has it: reciprocal_gain = 1, action and reaction."
-        f" With the same parameters the static stroke per force is k_B/(k_P + k_B) = {share:.4g}"
-        " times that of the cascade at reciprocal_gain = 0, and the output's stiffness is that of"
-        " wafers and bonding layers in series,"
-        f" k_P k_B/(k_P + k_B) = {k_P * share:.4g} N/m in place of k_B = {k_B:.4g} N/m."
-        " Where the parameters were found with the cascade, find them again"
-        " with reciprocal_coupling at 1, or scale the forces (k_L, A, beta, gamma, delta, h_ref) by"
-        " (k_P + k_B)/k_B for the same free stroke."
-    )
 
 
 def _span(model: Model) -> float:
@@ -241,25 +204,30 @@ def _rectangle(left: int, top: int, width: int, height: int, colour: str) -> tup
     return extent, f"{{{red}, {green}, {blue}}}"
 
 
-def documentation(paragraphs: Sequence[str], table: str = "") -> str:
-    """Return a Documentation annotation of paragraphs, plain texts, and a table in HTML."""
-    body = "".join(f"<p>{escape(p, quote=False)}</p>\n" for p in paragraphs if p)
-    return f"Documentation(info={string(f'<html>{chr(10)}{body}{table}</html>')})"
+def documentation(model: Model, **more: object) -> str:
+    """Return a Documentation annotation: what a model is, who publishes it, and `more` of it.
+
+    That is a table of `components`; the `wiring` of pins and flange; the reaction in a `cascade`;
+    of the package whether the states are at `rests`, and whether some are `sampled`.
+    """
+    said = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
+    about = [t for t in (describe(model), said, f"Written by {generation_tool()}.") if t]
+    every = dict.fromkeys(("components", "wiring", "cascade", "rests", "sampled")) | more
+    text = filled("modelica.html", about=map(_plain, about), values=model.values, **every)
+    return f"Documentation(info={string(text.rstrip())})"
 
 
-def equations_table(model: Model) -> str:
-    """Return an HTML table of the components: what they are, their equations, their sources."""
+def components_of(model: Model) -> list[list[str]]:
+    """Return the components: what they are, their equations, their sources."""
     told = (
         (c.name, c.description, c.equation_text, c.source.rstrip(".")) for c in model.components
     )
-    rows = [[Markup(escape(cell, quote=False)) for cell in row] for row in told]
-    return filled("equations.html", components=rows)
+    return [[_plain(cell) for cell in row] for row in told]
 
 
-def about(model: Model) -> list[str]:
-    """Return what the model is, who publishes it on what terms, and which program wrote it."""
-    said = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
-    return [describe(model), said, f"Written by {generation_tool()}."]
+def _plain(text: str) -> Markup:
+    """Return a text for HTML, with its quotes as they are."""
+    return Markup(escape(text, quote=False))
 
 
 def _refuse(model: Model) -> None:
