@@ -90,46 +90,6 @@ def without_sampled(found: dict[Key, str]) -> dict[Key, str]:
     return {key: how for key, how in found.items() if key[0] != "sampled"}
 
 
-#: Log categories; the last one is shown only when debug logging is on.
-LOG_CATEGORIES = {
-    "logStatusWarning": "calls that succeeded, but look wrong",
-    "logStatusDiscard": "steps and evaluations that failed and may be retried",
-    "logStatusError": "calls that are not allowed or impossible",
-    "logSolver": "cost of each communication step",
-}
-#: What each version's interfaces are capable of: of both, of co-simulation, and of that without a
-#: fixed step. FMI 2 has no word for multiples of a step.
-_ABLE = {
-    2: (
-        ("canNotUseMemoryManagementFunctions", "canGetAndSetFMUstate", "canSerializeFMUstate",
-         "providesDirectionalDerivative"),
-        ("canHandleVariableCommunicationStepSize", "canInterpolateInputs"),
-        ("canHandleVariableCommunicationStepSize",),
-    ),
-    3: (
-        ("canGetAndSetFMUState", "canSerializeFMUState", "providesDirectionalDerivatives",
-         "providesAdjointDerivatives", "providesEvaluateDiscreteStates"),
-        ("canHandleVariableCommunicationStepSize", "providesIntermediateUpdate",
-         "canReturnEarlyAfterIntermediateUpdate", "hasEventMode"),
-        ("providesIntermediateUpdate", "canReturnEarlyAfterIntermediateUpdate"),
-    ),
-}  # fmt: skip
-_CONTINUOUS = {"variability": "continuous"}
-#: Causality, variability and initial of each kind of variable; the same words in both versions.
-_CAUSALITY = {
-    "time": {"causality": "independent", **_CONTINUOUS},
-    "state": {"causality": "local", **_CONTINUOUS, "initial": "exact"},
-    "derivative": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
-    "input": {"causality": "input", **_CONTINUOUS},
-    "output": {"causality": "output", **_CONTINUOUS, "initial": "calculated"},
-    "parameter": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
-    "option": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
-    "indicator": {"causality": "local", **_CONTINUOUS, "initial": "calculated"},
-    "sampled": {"causality": "local", "variability": "discrete", "initial": "exact"},
-    "constant": {"causality": "local", "variability": "constant", "initial": "exact"},
-}
-
-
 def model_description(
     model: Model,
     identifier: str,
@@ -144,7 +104,7 @@ def model_description(
     `fixed` step there is no model exchange, and parameters are constants.
     """
     second, table = fmi == 2, variable_table(model)
-    said, span = describe(model), default_span(model)
+    said, span, places = describe(model), default_span(model), range(1, len(table) + 1)
     size = span / 1000.0
     if fixed:
         said += (
@@ -166,37 +126,16 @@ def model_description(
             "variableNamingConvention": "structured",
         },
         events=len(model.structure.switches),
-        interfaces=_interfaces(identifier, fmi, fixed),
+        identifier=identifier,
+        fixed=number(fixed.plan.step) if fixed else None,
         sources=sorted(sources),
         units=_units(table),
         types=sorted((name, unit) for unit in units if (name := _type_name(unit))),
-        categories=LOG_CATEGORIES,
         span=number(span),
         size=number(size),
-        variables=[
-            _variable(k, v, second=second, fixed=fixed is not None) for k, v in enumerate(table, 1)
-        ],
+        variables=list(zip(places, table, map(_value, table), strict=True)),
         structure=_structure(model, table, second=second, fixed=fixed is not None),
     )
-
-
-def _interfaces(identifier: str, fmi: int, fixed: FixedStep | None) -> dict[str, dict[str, str]]:
-    """Return ModelExchange and CoSimulation: what they are capable of."""
-    always, stepping, not_fixed = _ABLE[fmi]
-    found = {}
-    for tag in ("CoSimulation",) if fixed else ("ModelExchange", "CoSimulation"):
-        able = (*always, *stepping) if tag == "CoSimulation" else always
-        left_out = not_fixed if fixed else ()
-        flags = {"modelIdentifier": identifier}
-        flags |= {name: "true" for name in able if name not in left_out}
-        if tag == "CoSimulation":
-            flags["maxOutputDerivativeOrder"] = "1"
-        elif fmi == 3:
-            flags["needsCompletedIntegratorStep"] = "false"
-        if fixed and fmi == 3:
-            flags["fixedInternalStepSize"] = number(fixed.plan.step)
-        found[tag] = flags
-    return found
 
 
 Attributes = dict[str, str | None]
@@ -232,20 +171,10 @@ def _type_name(unit: str) -> str | None:
     return quantity.title().replace(" ", "") if quantity else None
 
 
-def _variable(
-    reference: int, it: Variable, *, second: bool, fixed: bool
-) -> tuple[Attributes, Attributes]:
-    """Return what a variable is, and what its value is."""
-    constant = fixed and it.kind == "parameter"
-    head: Attributes = {
-        "name": it.name,
-        "valueReference": str(reference),
-        "description": it.description,
-        **_CAUSALITY["constant" if constant else it.kind],
-    }
+def _value(it: Variable) -> Attributes:
+    """Return what is stated of a variable's value."""
     low, high = it.bounds or (-math.inf, math.inf)
-    within = not (second or fixed) and it.kind in ("state", "derivative", "input", "output")
-    return head, {
+    return {
         "unit": it.unit or None,
         "declaredType": _type_name(it.unit),
         "displayUnit": it.display_unit or None,
@@ -253,8 +182,6 @@ def _variable(
         "max": number(high) if math.isfinite(high) else None,
         "nominal": None if it.nominal is None else number(abs(it.nominal)),
         "start": None if it.start is None else number(it.start),
-        "intermediateUpdate": "true" if within else None,
-        "derivative": str(it.index + 2) if it.kind == "derivative" else None,
     }
 
 
