@@ -12,34 +12,7 @@ from build_scripts.page_commands import blocks_of, find_blocks, pages, run_block
 from psa_casadi.cli.app import app
 from psa_casadi.effects import EFFECTS
 
-TEXT = """
-# Title
-
-<!-- run: skip, it ends -->
-
-```console
-$ exit 7
-```
-
-```text
-$ exit 8
-```
-
-```console
-$ test -z "$(ls)"
-$ echo one > file; \\
-  echo two >> file
-one
-$ grep two file
-```
-
-Words.
-
-<!-- run: continue -->
-```console
-$ grep one file
-```
-"""
+TEXT = Path(__file__).with_name("commands.md").read_text("utf-8")
 
 
 #: The pages whose one block a test runs.
@@ -126,7 +99,7 @@ def test_a_command_that_fails_is_named_with_its_line() -> None:
     (failure,) = run_text(
         TEXT.replace("<!-- run: skip, it ends -->", "").replace("$ grep two", "$ true")
     )
-    assert failure == "README.md line 6: 'exit 7' ended with exit code 7."
+    assert failure == "README.md line 5: 'exit 7' ended with exit code 7."
     (failure,) = run_text("```console\n$ false | cat\n$ touch never\n```")
     assert "'false | cat' ended with exit code 1" in failure
 

@@ -42,7 +42,7 @@ from psa_casadi.simulation.compiler import (
     shared_library,
     zig_command,
 )
-from tests.export.c_host.build import HEADERS
+from tests.export.c_host.build import HEADERS, HERE
 from tests.export.fmu_models import files_inside, rewritten
 from tests.model.stack_models import stack
 from tests.simulation.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect
@@ -214,24 +214,7 @@ def test_every_effect_and_every_stack_is_exported_and_compared() -> None:
 
 
 LONG_STEP = 1e-4
-TOLD = """#include "stack.h"
-#if !defined(_WIN32)
-__attribute__((visibility("default")))
-#endif
-int told(const double *voltage, int count, double *x) {
-    stack_state state;
-    stack_input input = {0};
-    stack_output output;
-    int all = 0;
-    stack_init(&state);
-    for (int k = 0; k < count; ++k) {
-        input.voltage = voltage[k];
-        all = 2 * all + stack_step(&state, &input, &output);
-    }
-    *x = output.displacement;
-    return all;
-}
-"""
+TOLD = (HERE / "told.c").read_text("utf-8")
 
 
 def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:

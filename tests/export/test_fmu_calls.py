@@ -29,6 +29,7 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
+from tests.export.c_host.build import HERE
 from tests.export.fmi3_instances import Instance3, Update, loaded, try_step
 from tests.export.fmu_models import exported, model_named, recompiled
 from tests.tiers import slow
@@ -105,15 +106,7 @@ def test_stop_time_is_kept() -> None:
             slave.step(2e-3, 1e-3)
 
 
-_COUNTING = """
-#include <stdarg.h>
-#include <stdio.h>
-__attribute__((visibility("default"))) int psa_sentences = 0;
-static int counted(char *text, size_t size, const char *format, va_list arguments) {
-    ++psa_sentences;
-    return vsnprintf(text, size, format, arguments);
-}
-"""
+_COUNTING = (HERE / "counting.c").read_text("utf-8")
 
 
 def test_a_step_writes_no_sentence_that_nobody_reads(tmp_path: Path) -> None:

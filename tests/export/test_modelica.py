@@ -216,21 +216,7 @@ def test_the_reaction_is_there_whatever_the_gain_of_the_model() -> None:
 def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
     """The stage between a spring to the ground and a position that is given."""
     text = modelica_text(psa.compose([psa.COMPONENTS["flexure"]], name="flexure"), name="Stage")
-    bench = """
-    model Mover
-      Modelica.Mechanics.Translational.Interfaces.Flange_b flange_b;
-      Real s(start=0, fixed=true);
-    equation
-      der(s) = 1e-4;
-      flange_b.s = s;
-    end Mover;
-    model Bench
-      Stage.Acausal stage;
-      Mover mover;
-    equation
-      connect(mover.flange_b, stage.flange_a);
-    end Bench;
-    """
+    bench = Path(__file__).with_name("modelica_bench.mo").read_text("utf-8")
     got = simulated(STUB + text + bench, "Bench", 0.05, rtol=1e-10)
     contact = 5e7 * (got["mover.s"] - got["stage.x_f"]) + 500.0 * (1e-4 - got["stage.v_f"])
     np.testing.assert_allclose(got["stage.flange_a.f"], contact, rtol=1e-6, atol=1e-9)
