@@ -5,8 +5,9 @@ Sources: SSP Traceability 1.0 (SRMD and its place in an FMU), FMI-LS-REF 1.0.0-b
 """
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from dataclasses import replace
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import numpy.typing as npt
@@ -30,12 +31,8 @@ from psa_casadi.export.fmu.reference_run import (
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import (
-    Covariance,
-    ErrorShare,
     Evidence,
-    RecordRun,
     ReferenceRun,
-    SeenRange,
 )
 from psa_casadi.simulation.stepper import run
 
@@ -78,107 +75,6 @@ def seen_inputs(model: Model) -> list[tuple[float, float, float]]:
         low, high = (found.low, found.high) if found else (-math.inf, math.inf)
         rows.append((low, high, seen.rate if seen and name == "voltage" else math.inf))
     return rows
-
-
-NOT_HELD_OUT = "no sample was held out; `psa diagnose` holds some out and judges the model on them"
-
-
-#: One thing that is said: a keyword for machines, and the text.
-Said = tuple[str, str]
-
-
-def chapters(model: Model) -> list[tuple[str, str, list[Said]]]:
-    """Return what is known of a model's origin, errors, range and uncertainty.
-
-    Each part has a name for machines, a title, and what is said there.
-    """
-    evidence = model.evidence
-    if evidence is None:
-        return []
-    origin = ("found by", f"{evidence.by}, psa_casadi {model.provenance.package_version}")
-    parts: dict[str, tuple[str, Iterable[Said]]] = {
-        "origin": ("Where it comes from", (origin, *_records(evidence.runs))),
-        "error": ("What it errs by", _errors(evidence)),
-        "budget": ("Where the error goes", _budget(evidence)),
-        "validity": ("What the records have shown", _seen(evidence.seen)),
-        "covariance": ("How sure the values are", _sure(model, evidence.covariance)),
-    }
-    found = [(name, title, list(said)) for name, (title, said) in parts.items()]
-    return [part for part in found if part[2]]
-
-
-def _um(metres: float) -> str:
-    return f"{1e6 * metres:.4g} um"
-
-
-def _records(runs: Iterable[RecordRun]) -> Iterator[Said]:
-    for r in runs:
-        blocks = f", each the mean of {r.averaged}" if r.averaged > 1 else ""
-        errors = f"fitted to {_um(r.fitted_m)} rms"
-        if r.held_out_m is not None:
-            count = sum(stop - first for first, stop in r.held_out)
-            errors += f", {_um(r.held_out_m)} rms over {count} held-out ones"
-        yield ("record", f"{r.record}, sha256 {r.sha256}: {r.samples} samples{blocks}; {errors}")
-
-
-def _errors(evidence: Evidence) -> Iterator[Said]:
-    yield ("fitted error", f"{_um(evidence.fitted_m)} rms over the samples of the fit")
-    held, said = evidence.held_out, NOT_HELD_OUT
-    if held is not None:
-        over = f"{held.records} records" if held.records else "blocks of the records"
-        said = (
-            f"{_um(held.rms_m)} rms, 95 % interval {_um(held.interval_m.low)} to"
-            f" {_um(held.interval_m.high)} (jackknife over {over}); {held.nrmse_percent:.3g} % of"
-            f" the range; at most {_um(held.max_m)}"
-        )
-    yield ("held-out error", said)
-    if evidence.outside:
-        left = ", ".join(evidence.outside)
-        yield (
-            "counted with",
-            f"{left}: of sensor or environment, which an exported plant leaves out",
-        )
-
-
-def _budget(evidence: Evidence) -> Iterator[Said]:
-    yield from (("unnamed correction inside", text) for text in evidence.unnamed)
-    b = evidence.budget
-    if b is None:
-        return
-    yield ("base", f"{_um(b.base_m)} rms above the noise, without the causes")
-    yield ("noise", f"{_um(b.noise_m)} rms")
-    for effect in b.causes:
-        yield ("effect", _share(effect))
-    if b.unnamed is not None:
-        yield ("unnamed correction outside", f"{_share(b.unnamed)}; the model lacks it")
-    remains = f"{_um(b.remains_m)} rms above the noise, {b.remains_percent:.3g} % of the range"
-    yield ("remains", remains)
-
-
-def _share(it: ErrorShare) -> str:
-    ends = (it.share, it.interval.low, it.interval.high)
-    percent, low, high = (100.0 * min(max(v, 0.0), 1.0) for v in ends)  # cut as in every page
-    return f"{it.what}: {percent:.3g} % of the error, 95 % interval {low:.3g} to {high:.3g} %"
-
-
-def _seen(seen: SeenRange) -> Iterator[Said]:
-    warm = seen.temperature
-    yield ("voltage", f"{seen.voltage.low:.6g} to {seen.voltage.high:.6g} V")
-    yield ("rate of voltage", f"up to {seen.rate:.4g} V/s")
-    yield ("duration", f"up to {seen.duration:.4g} s from the start of a run")
-    yield ("temperature", f"{warm.low:.6g} to {warm.high:.6g} K" if warm else "not recorded")
-
-
-def _sure(model: Model, c: Covariance) -> Iterator[Said]:
-    """Yield the standard errors, and the covariance row by row."""
-    for k, name in enumerate(c.names):
-        unit = model.parameter(name).unit
-        value = f"{model.values[name]:.6g}{'' if unit == '1' else f' {unit}'}"
-        yield (name, f"{value}, standard error {c.matrix[k][k] ** 0.5:.3g}")
-    if c.names:
-        yield ("covariance of", " ".join(c.names))
-        for name, row in zip(c.names, c.matrix, strict=True):
-            yield (f"covariance.{name}", " ".join(number(v) for v in row))
 
 
 FloatArray = npt.NDArray[np.float64]
@@ -239,7 +135,8 @@ def evidence_texts(model: Model, samples: int) -> dict[str, str]:
     if model.evidence is None:
         return {}
     sets = set_files(model, samples)
-    texts = {PAGE: evidence_page(model), META_DATA: meta_data(model), **sets}
+    meta = meta_data(model, model.evidence)
+    texts = {PAGE: evidence_page(model, meta), META_DATA: meta, **sets}
     reference = model.evidence.reference
     if reference is None:
         return texts
@@ -273,28 +170,44 @@ def set_files(model: Model, samples: int) -> dict[str, str]:
     return {f"{SETS}/{n}.ssv": parameter_set(model, v, name=n) for n, v in found.items()}
 
 
-def evidence_page(model: Model) -> str:
-    """Return the page on a model's evidence."""
-    listed = [
-        {"title": title, "shown": [s for s in said if not s[0].startswith("covariance")]}
-        for _, title, said in chapters(model)
-    ]
+def evidence_page(model: Model, meta: str) -> str:
+    """Return the page on a model's evidence, which says what the meta data say."""
+    told = {
+        part.attrib["type"].removeprefix("psa_casadi."): [
+            (e.attrib["keyword"], e.text)
+            for e in part
+            if not e.attrib["keyword"].startswith("covariance")
+        ]
+        for part in ET.fromstring(meta)
+    }
     text = filled(
-        "evidence.html", title=f"{model.name}: evidence", chapters=listed, validation=VALIDATION,
+        "evidence.html",
+        title=f"{model.name}: evidence",
+        told=told,
+        validation=VALIDATION,
         sets=SETS,
-    )  # fmt: skip
+    )
     check_text(text, "The page on the evidence")
     return text
 
 
-def meta_data(model: Model) -> str:
+def meta_data(model: Model, evidence: Evidence) -> str:
     """Return the SRMD file: a classification for each part of the evidence."""
     stated = model.publication.stated
     if "version" in stated:
         stated["fileversion"] = stated.pop("version")
-    parts = [(f"psa_casadi.{name}", said) for name, _, said in chapters(model)]
     head = {"name": f"evidence of {model.name}", **stated, "generationTool": generation_tool()}
-    return xml_text("resourceMetaData.xml", head=head, parts=parts)
+    c = evidence.covariance
+    rows = list(zip(c.names, c.matrix, strict=True))
+    return xml_text(
+        "resourceMetaData.xml",
+        head=head,
+        model=model,
+        evidence=evidence,
+        records=[(r, sum(stop - first for first, stop in r.held_out)) for r in evidence.runs],
+        sure=[(n, model.parameter(n).unit, row[k] ** 0.5) for k, (n, row) in enumerate(rows)],
+        rows=[(n, " ".join(map(number, row))) for n, row in rows],
+    )
 
 
 def run_start(model: Model) -> dict[str, float]:
