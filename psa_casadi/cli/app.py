@@ -61,52 +61,25 @@ def _main(
     """Models of piezoelectric stack actuators: identify, diagnose what is missing, export."""
 
 
-def _add(
-    group: typer.Typer,
-    function: Callable[..., None],
-    example: str,
-    name: str | None = None,
-    **settings: bool,
-) -> None:
-    """Add a command; its first sentence stands whole in the list, its example on one line."""
-    first = (inspect.getdoc(function) or "").partition("\n\n")[0]
-    group.command(
-        name, short_help=first, epilog=f"\b\nExample: {example}", context_settings=settings
-    )(command(function))
+def _add(group: typer.Typer, *functions: Callable[..., None]) -> None:
+    """Add commands; the first sentence stands whole in the list, the example on one line."""
+    for function in functions:
+        told, _, example = (inspect.getdoc(function) or "").partition("\n\nExample:\n")
+        kinds = [p.annotation for p in inspect.signature(function).parameters.values()]
+        group.command(
+            function.__name__.strip("_"),
+            short_help=told.partition("\n\n")[0],
+            epilog=f"\b\nExample: {' '.join(example.split())}",
+            context_settings={"allow_extra_args": typer.Context in kinds},
+        )(command(function))
 
 
-_add(app, demo, "psa demo my_demo")
-_add(app, identify, "psa identify slow.csv fast.csv -o model.json --report fit.html")
-_add(app, sample, "psa sample record.csv --model model.json -o posterior.nc --figure posterior.png")
-_add(app, simulate, "psa simulate --stack P-885.51 --input voltage.csv --history 120,0 -o out.csv")
-_add(app, diagnose, "psa diagnose a.csv --holdout b.csv -o extended.json --report report.html")
-_add(app, batch, "psa batch records -o results --report population.html")
-_add(app, compare, "psa compare before.json after.json -o compare.html")
-_add(app, effects, "psa effects slow_creep --figure creep.png")
-_add(app, stacks, "psa stacks P-885.51")
+_add(app, demo, identify, sample, simulate, diagnose, batch, compare, effects, stacks)
+_add(app, check, web, examples, datasets)
+_add(export, fmu, modelica, c, ssp)
+_add(design, experiment, mechanism, input_)
 app.add_typer(export, name="export")
-_add(export, fmu, "psa export fmu --model extended.json -o stack.fmu")
-_add(export, modelica, "psa export modelica --model extended.json -o PiezoStack.mo")
-_add(export, c, "psa export c --stack P-885.51 --step 10us -o code")
-_add(export, ssp, "psa export ssp --stack P-885.51 -o stage.ssp")
 app.add_typer(design, name="design")
-_add(
-    design,
-    experiment,
-    "psa design experiment --stack P-885.51 --duration 2"
-    " --separate field_dependent_gain rate_independent_asymmetry -o voltage.csv",
-)
-_add(design, mechanism, "psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json")
-_add(
-    design,
-    input_,
-    "psa design input --stack P-885.51 --move 2 10 --min-voltage -20 --max-voltage 120 -o move.csv",
-    "input",
-)
-_add(app, check, "psa check stack.fmu --model extended.json")
-_add(app, web, "psa web --model extended.json -o page.html", allow_extra_args=True)
-_add(app, examples, "psa examples van_der_pol -o van_der_pol")
-_add(app, datasets, "psa datasets micromanipulator -o records")
 
 
 def main() -> None:

@@ -47,6 +47,9 @@ def batch(
         dask: Address of a Dask scheduler that hands the devices out, such as tcp://HOST:8786, or
             local for a cluster on this machine (extra dask).
         model: MODEL.json whose values every fit starts from, or a model of your own.
+
+    Example:
+        psa batch records -o results --report population.html
     """
     from psa_casadi.devices.executors import dask_client
     from psa_casadi.devices.jobs import jobs_given

@@ -46,6 +46,9 @@ def check(
         json: JSON file of all checks to write.
         timeout: Seconds that the whole check may take.
         memory: Memory that the FMU's code may take [MiB]; limited on Linux only.
+
+    Example:
+        psa check stack.fmu --model extended.json
     """
     from psa_casadi.report.documents.files import check_file
     from psa_casadi.report.documents.junit import check_cases

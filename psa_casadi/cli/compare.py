@@ -17,6 +17,9 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
         files: Two files or more of psa diagnose --json, psa identify --json or -o, or folders of
             devices; or the one folder of results of psa batch.
         output: HTML page to write.
+
+    Example:
+        psa compare before.json after.json -o compare.html
     """
     from psa_casadi.devices.batch import read_results
     from psa_casadi.population.population import population

@@ -25,6 +25,9 @@ def datasets(
         quiet: Print names only.
         name: Name of one dataset.
         output: Folder to write its records to, as CSV files.
+
+    Example:
+        psa datasets micromanipulator -o records
     """
     from psa_casadi.datasets import DATASETS, copy, find, origin_text
     from psa_casadi.report.words.tables import Table

@@ -54,6 +54,9 @@ def demo(
     Options:
         directory: Where to leave the files; it is created.
         output: The same as DIRECTORY.
+
+    Example:
+        psa demo my_demo
     """
     from psa_casadi.diagnosis.diagnose import diagnose
     from psa_casadi.diagnosis.probes import laws_of, screened_with

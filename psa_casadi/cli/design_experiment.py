@@ -79,6 +79,10 @@ def experiment(
         seed: Seed of the drawn inputs.
         output: CSV with the inputs to apply.
         report: HTML page to write.
+
+    Example:
+        psa design experiment --stack P-885.51 --duration 2 --separate field_dependent_gain
+        rate_independent_asymmetry -o voltage.csv
     """
     from psa_casadi.design.experiment.experiment import columns_to_play
     from psa_casadi.design.experiment.limits import KINDS

@@ -40,6 +40,10 @@ def input_(
         max_current: Largest current [A].
         report: HTML page to write.
         check_fmu: Simulate the exported FMU too.
+
+    Example:
+        psa design input --stack P-885.51 --move 2 10 --min-voltage -20
+        --max-voltage 120 -o move.csv
     """
     from psa_casadi.cli import design_input_runs as runs
     from psa_casadi.design.tracking.targets import AmplifierLimits, read_target

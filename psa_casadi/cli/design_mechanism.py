@@ -48,6 +48,9 @@ def mechanism(
         starts: Starts of the search.
         port: Also write the stack with the port that the mechanism couples to.
         report: HTML page to write.
+
+    Example:
+        psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json
     """
     from psa_casadi.design.mechanism.mechanism import check_goals
     from psa_casadi.design.mechanism.search import Limits

@@ -70,6 +70,9 @@ def diagnose(
             adequate, cause_named, partly_explained, ambiguous, unexplained, not_driven.
         max_error: Largest held-out error of the extended model, in % of the range, as 0.5%, else
             exit code 1.
+
+    Example:
+        psa diagnose a.csv --holdout b.csv -o extended.json --report report.html
     """
     from psa_casadi.simulation.timings import stage, timed
 

@@ -28,6 +28,9 @@ def effects(
         figure: Picture of the effect's signature to write, PNG, SVG or PDF as its name ends; needs
             NAME.
         model: MODEL.json of the stack for which NAME's size is told.
+
+    Example:
+        psa effects slow_creep --figure creep.png
     """
     from psa_casadi.diagnosis.remedy import example
     from psa_casadi.diagnosis.signature import signature

@@ -25,6 +25,9 @@ def examples(
         name: Name of an example or a recipe.
         output: Folder for its files; it is created.
         copy_only: Copy the files to the folder, run nothing.
+
+    Example:
+        psa examples van_der_pol -o van_der_pol
     """
     from psa_casadi.examples import index
     from psa_casadi.report.words.tables import Table

@@ -50,6 +50,9 @@ def c(
         hold: Inputs reached at a step's end on a line, or held over it.
         substeps: Equal parts of a step; by default as few as err by less than 0.1 %.
         name: Name of files and functions; by default the model's name.
+
+    Example:
+        psa export c --stack P-885.51 --step 10us -o code
     """
     seconds = given.attempt(lambda: step_seconds(step))
     base = chosen = None
@@ -129,6 +132,9 @@ def fmu(
         sets_to: Folder to write the parameter sets to as well.
         validity_output: Add the output outside_validity: how far a run has left what the records
             show.
+
+    Example:
+        psa export fmu --model extended.json -o stack.fmu
     """
     from psa_casadi.export.fmu.evidence import set_files
     from psa_casadi.export.fmu.platforms import chosen_platforms
@@ -221,6 +227,9 @@ def modelica(
     Options:
         output: Modelica file to write.
         name: Name of the package.
+
+    Example:
+        psa export modelica --model extended.json -o PiezoStack.mo
     """
     from psa_casadi.export.modelica.package import class_names
 
@@ -253,6 +262,9 @@ def ssp(
         stack: Named stack in place of a model; `psa stacks` lists them.
         no_compensator: Leave the hysteresis compensator out.
         picture: Picture of the wiring to write, .svg or .png.
+
+    Example:
+        psa export ssp --stack P-885.51 -o stage.ssp
     """
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.export.ssp import OUTSIDE, Port, layout_of, save_wiring, stable_step, wiring_of

@@ -48,6 +48,9 @@ def identify(
         profile: Parameter whose profile likelihood is wanted; may be repeated.
         json: JSON file of parameters and records to write.
         report: HTML page of the fit to write.
+
+    Example:
+        psa identify slow.csv fast.csv -o model.json --report fit.html
     """
     from psa_casadi.identification.identify import StackIdentification
     from psa_casadi.identification.identify import identify as of_stack

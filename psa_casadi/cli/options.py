@@ -1,5 +1,7 @@
 """A command is a function: what its arguments are for stands in its docstring, under `Options:`.
 
+What to type, under `Example:`, is the end of its help.
+
 Arguments before the star are words of the command line, those behind it options. One whose type is
 a dataclass stands for the options that are its fields. What a command does not say of an option
 that several have:
@@ -72,7 +74,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 def _described(described: object) -> tuple[str, dict[str, str]]:
     """Return a docstring without its section of options, and what that says of each."""
-    about, _, section = (inspect.getdoc(described) or "").partition("\n\nOptions:\n")
+    doc, _, _ = (inspect.getdoc(described) or "").partition("\n\nExample:\n")
+    about, _, section = doc.partition("\n\nOptions:\n")
     return about, {name: " ".join(text.split()) for name, text in _ENTRY.findall(section)}
 
 

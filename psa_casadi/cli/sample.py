@@ -53,6 +53,9 @@ def sample(
         json: JSON file of the figures to write.
         figure: Picture of prior and posterior to write, PNG, SVG or PDF as its name ends.
         report: HTML page to write.
+
+    Example:
+        psa sample record.csv --model model.json -o posterior.nc --figure posterior.png
     """
     from psa_casadi.report.documents.files import posterior_file
     from psa_casadi.report.plots.figures import DPI, picture_format, posterior_figure

@@ -48,6 +48,9 @@ def simulate(
             ends.
         start_voltage: Voltage [V] that holds the stack when it starts, as in `psa export fmu`; by
             default the first one of the record.
+
+    Example:
+        psa simulate --stack P-885.51 --input voltage.csv --history 120,0 -o out.csv
     """
     from psa_casadi.files import atomic_path
     from psa_casadi.report.plots.figures import DPI, columns_figure, picture_format

@@ -20,6 +20,9 @@ def stacks(
     Options:
         quiet: Print names only.
         name: Name of one stack.
+
+    Example:
+        psa stacks P-885.51
     """
     from psa_casadi.report.words.tables import stack_table, stacks_table
 

@@ -39,6 +39,9 @@ def web(
             columns, watch the search.
         port: Port of the page that --diagnose serves; by default a free one.
         no_browser: Print the address and open no browser.
+
+    Example:
+        psa web --model extended.json -o page.html
     """
     if more.args and model is None:  # as it was written before there was --model here
         model = Path(more.args.pop(0))
