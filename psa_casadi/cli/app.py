@@ -69,7 +69,7 @@ def _add(group: typer.Typer, *functions: Callable[..., None]) -> None:
         group.command(
             function.__name__.strip("_"),
             short_help=told.partition("\n\n")[0],
-            epilog=f"\b\nExample: {' '.join(example.split())}",
+            epilog=f"\b\nExample: {' '.join(example.split())}" if example else None,
             context_settings={"allow_extra_args": typer.Context in kinds},
         )(command(function))
 
