@@ -33,6 +33,7 @@ FloatArray = npt.NDArray[np.float64]
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref"
 NOTES = "documentation/fmi-ls-ref.txt"
 INPUTS, OUTPUTS, PARAMETERS, EXPERIMENTS = "in.csv", "ref.csv", "parameters.ssv", "smoke_test.exp"
+_NAMES = {"inputs": INPUTS, "outputs": OUTPUTS, "parameters": PARAMETERS}
 
 #: Relative tolerance that the experiment asks for, and the one the outputs were computed to.
 TOLERANCE = 1e-6
@@ -45,14 +46,6 @@ _DIGITS = 7
 Related = tuple[str, str, str]
 #: MIME types of the files.
 CSV, SSV, EXP = "text/csv", "application/x-ssp-parameter-set", "application/x-ma-hs-experiments"
-_RELATED: dict[str, Related] = {
-    f"{FOLDER}/{PARAMETERS}": (SSV, "parameter", "values of all parameters"),
-    f"{FOLDER}/{EXPERIMENTS}": (
-        EXP, "experiment/smoke-test", "a run over straight segments of every input"),
-    f"{FOLDER}/{INPUTS}": (CSV, "other", "inputs of the smoke test"),
-    f"{FOLDER}/{OUTPUTS}": (CSV, "result", "outputs of the smoke test"),
-    NOTES: ("text/plain", "document", "how the smoke test is meant"),
-}  # fmt: skip
 
 
 def reference_entries(model: Model, more: Mapping[str, Related]) -> dict[str, bytes]:
@@ -71,11 +64,11 @@ def reference_entries(model: Model, more: Mapping[str, Related]) -> dict[str, by
         OUTPUTS: csv_table(("time", *model.output_names), times, outputs),
         PARAMETERS: parameter_set(model),
         EXPERIMENTS: experiments("smoke test", times, [("segments", said, files)]),
-        "fmi-ls-manifest.xml": _manifest({**_RELATED, **more}),
+        "fmi-ls-manifest.xml": _manifest(more),
     }
     notes = filled(
         "fmi-ls-ref.txt", name=model.name, segment=_segment(model), stop=times[-1], step=times[1],
-        inputs=INPUTS, outputs=OUTPUTS, parameters=PARAMETERS, own=OWN_TOLERANCE, digits=_DIGITS,
+        own=OWN_TOLERANCE, digits=_DIGITS, **_NAMES,
     )  # fmt: skip
     entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
     return {**entries, NOTES: notes.encode("utf-8")}
@@ -139,14 +132,14 @@ def experiments(
     return xml_text("experiments.xml", name=name, listed=list(listed), common=common)
 
 
-def _manifest(listed: Mapping[str, Related]) -> str:
+def _manifest(more: Mapping[str, Related]) -> str:
     """Return fmi-ls-manifest.xml, which lists the files: their kind, role and meaning."""
-    related = []
-    for place, (kind, role, meaning) in listed.items():
+    listed = []
+    for place, (kind, role, meaning) in more.items():
         inside = place.startswith(f"{FOLDER}/")
         source = place.removeprefix(f"{FOLDER}/") if inside else f"../../{place}"
-        related.append({"type": kind, "source": source, "role": role, "description": meaning})
-    return xml_text("fmi-ls-manifest.xml", related=related)
+        listed.append({"type": kind, "source": source, "role": role, "description": meaning})
+    return xml_text("fmi-ls-manifest.xml", more=listed, notes=NOTES, run=EXPERIMENTS, **_NAMES)
 
 
 #: Error that the step must meet, over the range of the output.
