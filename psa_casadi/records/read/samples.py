@@ -93,16 +93,17 @@ class Outcome:
     reading; there are none where nothing is read. `notes` are sentences on what was taken for what,
     `unread` the labels of other columns where one that a model has is missing.
     `tables` are the choices where there are several records, `offer` the columns and the sample
-    time [s] with which the file is read.
+    time [s] with which the file is read, `sha256` is that of the file.
     """
 
-    problems: Problems = field(default_factory=Problems)
+    problems: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     values: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     notes: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     offer: tuple[ColumnMap, float | None] | None = None
+    sha256: str = ""
 
     @property
     def is_read(self) -> bool:
@@ -148,13 +149,12 @@ def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
         return found[some[0]]
     listed = quoted(some[:MOST_NAMED])
     more = f" and {len(some) - MOST_NAMED} more" if len(some) > MOST_NAMED else ""
-    problems = Problems()
-    problems.add(
+    problem = (
         f"{path}: holds {len(some)} tables that may be the record ({listed}{more}); take one of"
         f" them, such as {ready_line(*(found[some[0]].offer or ({}, None)), some[0])}"
         f"{f', or each as a record: {ready_line({}, None, ALL)}' if read else ''}."
     )
-    return Outcome(problems, tables=tuple(some))
+    return Outcome((problem,), tables=tuple(some))
 
 
 def _of_one(table: Table, request: Request, segment: str) -> Outcome:
@@ -174,7 +174,7 @@ def _of_one(table: Table, request: Request, segment: str) -> Outcome:
     whole = Problems()
     for sentence in (*(f"{s}." for s in said), *tried.problems.sentences()):
         whole.add(sentence)
-    return replace(tried.outcome, problems=whole, offer=offer)
+    return replace(tried.outcome, problems=whole.sentences(), offer=offer)
 
 
 def _offer(
@@ -218,7 +218,7 @@ class _Try:
         self.request, self.open = request, self.choice.open
         if self.choice.fields:
             self._convert(dict(self.choice.fields))
-        self.outcome.problems = self.problems
+        self.outcome.problems = self.problems.sentences()
 
     def _convert(self, fields: dict[str, Field]) -> None:
         """Take the samples of chosen columns, checked, where they make a record."""
