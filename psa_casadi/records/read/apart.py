@@ -20,9 +20,9 @@ import numpy as np
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
-from psa_casadi.records.read.columns import MARKS, Field, stated_unit
+from psa_casadi.records.read.columns import MARKS, WORDS, Field, stated_unit
 from psa_casadi.records.read.file_bytes import check_there, read_text
-from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
+from psa_casadi.records.read.formats import READERS, ending_of
 from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Table, parts_of_file
 from psa_casadi.records.read.text import decoded, text_tables
@@ -135,7 +135,7 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
         InputError: the file is missing, too large, damaged, or no text.
     """
     check_there(path)
-    kind = EXPORTS.get(Path(path).suffix.lower())
+    kind = WORDS["exports"].get(Path(path).suffix.lower())
     content, digest = read_text(path)
     if kind and b"\0" in content[:4096]:
         raise InputError(f"{path}: is {kind}; export the record as CSV and name that file.")
