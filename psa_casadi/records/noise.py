@@ -148,7 +148,7 @@ _SQUARES = (0.5625, 0.09, 0.0025)
 _SEGMENT, _FEWEST_SEGMENTS, _FAST = 128, 4, 0.045
 _CORRELATIONS = np.arange(0.0, 0.96, 0.01)
 #: A correlation counts from here on, and from so many times 1/sqrt(n): three standard errors.
-_LEAST_noise, _SURE = 0.1, 6.0
+_CORRELATED, _SURE = 0.1, 6.0
 
 
 def high_frequency_noise(signal: FloatArray) -> float:
@@ -204,7 +204,7 @@ def first_order_noise(signal: FloatArray) -> tuple[float, float]:
     levels = np.median(white_part, axis=1)
     best = int(np.argmin(np.sum(np.abs(white_part - levels[:, None]), axis=1)))
     r = float(_CORRELATIONS[best])
-    if r < max(_LEAST_noise, _SURE / np.sqrt(n)):
+    if r < max(_CORRELATED, _SURE / np.sqrt(n)):
         return white, 0.0
     rms = float(np.sqrt(np.exp(levels[best]) / (1 - r**2)))
     return min(rms, float(np.std(signal))), r

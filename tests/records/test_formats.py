@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow
+import pyarrow.feather
 import pyarrow.parquet
 import pytest
 import pyuff
@@ -256,6 +257,17 @@ def test_instants_and_units_of_parquet(kind: str, tmp_path: Path) -> None:
     record = read_record(tmp_path / "a.parquet", **asked)
     np.testing.assert_allclose(record.time, T, atol=1e-9)
     assert list(np.flatnonzero(~record.mask)) == [3]
+
+
+def test_a_file_of_another_ending_is_known_by_its_first_bytes(tmp_path: Path) -> None:
+    named = {"time [s]": T, "voltage [V]": U, "displacement [um]": Y}
+    pyarrow.feather.write_feather(pyarrow.table(named), str(tmp_path / "a.feather"))
+    feather, path = (tmp_path / "a.feather").read_bytes(), tmp_path / "a.log"
+    units = {"time": "s", "voltage": "V", "displacement": "um"}
+    arrays = hdf5(dict(zip(units, (T, U, Y), strict=True)), units)
+    for content in (feather, parquet(named), tdms(named, {}), arrays):
+        is_read(read_record(kept(path, content)))
+    is_read(read_record(tmp_path / "a.feather"))
 
 
 def test_dates_in_workbooks_and_instants_of_tdms(tmp_path: Path) -> None:

@@ -376,7 +376,7 @@ def parquet_tables(path: str) -> list[Table]:
     """Return the table of a Parquet or Feather file; only the columns of a record are read."""
     from pyarrow import feather, parquet  # noqa: PLC0415
 
-    if path.lower().endswith((".feather", ".arrow")):
+    if ending_of(path) in (".feather", ".arrow"):
         whole = feather.read_table(path)
         schema, rows = whole.schema, whole.num_rows
     else:
