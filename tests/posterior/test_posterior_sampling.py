@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import psa_casadi as psa
+from build_scripts.schemas import schema_texts
 from psa_casadi.cli.app import app
 from psa_casadi.interruption import interruptible_work, raise_if_stopped
 from psa_casadi.posterior import chains
 from psa_casadi.posterior.chains import chains_of
 from psa_casadi.posterior.task import Block, Density, Task, Within, task_of
-from psa_casadi.report.documents.files import schema_texts
 from tests.model.stack_models import stack
 
 FloatArray = NDArray[np.float64]
