@@ -7,7 +7,8 @@ from functools import partial
 from importlib.resources import files
 
 import numpy as np
-import numpy.typing as npt
+
+from psa_casadi.units import ComplexArray, FloatArray
 
 
 def _beside(name: str) -> str:
@@ -72,9 +73,6 @@ class Columns:
         samples = ((float(c[self.voltage]), float(c[self.displacement])) for c in cells)
         return csv_text(samples, self.sample_rate, 3)
 
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 #: A line is excited whose mean amplitude is above this share of the largest one's.
 _EXCITED = 0.01

@@ -49,12 +49,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 from numpy.typing import ArrayLike
 
 from psa_casadi.errors import InputError
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 Adjustment = Literal["benjamini-hochberg", "bonferroni"]
 #: What an adjusted p value must be below to be told.
@@ -199,7 +198,6 @@ FEWEST, _ROUNDS = 3, 20
 _MOST = 0.3
 #: Numbers in one matrix while devices are left out in turn.
 _AT_ONCE = 2_000_000
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

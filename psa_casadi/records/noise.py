@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 _WHITE = -0.6
 
@@ -56,7 +55,7 @@ def convolved(x: FloatArray, kernel: FloatArray) -> FloatArray:
     return whole
 
 
-def peaks(values: FloatArray, apart: int, most: int) -> NDArray[np.int64]:
+def peaks(values: FloatArray, apart: int, most: int) -> IndexArray:
     """Return the places of the highest local maxima, at least `apart` samples apart, in order."""
     inner = values[1:-1]
     places = np.flatnonzero((inner > values[:-2]) & (inner >= values[2:])) + 1
@@ -131,7 +130,7 @@ def local_scale(away: FloatArray) -> FloatArray:
     return np.repeat(each, [b.size for b in blocks])
 
 
-def runs_of(found: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs_of(found: BoolArray) -> list[tuple[int, int]]:
     """Return the first sample of every run of True in (n,), and the one behind its last."""
     edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8))).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))

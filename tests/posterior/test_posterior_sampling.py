@@ -7,7 +7,6 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 import psa_casadi as psa
@@ -17,9 +16,9 @@ from psa_casadi.interruption import interruptible_work, raise_if_stopped
 from psa_casadi.posterior import chains
 from psa_casadi.posterior.chains import chains_of
 from psa_casadi.posterior.task import Block, Density, Task, Within, task_of
+from psa_casadi.units import FloatArray
 from tests.model.stack_models import stack
 
-FloatArray = NDArray[np.float64]
 FREE = ("k_L", "A", "n", "tau")
 TRUTH = stack("P-885.51", tau=1e-3)
 

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
@@ -34,7 +33,7 @@ from psa_casadi.records.record import (
     check_length,
     check_time,
 )
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: A sample time [s] to show where a file has no time.
 _EXAMPLE_STEP = 1e-3
@@ -255,7 +254,7 @@ class _Try:
         self.outcome.units, self.outcome.notes = units, tuple(self.notes)
         self.outcome.unread = self.choice.unread
 
-    def _even_time(self, step: float, lines: NDArray[np.int64]) -> Located:
+    def _even_time(self, step: float, lines: IndexArray) -> Located:
         if not 0.0 < step < 1e9:
             raise InputError(
                 f"{self.table.path}: the sample time {step} s is no time; give seconds."
@@ -268,14 +267,14 @@ class _Try:
         return self._located("time", step * np.arange(len(lines), dtype=np.float64), lines)
 
     def _located(
-        self, name: str, values: FloatArray, lines: NDArray[np.int64],
-        wrong: NDArray[np.bool_] | None = None,
+        self, name: str, values: FloatArray, lines: IndexArray,
+        wrong: BoolArray | None = None,
     ) -> Located:  # fmt: skip
         told = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
         return Located(self.table.path, name, values, lines, told, self.table.place)
 
     def _numbers(
-        self, name: str, unit: str, cells: Cells, lines: NDArray[np.int64], point: str
+        self, name: str, unit: str, cells: Cells, lines: IndexArray, point: str
     ) -> Located:
         """Return a column as numbers; what is none is told with its place."""
         table = self.table

@@ -39,11 +39,8 @@ from psa_casadi.simulation.exact.run import ALIKE
 from psa_casadi.simulation.simulate import input_samples, output_of
 from psa_casadi.simulation.start import is_stack
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import convert
+from psa_casadi.units import FloatArray, IndexArray, convert
 from psa_casadi.variables import Output, Parameter, State
-
-FloatArray = npt.NDArray[np.float64]
-IndexArray = npt.NDArray[np.int64]
 
 #: Samples of all records in a page, and records; of more, those that the model misses most.
 _SAMPLES, _RECORDS = 12_000, 6
