@@ -210,9 +210,7 @@ class Outliers:
     found: BoolArray
 
 
-def outliers(
-    theta: ArrayLike, errors: ArrayLike, how: Adjustment = "benjamini-hochberg"
-) -> Outliers:
+def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
     """Return how far every device lies from what the others predict.
 
     `theta` (n,) are estimates, `errors` (n,) their standard errors, in one unit.
@@ -224,18 +222,18 @@ def outliers(
     if y.size <= FEWEST:
         raise InputError(f"{y.size} devices have no outliers that could be told; give more.")
     found = np.zeros(y.size, dtype=np.bool_)
-    z, p, corrected = _tested(y, s, found, how)
+    z, p, corrected = _tested(y, s, found)
     for _ in range(_ROUNDS):
         more = found | (corrected < LIMIT)
         if (more == found).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
             break
         found = more
-        z, p, corrected = _tested(y, s, found, how)
+        z, p, corrected = _tested(y, s, found)
     return Outliers(z, p, corrected, corrected < LIMIT)
 
 
 def _tested(
-    y: FloatArray, s: FloatArray, apart: BoolArray, how: Adjustment
+    y: FloatArray, s: FloatArray, apart: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return z, p and adjusted p of every device against the others that are not `apart`."""
     kept = ~apart
@@ -246,7 +244,7 @@ def _tested(
         spread = s[apart] ** 2 + whole.tau**2 + whole.covariance[0, 0]
         z[apart], dof[apart] = (y[apart] - whole.b[0]) / np.sqrt(spread), whole.dof
     p = _two_sided(z, dof)
-    return z, p, adjusted(p, how)
+    return z, p, adjusted(p)
 
 
 def _left_out(y: FloatArray, s: FloatArray) -> FloatArray:
