@@ -105,7 +105,7 @@ def test_arrays_hold_what_they_state(tmp_path: Path) -> None:
 
 def here(path: Path) -> tuple[str, ...]:
     """Read a file in this process, and return what is wrong with it."""
-    request = Request(displacement=False)
+    request = Request(needed=("voltage",))
     return apart.answered(apart.Asked(str(path), request, str(path.parent))).outcome.problems
 
 

@@ -46,7 +46,7 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     Raises InputError with every mistake found: a column missing, a cell that is no number, times
     that do not increase, fewer than ten samples, a displacement that never changes.
     """
-    outcome = apart.read(str(path), Request(voltage=False))
+    outcome = apart.read(str(path), Request(needed=("displacement",)))
     if outcome.problems:
         raise InputError(outcome.problems)
     if not outcome.units:

@@ -229,9 +229,7 @@ def read_record(
             found, what was expected, what to do. At most 20 are listed, the others counted. An
             option that a sentence offers reads this file.
     """
-    request = Request(
-        displacement=need_displacement, excitation=need_excitation, sample_time=sample_time
-    )
+    request = _of_stack(need_displacement, need_excitation, sample_time)
     request = _said_of(request, columns, Path(path).name)
     return _record(str(path), _read(str(path), request), table=request.table)
 
@@ -252,9 +250,7 @@ def read_records(
     Raises:
         InputError: the mistakes of all files together, or no file was named.
     """
-    request = Request(
-        displacement=need_displacement, excitation=need_excitation, sample_time=sample_time
-    )
+    request = _of_stack(need_displacement, need_excitation, sample_time)
     return tuple(_several(paths, columns, request, _record))
 
 
@@ -280,6 +276,11 @@ def read_signals(
     several = [paths] if isinstance(paths, str | os.PathLike) else paths
     request = replace(_request_of(inputs, outputs), sample_time=sample_time)
     return tuple(_several(several, columns, request, _signals))
+
+
+def _of_stack(displacement: bool, excitation: bool, sample_time: float | None) -> Request:
+    needed = ("voltage", "displacement") if displacement else ("voltage",)
+    return Request(needed=needed, excitation=excitation, sample_time=sample_time)
 
 
 def _request_of(inputs: Sequence[str], outputs: Sequence[str]) -> Request:
@@ -342,7 +343,7 @@ def record_from(
     Raises:
         InputError: every mistake found, one sentence each.
     """
-    request = Request(displacement=need_displacement, sample_time=sample_time)
+    request = _of_stack(need_displacement, False, sample_time)
     return _record(name, _in_memory(table, name, _said_of(request, columns, name)), source="")
 
 

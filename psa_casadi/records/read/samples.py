@@ -47,30 +47,23 @@ class Request:
     """What is wanted of a file.
 
     `columns` says which column is which, `sample_time` [s] gives the time of samples without one,
-    `table` takes one of several tables; `displacement` and `excitation` demand a displacement, and
-    a voltage that changes. Without `voltage` it is a path to follow, which is checked elsewhere.
-    With `names`, those of a model's inputs and outputs, it is a record on that model, which must
-    have the inputs `needed`.
+    `table` takes one of several tables; `needed` are the columns that must be there beside the
+    time, and `excitation` demands a voltage that changes. With `names`, those of a model's inputs
+    and outputs, it is a record on that model; else one of a stack, or without a voltage among the
+    needed a path to follow, which is checked elsewhere.
     """
 
     columns: ColumnMap = field(default_factory=dict)
     sample_time: float | None = None
     table: str = ""
-    displacement: bool = True
+    needed: tuple[str, ...] = ("voltage", "displacement")
     excitation: bool = False
-    voltage: bool = True
     names: tuple[str, ...] = ()
-    needed: tuple[str, ...] = ()
 
     @property
     def required(self) -> tuple[str, ...]:
         """The columns that must be there."""
-        stack = {"voltage": self.voltage, "displacement": self.displacement}
-        needed = {
-            "time": self.sample_time is None,
-            **(dict.fromkeys(self.needed, True) if self.names else stack),
-        }
-        return tuple(name for name, is_needed in needed.items() if is_needed)
+        return (*(("time",) if self.sample_time is None else ()), *self.needed)
 
     @property
     def whole(self) -> tuple[str, ...]:
@@ -377,7 +370,7 @@ class _Try:
             if count:
                 column = f"'{output}'" if outputs else "the displacement"
                 self.notes.append(f"{count} readings of {column} are missing; they are masked.")
-        if not self.request.voltage:
+        if not self.request.names and "voltage" not in self.request.needed:
             return
         check_length(self.table.path, len(next(iter(found.values())).lines), self.problems)
         checks: dict[str, Check] = {"time": check_time, "displacement": check_displacement}
