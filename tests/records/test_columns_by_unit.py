@@ -10,11 +10,7 @@ from scipy.io import savemat
 
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.columns import parse_columns
-from tests.records.record_files import T, V, X, assert_is, kept, offered, refused, text
-
-
-def table(path: Path, *head: str, **form: Any) -> Path:
-    return kept(path, text(*head, **form))
+from tests.records.record_files import T, V, X, assert_is, offered, refused, table
 
 
 def is_read(record: Record, t: float = 1.0, v: float = 1.0, x: float = 1e-6) -> None:
