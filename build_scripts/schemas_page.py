@@ -7,7 +7,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from build_scripts.effects_page import markdown_table
-from psa_casadi.report.documents.files import schema_texts
+from build_scripts.schemas import schema_texts
 from psa_casadi.report.words.tables import Table
 
 PAGE, FOLDER = "json.md", "schemas"

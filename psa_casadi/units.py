@@ -21,6 +21,9 @@ from numpy.typing import NDArray
 from psa_casadi.errors import InputError
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IndexArray = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
 #: A number, or an array of them.
 Value = TypeVar("Value", float, FloatArray)
 

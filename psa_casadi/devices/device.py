@@ -2,16 +2,13 @@
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Any
 
-from psa_casadi.component import Component
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.errors import InputError, MachineError, PsaError
-from psa_casadi.faces import diagnose as any_diagnose
-from psa_casadi.faces import identify as any_identify
-from psa_casadi.identification.identify import identify
+from psa_casadi.faces import diagnose, identify
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.interruption import Work, interruptible_work
 from psa_casadi.model.compose import Model
@@ -20,10 +17,9 @@ from psa_casadi.model.own_effects import known_effects, own_effects
 from psa_casadi.progress import silent
 from psa_casadi.records import Record, read_records, read_signals
 from psa_casadi.records.signals import Signals
-from psa_casadi.report.documents.files import Status, identification_file
+from psa_casadi.report.documents.files import Status
 from psa_casadi.simulation.side_by_side import compiled, one_thread
 from psa_casadi.simulation.start import is_stack
-from psa_casadi.strict_json import json_text
 
 IDENTIFICATION, DIAGNOSIS, MODEL = "identification.json", "diagnosis.json", "model.json"
 #: Works of this process by the run that they belong to, and runs that were stopped.
@@ -67,54 +63,36 @@ def stop(run: str) -> None:
 
 
 def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
-    o = task.options
+    o, job = task.options, task.job
     effects = [c for module in o.modules for c in own_effects(module).values()]
-    start = _started(o, effects)
-    if start is not None and not is_stack(start):
-        return _worked_own(task, start, began)
-    records = read_records(
-        task.job.files, need_excitation=True, columns=o.columns, sample_time=o.sample_time
-    )
-    _refuse_same(records)
-    if o.work == "diagnose":
-        d = diagnose(
-            records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis,
-            effects=tuple(known_effects(effects).values()),
-        )  # fmt: skip
-        name, text, model = DIAGNOSIS, d.to_json(), d.model
+    start = loads(o.model, effects=effects) if isinstance(o.model, str) else o.model
+    asked: dict[str, Any] = {"columns": o.columns, "sample_time": o.sample_time}
+    given: tuple[Any, ...]
+    words: dict[str, Any]
+    records: Sequence[Record | Signals]
+    if start is None or is_stack(start):
+        records = read_records(job.files, need_excitation=True, **asked)
+        given = (records,)
+        words = {"model": start, "stiffness": o.stiffness, "hysteresis": o.hysteresis}
+        if o.work == "diagnose":
+            words["effects"] = tuple(known_effects(effects).values())
     else:
-        found = identify(records, model=start, stiffness=o.stiffness, hysteresis=o.hysteresis)
-        if found.interrupted:
-            raise KeyboardInterrupt
-        name, text, model = IDENTIFICATION, json_text(identification_file(found)), found.model
-    return _done(task, began, ((name, text), (MODEL, dumps(model))), records)
-
-
-def _worked_own(task: DeviceTask, model: Model, began: float) -> DeviceOutcome:
-    """Work with a model of one's own; an imported FMU has no file of its model."""
-    o = task.options
-    records = read_signals(
-        task.job.files, inputs=model.input_names, outputs=model.output_names,
-        columns=o.columns, sample_time=o.sample_time,
+        records = read_signals(
+            job.files, inputs=start.input_names, outputs=start.output_names, **asked
+        )
+        given, words = (start, records), dict(o.words)
+    _refuse_same(records)
+    work: Callable[..., Any] = diagnose if o.work == "diagnose" else identify
+    found = work(*given, progress=silent, **words)
+    if o.work == "identify" and (found.interrupted or found.fit.interrupted):
+        raise KeyboardInterrupt
+    files = [(DIAGNOSIS if o.work == "diagnose" else IDENTIFICATION, found.to_json())]
+    if not found.model.structure.foreign:  # an imported FMU has no file of its model
+        files.append((MODEL, dumps(found.model)))
+    return DeviceOutcome(
+        job.device, "done", time.monotonic() - began, tuple(files),
+        records=tuple((r.name, r.sha256) for r in records),
     )  # fmt: skip
-    _refuse_same(records)
-    if o.work == "diagnose":
-        d = any_diagnose(model, records, progress=silent, **o.words)
-        name, text, last = DIAGNOSIS, d.to_json(), d.model
-    else:
-        found = any_identify(model, records, progress=silent, **o.words)
-        if found.fit.interrupted:
-            raise KeyboardInterrupt
-        name, text, last = IDENTIFICATION, json_text(identification_file(found)), found.model
-    files = [(name, text)]
-    if not last.structure.foreign:
-        files.append((MODEL, dumps(last)))
-    return _done(task, began, tuple(files), records)
-
-
-def _started(o: Options, effects: Sequence[Component]) -> Model | None:
-    """Return the model to start from."""
-    return loads(o.model, effects=effects) if isinstance(o.model, str) else o.model
 
 
 def _refuse_same(records: Sequence[Record | Signals]) -> None:
@@ -127,21 +105,6 @@ def _refuse_same(records: Sequence[Record | Signals]) -> None:
                 " one of the two."
             )
         seen[r.sha256] = r.source
-
-
-def _done(
-    task: DeviceTask,
-    began: float,
-    files: tuple[tuple[str, str], ...],
-    records: Sequence[Record | Signals],
-) -> DeviceOutcome:
-    return DeviceOutcome(
-        task.job.device,
-        "done",
-        time.monotonic() - began,
-        files=files,
-        records=tuple((r.name, r.sha256) for r in records),
-    )
 
 
 def make_ready(job: Job, options: Options) -> None:

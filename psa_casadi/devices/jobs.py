@@ -93,7 +93,7 @@ def _of_path(path: Path) -> tuple[Job, ...]:
     if (path / TABLE).is_file():
         return _of_table(path / TABLE)
     jobs = tuple(
-        Job(entry.name if entry.is_dir() else entry.stem, files)
+        Job(_named(entry), files)
         for entry in sorted(path.iterdir())
         if (files := _records_of(entry))
     )
@@ -172,8 +172,13 @@ def _usual(table: Path, device: str) -> tuple[str, ...]:
     """Return the records that have a device's name beside its table: a folder, or a file."""
     if _BARRED.search(device):
         return ()
-    beside = sorted(f for f in table.parent.iterdir() if f.is_file() and f.stem == device)
+    beside = sorted(f for f in table.parent.iterdir() if f.is_file() and _named(f) == device)
     return _records_of(table.parent / device) or tuple(n for f in beside for n in _records_of(f))
+
+
+def _named(place: Path) -> str:
+    """Return the device that a folder or a file is named after."""
+    return place.name if place.is_dir() else Path(place.name.removesuffix(".gz")).stem
 
 
 def _records_of(place: Path) -> tuple[str, ...]:
@@ -184,7 +189,7 @@ def _records_of(place: Path) -> tuple[str, ...]:
         if f.is_file()
         and not f.name.startswith(".")
         and f.name != TABLE
-        and f.suffix.lower() in ENDINGS
+        and Path(f.name.lower().removesuffix(".gz")).suffix in ENDINGS
     )
 
 

@@ -26,7 +26,6 @@ from psa_casadi.population.finding import NORMAL_95, Finding, Found
 from psa_casadi.population.statistics import (
     FEWEST,
     LIMIT,
-    Adjustment,
     BatchTest,
     Drift,
     MixedFit,
@@ -174,7 +173,7 @@ class Population:
         return tuple(n for n, p in self.drift_p.items() if p < LIMIT)
 
 
-def population(findings: Sequence[Finding], how: Adjustment = "benjamini-hochberg") -> Population:
+def population(findings: Sequence[Finding]) -> Population:
     """Return what a population of devices shows.
 
     Every parameter is tested by itself (`outliers`, `batch_test`, `drift`); p values are adjusted
@@ -190,7 +189,7 @@ def population(findings: Sequence[Finding], how: Adjustment = "benjamini-hochber
         if len(found.places) <= FEWEST:
             few.append(name)
         else:
-            spreads.append(_spread(findings, found, how))
+            spreads.append(_spread(findings, found))
     if not spreads:
         raise InputError(
             f"No parameter is told by more than {FEWEST} of the {len(findings)} devices, so there"
@@ -201,21 +200,19 @@ def population(findings: Sequence[Finding], how: Adjustment = "benjamini-hochber
     return Population(
         findings=tuple(findings),
         spreads=tuple(spreads),
-        outliers=_outliers(findings, spreads, how),
+        outliers=_outliers(findings, spreads),
         batch_p=_over_parameters(
-            {s.estimates.name: s.batches.p_value for s in spreads if s.batches}, how
+            {s.estimates.name: s.batches.p_value for s in spreads if s.batches}
         ),
-        drift_p=_over_parameters(
-            {s.estimates.name: s.drift.p_value for s in spreads if s.drift}, how
-        ),
+        drift_p=_over_parameters({s.estimates.name: s.drift.p_value for s in spreads if s.drift}),
         verdicts=frequencies([f.verdict for f in diagnosed]),
         causes=frequencies(causes, len(diagnosed)) if causes else (),
         left_out=tuple(few),
     )
 
 
-def _spread(findings: Sequence[Finding], found: Estimates, how: Adjustment) -> Spread:
-    far = outliers(found.theta, found.errors, how)
+def _spread(findings: Sequence[Finding], found: Estimates) -> Spread:
+    far = outliers(found.theta, found.errors)
     kept = ~far.found
     theta, errors = found.theta[kept], found.errors[kept]
     those = [findings[k] for k, keep in zip(found.places, kept, strict=True) if keep]
@@ -230,16 +227,14 @@ def _spread(findings: Sequence[Finding], found: Estimates, how: Adjustment) -> S
     return Spread(found, mixed_regression(theta, errors), far, tested, moved)
 
 
-def _outliers(
-    findings: Sequence[Finding], spreads: Sequence[Spread], how: Adjustment
-) -> tuple[Outlier, ...]:
+def _outliers(findings: Sequence[Finding], spreads: Sequence[Spread]) -> tuple[Outlier, ...]:
     """Return the outliers of all parameters, their p values adjusted over all tests together."""
     tests = [
         (findings[k].device, s.estimates.name, float(z), float(p))
         for s in spreads
         for k, z, p in zip(s.estimates.places, s.far.z, s.far.p, strict=True)
     ]
-    corrected = adjusted([p for *_, p in tests], how)
+    corrected = adjusted([p for *_, p in tests])
     found = [
         Outlier(device, name, z, float(c))
         for (device, name, z, _), c in zip(tests, corrected, strict=True)
@@ -248,9 +243,8 @@ def _outliers(
     return tuple(sorted(found, key=lambda o: -abs(o.z)))
 
 
-def _over_parameters(p_values: dict[str, float], how: Adjustment) -> dict[str, float]:
-    corrected = adjusted(list(p_values.values()), how)
-    return dict(zip(p_values, corrected.tolist(), strict=True))
+def _over_parameters(p_values: dict[str, float]) -> dict[str, float]:
+    return dict(zip(p_values, adjusted(list(p_values.values())).tolist(), strict=True))
 
 
 def frequencies(words: Sequence[str], of: int | None = None) -> tuple[Frequency, ...]:

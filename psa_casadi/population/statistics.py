@@ -49,12 +49,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 from numpy.typing import ArrayLike
 
 from psa_casadi.errors import InputError
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 Adjustment = Literal["benjamini-hochberg", "bonferroni"]
 #: What an adjusted p value must be below to be told.
@@ -199,7 +198,6 @@ FEWEST, _ROUNDS = 3, 20
 _MOST = 0.3
 #: Numbers in one matrix while devices are left out in turn.
 _AT_ONCE = 2_000_000
-BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,9 +210,7 @@ class Outliers:
     found: BoolArray
 
 
-def outliers(
-    theta: ArrayLike, errors: ArrayLike, how: Adjustment = "benjamini-hochberg"
-) -> Outliers:
+def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
     """Return how far every device lies from what the others predict.
 
     `theta` (n,) are estimates, `errors` (n,) their standard errors, in one unit.
@@ -226,18 +222,18 @@ def outliers(
     if y.size <= FEWEST:
         raise InputError(f"{y.size} devices have no outliers that could be told; give more.")
     found = np.zeros(y.size, dtype=np.bool_)
-    z, p, corrected = _tested(y, s, found, how)
+    z, p, corrected = _tested(y, s, found)
     for _ in range(_ROUNDS):
         more = found | (corrected < LIMIT)
         if (more == found).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
             break
         found = more
-        z, p, corrected = _tested(y, s, found, how)
+        z, p, corrected = _tested(y, s, found)
     return Outliers(z, p, corrected, corrected < LIMIT)
 
 
 def _tested(
-    y: FloatArray, s: FloatArray, apart: BoolArray, how: Adjustment
+    y: FloatArray, s: FloatArray, apart: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return z, p and adjusted p of every device against the others that are not `apart`."""
     kept = ~apart
@@ -248,7 +244,7 @@ def _tested(
         spread = s[apart] ** 2 + whole.tau**2 + whole.covariance[0, 0]
         z[apart], dof[apart] = (y[apart] - whole.b[0]) / np.sqrt(spread), whole.dof
     p = _two_sided(z, dof)
-    return z, p, adjusted(p, how)
+    return z, p, adjusted(p)
 
 
 def _left_out(y: FloatArray, s: FloatArray) -> FloatArray:

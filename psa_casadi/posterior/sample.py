@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.errors import Problems
 from psa_casadi.files import atomic_write, temporary_folder
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.compose import Model
@@ -280,5 +280,4 @@ def _refuse(model: Model, chains: int, draws: int, tune: int, words: Iterable[st
             f"{chains} chains of {draws} draws after {tune} give no posterior; take one chain, four"
             " draws and one tuning draw at least."
         )
-    if problems:
-        raise InputError(problems.sentences())
+    problems.raise_if_any()

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.identification.fitting.fit import (
@@ -30,7 +29,7 @@ from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Channel, Experiment, whole, without_gaps
 from psa_casadi.simulation.simulate import Way
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ class Within:
     high: FloatArray
 
     @property
-    def bounded(self) -> npt.NDArray[np.bool_]:
+    def bounded(self) -> BoolArray:
         """Which coordinates have a bound (size,)."""
         return np.isfinite(self.low) | np.isfinite(self.high)
 
@@ -372,7 +371,7 @@ def _whitening(
     theta: FloatArray,
     precision: FloatArray,
     covariance: FloatArray,
-    moving: npt.NDArray[np.bool_],
+    moving: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return z at the fit, a little inside the bounds, and a factor of the covariance of z.
 

@@ -1,10 +1,9 @@
 """The periodicity of a drive voltage, its turns, and where it comes back by a threshold."""
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
+from psa_casadi.units import FloatArray, IndexArray
 
 _DOMINANT = 0.5
 _SIDE_LINES = 5
@@ -54,7 +53,7 @@ def turns(voltage: FloatArray, share: float = 0.1) -> bool:
     return bool(min(moves[moves > 0].sum(), -moves[moves < 0].sum()) > share * np.ptp(voltage))
 
 
-def reversals(voltage: FloatArray, threshold: float | None = None) -> npt.NDArray[np.int64]:
+def reversals(voltage: FloatArray, threshold: float | None = None) -> IndexArray:
     """Return the samples at which the voltage turns and comes back by more than `threshold` [V].
 
     Without a threshold it is 1e-4 of the range, which is taken for noise.

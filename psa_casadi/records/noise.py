@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 _WHITE = -0.6
 
@@ -56,7 +55,7 @@ def convolved(x: FloatArray, kernel: FloatArray) -> FloatArray:
     return whole
 
 
-def peaks(values: FloatArray, apart: int, most: int) -> NDArray[np.int64]:
+def peaks(values: FloatArray, apart: int, most: int) -> IndexArray:
     """Return the places of the highest local maxima, at least `apart` samples apart, in order."""
     inner = values[1:-1]
     places = np.flatnonzero((inner > values[:-2]) & (inner >= values[2:])) + 1
@@ -131,7 +130,7 @@ def local_scale(away: FloatArray) -> FloatArray:
     return np.repeat(each, [b.size for b in blocks])
 
 
-def runs_of(found: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs_of(found: BoolArray) -> list[tuple[int, int]]:
     """Return the first sample of every run of True in (n,), and the one behind its last."""
     edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8))).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
@@ -148,7 +147,7 @@ _SQUARES = (0.5625, 0.09, 0.0025)
 _SEGMENT, _FEWEST_SEGMENTS, _FAST = 128, 4, 0.045
 _CORRELATIONS = np.arange(0.0, 0.96, 0.01)
 #: A correlation counts from here on, and from so many times 1/sqrt(n): three standard errors.
-_LEAST_noise, _SURE = 0.1, 6.0
+_CORRELATED, _SURE = 0.1, 6.0
 
 
 def high_frequency_noise(signal: FloatArray) -> float:
@@ -204,7 +203,7 @@ def first_order_noise(signal: FloatArray) -> tuple[float, float]:
     levels = np.median(white_part, axis=1)
     best = int(np.argmin(np.sum(np.abs(white_part - levels[:, None]), axis=1)))
     r = float(_CORRELATIONS[best])
-    if r < max(_LEAST_noise, _SURE / np.sqrt(n)):
+    if r < max(_CORRELATED, _SURE / np.sqrt(n)):
         return white, 0.0
     rms = float(np.sqrt(np.exp(levels[best]) / (1 - r**2)))
     return min(rms, float(np.std(signal))), r

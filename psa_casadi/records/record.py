@@ -7,11 +7,10 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.signals import Hold, Signals, frozen
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Fewer samples than this describe no experiment, and judge none.
 FEWEST_SAMPLES = 16
@@ -32,8 +31,8 @@ class Located:
     path: str
     name: str
     values: FloatArray
-    lines: NDArray[np.int64]
-    reported: NDArray[np.bool_]
+    lines: IndexArray
+    reported: BoolArray
     place: str = "line"
 
     def part(self, where: slice) -> "Located":
@@ -250,7 +249,7 @@ class Record(Signals):
         return "voltage" if self.displacement is None else "displacement"
 
     @property
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self) -> BoolArray:
         """True where a displacement was measured, shape (n,); all False without displacement."""
         if self.displacement is None:
             return np.zeros(self.n, dtype=np.bool_)

@@ -4,13 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from psa_casadi.records.noise import lag_products, runs_of
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
-
-BoolArray = NDArray[np.bool_]
+from psa_casadi.units import BoolArray, FloatArray
 
 #: Voltages are the same to within this share of their range, as the rms of so many neighbours.
 SAME, NEIGHBOURS = 1e-3, 9

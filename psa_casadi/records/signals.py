@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from psa_casadi.errors import Problems
 from psa_casadi.shown import Plotted, frame, with_units
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 #: What an input does between two samples.
 Hold = Literal["linear", "zero"]
@@ -95,7 +95,7 @@ class Signals(Plotted):
         return float(np.median(np.diff(self.time)))
 
     @property
-    def mask(self) -> npt.NDArray[np.bool_]:
+    def mask(self) -> BoolArray:
         """True for every sample, shape (n,); missing readings of an output are nan."""
         return np.ones(self.n, dtype=np.bool_)
 

@@ -10,13 +10,10 @@ Source: Pati, Rezaiifar and Krishnaprasad, "Orthogonal matching pursuit", Asilom
 """
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.records.noise import local_scale, runs_of
-from psa_casadi.units import FloatArray
-
-BoolArray = npt.NDArray[np.bool_]
+from psa_casadi.units import BoolArray, FloatArray
 
 #: Neighbours on each side of which a sample is a function, and instants of the inputs around it.
 _REACH, _INPUTS = 4, 1

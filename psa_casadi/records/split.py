@@ -14,6 +14,7 @@ from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.repeats import held
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.suspects import HIDDEN
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Turns by less than this share of the span are no reversals here; sizes of rises and falls are
 #: told apart at these shares of it, durations by this factor.
@@ -79,9 +80,7 @@ def loop_sizes(records: Sequence[Record], span: float) -> int:
     return int(np.sum(np.diff(sizes) > _SIZES[0])) + 1 if sizes.size else 0
 
 
-def counts(
-    records: Sequence[Record], chosen: Sequence[npt.NDArray[np.bool_]], span: float
-) -> dict[Kind, int]:
+def counts(records: Sequence[Record], chosen: Sequence[BoolArray], span: float) -> dict[Kind, int]:
     """Return how many of the `chosen` samples of the records belong to each kind."""
     found: dict[Kind, int] = {}
     for record, mask in zip(records, chosen, strict=True):
@@ -152,9 +151,6 @@ def gaps(record: Record | Signals, inputs: Sequence[str] = ("voltage",)) -> tupl
             found.append(k)
     return tuple(found)
 
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 #: Number of blocks a record is cut into, and of how many one is held out when no record is named.
 BLOCKS, HELD_OUT_EVERY = 16, 4
@@ -322,7 +318,7 @@ def split(record: Record) -> Experiment:
     return Experiment(record, record.mask & ~held, record.mask & held)
 
 
-def _held_out(record: Record, index: npt.NDArray[np.int64]) -> tuple[int, ...]:
+def _held_out(record: Record, index: IndexArray) -> tuple[int, ...]:
     """Return the blocks to hold out, one of every four; `index` (n,) is the block of each sample.
 
     Of all choices, the one that holds the fewest extremes of voltage and rate out, among the

@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import (
@@ -22,9 +21,8 @@ from psa_casadi.records.noise import (
 )
 from psa_casadi.records.record import Record
 from psa_casadi.records.spikes import spikes_in
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
-BoolArray = NDArray[np.bool_]
 #: Signals (n,) by their names.
 Columns = Mapping[str, FloatArray]
 

@@ -4,14 +4,12 @@ import hashlib
 import io
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from build_scripts.measured_data import measured_data_directory
 from psa_casadi.datasets import DATASETS
 from psa_casadi.datasets.devices import OneAxis, linear_response
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Folder of the originals of the steering mirror, which may not exist.
 ORIGINALS = measured_data_directory() / "steering_mirror_test"

@@ -213,6 +213,9 @@ def test_a_table_of_jobs_is_read(records: Path) -> None:
     assert (first.batch, first.day) == ("B1", date(2026, 3, 14))
     assert [Path(f).name for f in first.files] == ["loops.csv"]
     assert [Path(f).name for f in second.files] == ["second.csv", "loops.csv", "third.csv"]
+    (records / "jobs.csv").unlink()
+    (records / "third.csv").rename(records / "third.csv.gz")
+    assert [job.device for job in jobs_given(records)] == ["first", "second", "third"]
 
 
 @pytest.mark.parametrize(

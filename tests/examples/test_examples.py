@@ -133,17 +133,13 @@ def test_a_recipe_is_shown_and_copied_with_its_scripts(tmp_path: Path) -> None:
     assert "add_block" in (folder / "run_stack.m").read_text(encoding="utf-8")
 
 
-def test_an_example_is_copied_or_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    copied = _run("van-der-pol", "-o", str(tmp_path), "--copy-only")
-    assert copied.code == 0
-    assert [p.name for p in tmp_path.iterdir()] == ["van_der_pol.py"]
-
+def test_an_example_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def main(folder: Path) -> dict[str, float]:
         (folder / "left.txt").write_text("left", encoding="utf-8")
         return {"amplitude [m]": 2.0}
 
     monkeypatch.setattr(van_der_pol, "main", main)
-    ran = _run("van_der_pol", "-o", str(tmp_path))
+    ran = _run("van-der-pol", "-o", str(tmp_path))
     assert ran.code == 0
     assert "amplitude [m]: 2\n" in ran.out
     assert "left.txt" in ran.out

@@ -1,14 +1,13 @@
 """Binary files read in this process or a fork of it, where many would start one of their own."""
 
-import json
 import os
 import signal
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from psa_casadi.records.read import apart
+from psa_casadi.records.read.samples import Outcome
 
 
 def answered_by_fork(asked: apart.Asked) -> apart.Answer:
@@ -18,11 +17,11 @@ def answered_by_fork(asked: apart.Asked) -> apart.Answer:
     if not child:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, 5.0)
-        answer.write_text(json.dumps(msgspec.to_builtins(apart.answered(asked))))
+        answer.write_text(apart.text_in(apart.answered(asked)))
         os._exit(0)
     if os.waitpid(child, 0)[1]:
-        return apart.Answer((f"{asked.path}: is damaged.",))
-    return msgspec.convert(json.loads(answer.read_text()), apart.Answer)
+        return apart.Answer(Outcome((f"{asked.path}: is damaged.",)))
+    return apart.answer_in(answer.read_text())
 
 
 def here(monkeypatch: pytest.MonkeyPatch) -> None:

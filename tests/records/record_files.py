@@ -41,6 +41,11 @@ def kept(path: Path, content: str | bytes) -> Path:
     return path
 
 
+def table(path: Path, *head: str, **form: Any) -> Path:
+    """Write a table with these lines above its rows."""
+    return kept(path, text(*head, **form))
+
+
 def assert_is(
     record: Record, t: ArrayLike, v: ArrayLike, x: ArrayLike | None, accuracy: float = 1e-12
 ) -> None:

@@ -10,11 +10,7 @@ from scipy.io import savemat
 
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.read.columns import parse_columns
-from tests.records.record_files import T, V, X, assert_is, kept, offered, refused, text
-
-
-def table(path: Path, *head: str, **form: Any) -> Path:
-    return kept(path, text(*head, **form))
+from tests.records.record_files import T, V, X, assert_is, offered, refused, table
 
 
 def is_read(record: Record, t: float = 1.0, v: float = 1.0, x: float = 1e-6) -> None:
@@ -179,14 +175,13 @@ def test_a_recording_of_control_desk_is_read(tmp_path: Path, *, packed: bool) ->
 
 
 def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
-    names = [{"Name": "Model Root/cmd", "Data": V}, {"Name": "Model Root/Out1", "Data": X}]
-    line = "voltage=exp001.Model Root/cmd:V,displacement=exp001.Model Root/Out1:um"
-    assert suggestion(recorded(tmp_path / "a.mat", *names)) == line
-    is_read(read_record(tmp_path / "a.mat", columns=line))
-    alike = [{"Name": "Out1", "Data": V}, {"Name": "Out1", "Data": X}]
-    line = "voltage=exp001.Y.1:V,displacement=exp001.Y.2:um"
-    assert suggestion(recorded(tmp_path / "b.mat", *alike)) == line
-    is_read(read_record(tmp_path / "b.mat", columns=line))
-    path = recorded(tmp_path / "c.mat", *names, clocks=2)
-    both = "voltage=exp001.Model Root/cmd:V,displacement=exp001.Model Root/Out1:um"
-    assert suggestion(path) == both  # the two clocks are the same
+    path = tmp_path / "a.mat"
+    for names, (drive, moved) in (
+        (("Out1", "Out1"), ("Y.1", "Y.2")),
+        (("Model Root/cmd", "Model Root/Out1"), ("Model Root/cmd", "Model Root/Out1")),
+    ):
+        line = f"voltage=exp001.{drive}:V,displacement=exp001.{moved}:um"
+        signals = [{"Name": n, "Data": y} for n, y in zip(names, (V, X), strict=True)]
+        assert suggestion(recorded(path, *signals)) == line
+        is_read(read_record(path, columns=line))
+    assert suggestion(recorded(path, *signals, clocks=2)) == line  # the two clocks are the same

@@ -105,8 +105,8 @@ def test_arrays_hold_what_they_state(tmp_path: Path) -> None:
 
 def here(path: Path) -> tuple[str, ...]:
     """Read a file in this process, and return what is wrong with it."""
-    request = Request(displacement=False)
-    return apart.answered(apart.Asked(str(path), request, str(path.parent))).problems
+    request = Request(needed=("voltage",))
+    return apart.answered(apart.Asked(str(path), request, str(path.parent))).outcome.problems
 
 
 def test_no_more_is_read_than_a_record_may_hold(

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.diagnosis.diagnose import diagnose
@@ -19,12 +18,12 @@ from psa_casadi.identification.identify import identify
 from psa_casadi.records import Record, sine, split, time_grid
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.split import LEAST, MOST, PARTS, excerpts
+from psa_casadi.units import FloatArray
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.stack import draw_stack
 from tests.tiers import slow
 from tests.voltages import steps
 
-FloatArray = NDArray[np.float64]
 SLOPE, NOISE = 1e-7, 1e-8
 N = 250_000
 T = time_grid(25.0, 1e-4)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow
+import pyarrow.feather
 import pyarrow.parquet
 import pytest
 import pyuff
@@ -21,7 +22,7 @@ from psa_casadi.records.read.columns import parse_columns
 from tests.records import laboratory_bytes
 from tests.records.laboratory_bytes import hdf5, parquet, tdms
 from tests.records.reading_here import here
-from tests.records.record_files import HEADER, ROWS, assert_is, problems_of, write
+from tests.records.record_files import HEADER, ROWS, assert_is, kept, problems_of, write
 
 N = 24
 T = np.arange(N) / 8.0
@@ -178,20 +179,14 @@ def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
 
 
 def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
-    text = write(tmp_path / "text.mat", HEADER, *ROWS)
-    (problem,) = problems_of(text)
-    assert "is no readable MATLAB file" in problem
-    (problem,) = problems_of(write(tmp_path / "text.parquet", HEADER, *ROWS))
-    assert "is no readable Parquet file" in problem
-    (tmp_path / "broken.mat").write_bytes(
-        b"MATLAB 7.3".ljust(512) + b"\x89HDF\r\n\x1a\n" + b"x" * 50
-    )
-    (problem,) = problems_of(tmp_path / "broken.mat")
-    assert "is no readable MATLAB file" in problem
-    (problem,) = problems_of(tmp_path / "absent.mat")
-    assert "there is no such file" in problem
-    (problem,) = problems_of(tmp_path / "absent.parquet")
-    assert "there is no such file" in problem
+    text = "\n".join([HEADER, *ROWS]).encode()
+    broken = b"MATLAB 7.3".ljust(512) + b"\x89HDF\r\n\x1a\n" + b"x" * 50
+    for name, content, kind in (
+        ("text.mat", text, "MATLAB"), ("text.parquet", text, "Parquet"),
+        ("broken.mat", broken, "MATLAB"),
+    ):  # fmt: skip
+        (problem,) = problems_of(kept(tmp_path / name, content))
+        assert f"is no readable {kind} file" in problem
     empty = mat(tmp_path / "empty.mat", {"note": "nothing"})
     assert "the column 'time' is missing (found: nothing)" in problems_of(empty)[0]
 
@@ -262,6 +257,17 @@ def test_instants_and_units_of_parquet(kind: str, tmp_path: Path) -> None:
     record = read_record(tmp_path / "a.parquet", **asked)
     np.testing.assert_allclose(record.time, T, atol=1e-9)
     assert list(np.flatnonzero(~record.mask)) == [3]
+
+
+def test_a_file_of_another_ending_is_known_by_its_first_bytes(tmp_path: Path) -> None:
+    named = {"time [s]": T, "voltage [V]": U, "displacement [um]": Y}
+    pyarrow.feather.write_feather(pyarrow.table(named), str(tmp_path / "a.feather"))
+    feather, path = (tmp_path / "a.feather").read_bytes(), tmp_path / "a.log"
+    units = {"time": "s", "voltage": "V", "displacement": "um"}
+    arrays = hdf5(dict(zip(units, (T, U, Y), strict=True)), units)
+    for content in (feather, parquet(named), tdms(named, {}), arrays):
+        is_read(read_record(kept(path, content)))
+    is_read(read_record(tmp_path / "a.feather"))
 
 
 def test_dates_in_workbooks_and_instants_of_tdms(tmp_path: Path) -> None:

@@ -12,17 +12,13 @@ from psa_casadi.errors import InputError
 from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import Field
 from tests.records.laboratory_bytes import Cell, xlsx
-from tests.records.record_files import T, V, X, kept, text
+from tests.records.record_files import T, V, X, table, text
 
 ROWS = text().splitlines()
 
 
-def written(path: Path, *head: str) -> Path:
-    return kept(path, text(*head))
-
-
 def test_names_units_and_first_rows_of_a_table(tmp_path: Path) -> None:
-    path = written(tmp_path / "a.csv", "of 12 March", "", "time [ms],Drive (V),x/um")
+    path = table(tmp_path / "a.csv", "of 12 March", "", "time [ms],Drive (V),x/um")
     head = head_of(path, 3)
     assert head.names == ("time", "Drive (V)", "x/um")
     assert head.units == ("ms", "V", "um")
@@ -36,20 +32,20 @@ def test_names_units_and_first_rows_of_a_table(tmp_path: Path) -> None:
 
 
 def test_what_is_asked_is_guessed_as_it_is_suggested(tmp_path: Path) -> None:
-    head = head_of(written(tmp_path / "a.csv", "Elapsed (us),CH1,CH2"))
+    head = head_of(table(tmp_path / "a.csv", "Elapsed (us),CH1,CH2"))
     assert head.guess == {
         "time": Field(0, "us"), "voltage": Field(1, "V"), "displacement": Field(2, "um"),
     }  # fmt: skip
-    head = head_of(written(tmp_path / "b.csv", "t (s),CH1 (mV),CH2 (mV)"))
+    head = head_of(table(tmp_path / "b.csv", "t (s),CH1 (mV),CH2 (mV)"))
     assert head.units == ("s", "mV", "mV")
     assert head.guess["voltage"] == Field(1, "mV")
     assert head.guess["displacement"] == Field(2, "um")  # of a sensor's volts: to be scaled
-    head = head_of(written(tmp_path / "c.csv", "t (s),Drive Monitor (V),Setpoint (um)"))
+    head = head_of(table(tmp_path / "c.csv", "t (s),Drive Monitor (V),Setpoint (um)"))
     assert head.guess == {"time": Field(0, "s"), "monitor_voltage": Field(1, "V")}
 
 
 def test_a_name_with_a_mark_of_the_option_is_no_name(tmp_path: Path) -> None:
-    head = head_of(written(tmp_path / "a.csv", '"time [s]","U, V","x: um"'))
+    head = head_of(table(tmp_path / "a.csv", '"time [s]","U, V","x: um"'))
     assert head.names == ("time", "", "")
     assert head.guess["voltage"] == Field(1, "V")
 
@@ -87,7 +83,7 @@ def test_workbooks_and_parquet_files_have_the_same_head(tmp_path: Path) -> None:
 
 def test_the_head_of_one_of_several_tables(tmp_path: Path) -> None:
     path, two = (
-        written(tmp_path / "a.csv", "time [s],U [V],x [um]"),
+        table(tmp_path / "a.csv", "time [s],U [V],x [um]"),
         "Clock [ms],Drive [V],Probe [nm]",
     )
     path.write_text("\n".join([path.read_text(), "run 2", two, *ROWS, ""]))

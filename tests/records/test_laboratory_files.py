@@ -4,7 +4,6 @@ import gzip
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +13,7 @@ from psa_casadi.records import read_record, record_from
 from psa_casadi.records.read.columns import parse_columns
 from tests.records import record_files
 from tests.records.laboratory_bytes import gcs, hdf5, lvm, named, npy, npz, tdms, xlsx
-from tests.records.record_files import T, V, X, assert_is, offered, problems_of, refused
-
-
-def text(*head: str, **form: Any) -> bytes:
-    return record_files.text(*head, **form).encode()
-
+from tests.records.record_files import T, V, X, assert_is, offered, problems_of, refused, text
 
 TABLE = np.column_stack([T, V, X])
 ROWS: list[list[float]] = TABLE.tolist()
@@ -35,7 +29,7 @@ VX_ROWS = [row[1:] for row in ROWS]
 FIELDS = named(T, V, X)
 
 #: Files that are read as they are, by what they are; the name says the ending.
-READ: dict[str, bytes] = {
+READ: dict[str, str | bytes] = {
     "own names": text("time [s],voltage [V],displacement [um]"),
     "symbols with units": text("t [s],V [V],x [um]"),
     "round brackets": text("Time (s),Voltage (V),Displacement (um)"),
@@ -55,24 +49,22 @@ READ: dict[str, bytes] = {
     "tabs": text("time [s]\tvoltage [V]\tdisplacement [um]", mark="\t"),
     "spaces": text("time_s voltage_V displacement_um", mark="   "),
     "semicolons": text("time [s];voltage [V];displacement [um]", mark=";"),
-    "UTF-16": text("Time (s),Voltage (V),Position (µm)").decode().encode("utf-16"),
-    "gzip": gzip.compress(text("time [s],voltage [V],displacement [um]")),
-    "Windows line ends": text("time [s],voltage [V],displacement [um]").replace(b"\n", b"\r\n"),
-    "old line ends": text("time [s],voltage [V],displacement [um]").replace(b"\n", b"\r"),
+    "UTF-16": text("Time (s),Voltage (V),Position (µm)").encode("utf-16"),
+    "gzip": gzip.compress(text("time [s],voltage [V],displacement [um]").encode()),
+    "Windows line ends": text("time [s],voltage [V],displacement [um]").replace("\n", "\r\n"),
+    "old line ends": text("time [s],voltage [V],displacement [um]").replace("\n", "\r"),
     "UTF-8 with a mark": text("\ufefftime [s],voltage [V],displacement [µm]"),
-    "Western Europe": text("# Pr\xfcfstand 3", "time [s];voltage [V];displacement [µm]", mark=";")
-    .decode()
-    .encode("cp1252"),
+    "Western Europe": text(
+        "# Pr\xfcfstand 3", "time [s];voltage [V];displacement [µm]", mark=";"
+    ).encode("cp1252"),
     "German, all quoted": re.sub(
-        rb"[^;\n]+", rb'"\g<0>"', text("Zeit [s];Spannung [V];Weg [um]", mark=";", point=",")
+        r"[^;\n]+", r'"\g<0>"', text("Zeit [s];Spannung [V];Weg [um]", mark=";", point=",")
     ),
     "a column more": text(
         "time_s,voltage_V,displacement_um,comment", columns=(T, V, X, ["ok"] * 20)
     ),
     "units written out": text("Time (sec),Voltage (Volts),Position (microns)"),
-    "UTF-16 without a mark": text("Time (s),Voltage (V),Position (um)")
-    .decode()
-    .encode("utf-16-le"),
+    "UTF-16 without a mark": text("Time (s),Voltage (V),Position (um)").encode("utf-16-le"),
     "quoted, units behind a comma": text('"Time, s","Voltage, V","Displacement, um"'),
     "LabVIEW, one time.lvm": lvm(["Voltage", "Position"], ROWS, units=["Volts", "um"]),
     "LabVIEW, no time.lvm": lvm(
@@ -112,7 +104,7 @@ def assert_read(path: Path, columns: str | None = None) -> None:
     assert_is(read_record(path, columns=columns), T, V, 1e-6 * X, 1e-5)
 
 
-def kept(folder: Path, form: str, content: bytes) -> Path:
+def kept(folder: Path, form: str, content: str | bytes) -> Path:
     """Write a file whose ending is that of its form's name, else `.csv`."""
     return record_files.kept(folder / f"r{Path(form).suffix or '.csv'}", content)
 
@@ -123,7 +115,7 @@ def test_a_laboratorys_file_is_read_as_it_is(form: str, tmp_path: Path) -> None:
 
 
 #: Files that do not say enough.
-OPEN: dict[str, bytes] = {
+OPEN: dict[str, str | bytes] = {
     "symbols without units": text("t,V,x"),
     "names without units": text("Elapsed time,Drive voltage,Position"),
     "no header": text(),
@@ -140,7 +132,7 @@ OPEN: dict[str, bytes] = {
             *(f"{k},{v:.6g},{x:.6g},,," for k, (v, x) in enumerate(zip(V, X, strict=True))),
             "",
         ]
-    ).encode(),
+    ),
     "channels with spaces": text("Zeit;Kanal A;Kanal B", "(s);(V);(mV)", mark=";", point=","),
     "LabVIEW, untitled.lvm": lvm(["Untitled", "Untitled 1"], ROWS),
     "data recorder.dat": gcs(
@@ -187,7 +179,7 @@ def test_the_line_to_type_is_told_once_and_works(
     "spoil", [lambda d: d[:40], lambda d: d[:10] + b"\0" * 9 + d[19:], lambda _: b"\x1f\x8b"]
 )
 def test_a_damaged_gzip_file_is_refused(spoil: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    path = record_files.kept(tmp_path / "r.csv.gz", spoil(READ["gzip"]))
+    path = record_files.kept(tmp_path / "r.csv.gz", spoil(gzip.compress(text().encode())))
     with pytest.raises(InputError, match="damaged gzip"):
         read_record(path)
 

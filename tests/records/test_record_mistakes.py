@@ -79,16 +79,12 @@ def test_a_quote_that_never_ends_is_told_as_a_mistake(tmp_path: Path) -> None:
 
 
 def test_one_file_has_one_decimal_sign(tmp_path: Path) -> None:
-    rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
-    rows[4] = "0.004;4;0,4"
-    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER.replace(",", ";"), *rows))
-    assert "line 6, column 'time': found '0.004'" in problem
-    assert "other numbers of this file have a decimal comma, write this one so too" in problem
-    rows = [row.replace(",", ";") for row in ROWS]
-    rows[4] = "0,004;4;0.4"
-    (problem,) = problems_of(write(tmp_path / "b.csv", HEADER.replace(",", ";"), *rows))
-    assert "line 6, column 'time': found '0,004'" in problem
-    assert "have a decimal point, write this one so too" in problem
+    for sign, other, name in ((",", ".", "comma"), (".", ",", "point")):
+        rows = [row.replace(",", ";").replace(".", sign) for row in ROWS]
+        rows[4] = f"0{other}004;4;0{sign}4"
+        (problem,) = problems_of(write(tmp_path / "a.csv", HEADER.replace(",", ";"), *rows))
+        assert f"line 6, column 'time': found '0{other}004'" in problem
+        assert f"other numbers of this file have a decimal {name}, write this one so too" in problem
 
 
 def test_decimal_commas_between_commas_are_told_from_a_row_too_long(tmp_path: Path) -> None:

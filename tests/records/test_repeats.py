@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import Record, excitation
 from psa_casadi.records.repeats import held, holds, repeats, repetitions
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 LEVEL = 1e-8
 STEP = 1e-3

@@ -4,12 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.records.spikes import spikes_in
+from psa_casadi.units import BoolArray, FloatArray
 
-FloatArray = NDArray[np.float64]
 N, DT = 3000, 1e-3
 T = DT * np.arange(N, dtype=np.float64)
 #: Input and output of a motion, without noise.
@@ -55,7 +54,7 @@ def bounces(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 MOTIONS = (resonance, tones, held_steps, slow, bounces)
 
 
-def found(u: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+def found(u: FloatArray, y: FloatArray) -> BoolArray:
     return spikes_in(y, u[:, None], 8.0, 1e-3 * float(np.ptp(y)), 3)
 
 

@@ -10,8 +10,7 @@ from psa_casadi.records import Record
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import divided, split, whole
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import BoolArray, FloatArray
 
 
 def record(voltage: FloatArray) -> Record:
@@ -44,7 +43,7 @@ def test_reversals_see_through_noise_of_a_converter(seed: int) -> None:
     )
 
 
-def borders(held_out: NDArray[np.bool_]) -> NDArray[np.intp]:
+def borders(held_out: BoolArray) -> NDArray[np.intp]:
     """Return the samples at which fitting turns into holding out or back."""
     return np.flatnonzero(np.diff(held_out.astype(int))) + 1
 

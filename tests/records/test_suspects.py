@@ -5,17 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.notes import texts
 from psa_casadi.records import Record, multisine, sine, time_grid, triangle
 from psa_casadi.records.noise import quantum_of
 from psa_casadi.records.suspects import cleaned, suspects
+from psa_casadi.units import FloatArray
 from tests.tiers import slow_but
 from tests.voltages import steps
 
-FloatArray = NDArray[np.float64]
 RANGE = 20e-6
 T = time_grid(1.0, 1e-4)
 

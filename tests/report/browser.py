@@ -26,12 +26,9 @@ SCRIPTS = Path(__file__).parent / "scripts"
 _CONSOLE = re.compile(r":CONSOLE[:(]\d+\)?\] (.*)")
 
 
-_FOUND = re.compile(r'<pre id="axe">(.*?)</pre>', re.DOTALL)
-
-
 def script(name: str) -> str:
-    """Return a script of the tests as a part of a page."""
-    return f"<script>{(SCRIPTS / name).with_suffix('.js').read_text('utf-8')}</script>"
+    """Return a script of the tests."""
+    return (SCRIPTS / f"{name}.js").read_text("utf-8")
 
 
 @dataclass(frozen=True)
@@ -55,20 +52,9 @@ class Browser:
     def serious_faults(self, page: Path, *flags: str) -> list[str]:
         """Return what axe calls serious or critical in a page: the rule, and where first."""
         axe = files("axe_core_python").joinpath("axe.min.js").read_text(encoding="utf-8")
-        text = page.read_text(encoding="utf-8")
-        copy = page.with_name(f"{page.stem}-axe.html")  # beside it: its links are relative
-        text = without_policy(text)
-        looked = f"<script>{axe}</script>{script('axe')}</body>".join(text.rsplit("</body>", 1))
-        copy.write_text(looked, encoding="utf-8")
-        try:
-            found = _FOUND.search(self.document(copy, *flags)[0])
-        finally:
-            copy.unlink()
-        if found is None:
-            pytest.fail(f"axe did not come to an end on {page}")
         return [
             f"{fault['rule']}: {fault['places'][0]}"
-            for fault in json.loads(unescape(found[1]))
+            for fault in driven(self, page, f"{axe}\n{script('axe')}", *flags, silent=False)
             if fault["impact"] in ("serious", "critical")
         ]
 
@@ -93,13 +79,12 @@ def driven(browser: Browser, page: Path, script: str, *flags: str, silent: bool 
 
     Where it is to be `silent`, a word on the console fails the test.
     """
-    copy = page.with_name(f"{page.stem}-driven.html")
-    tell = "document.getElementById('driven').textContent = JSON.stringify(found);"
-    wait = "window.addEventListener('load', () => setTimeout(() => {", "}, 500));"
-    begin, last = wait
+    copy = page.with_name(f"{page.stem}-driven.html")  # beside it: its links are relative
     call = (
-        f"<pre id='driven'></pre><script>function tell(found) {{ {tell} }}"
-        f"{begin}{script}{last}</script></body>"
+        "<pre id='driven'></pre><script>function tell(found) {"
+        " document.getElementById('driven').textContent = JSON.stringify(found); }\n"
+        f"window.addEventListener('load', () => setTimeout(() => {{\n{script}}}, 500));"
+        "</script></body>"
     )
     text = call.join(without_policy(page.read_text(encoding="utf-8")).rsplit("</body>", 1))
     copy.write_text(text, encoding="utf-8")
@@ -123,16 +108,22 @@ def find_browser(folder: Path) -> Browser:
 
 
 def on_a_phone(page: Path, height: int = 844) -> Path:
-    """Return a page that shows `page` in a frame as wide as a phone, and how it came out."""
+    """Return a page that shows `page` in a frame as wide as a phone."""
     inner, outer = (page.with_name(f"{page.stem}-{part}.html") for part in ("inner", "phone"))
-    text = page.read_text(encoding="utf-8")
-    text = without_policy(text)
-    inner.write_text(text.replace("</body>", f"{script('phone')}</body>"), encoding="utf-8")
+    text = without_policy(page.read_text(encoding="utf-8"))
+    told = f"<script>{script('phone')}</script></body>"
+    inner.write_text(text.replace("</body>", told), encoding="utf-8")
     outer.write_text(
-        "<!DOCTYPE html><html><body style='margin:0'><script>addEventListener('message',"
-        "function (e) { document.getElementById('told').textContent = e.data; });</script>"
+        "<!DOCTYPE html><html><body style='margin:0'>"
         f"<iframe src='{inner.name}' width='{PHONE}' height='{height}' style='border:0'></iframe>"
-        "<pre id='told'></pre></body></html>",
+        "</body></html>",
         encoding="utf-8",
     )
     return outer
+
+
+def seen_on_a_phone(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
+    """Return how a page came out on a phone."""
+    hear = "addEventListener('message', function (e) { tell(JSON.parse(e.data)); });"
+    found: dict[str, Any] = driven(browser, on_a_phone(page), hear, silent=silent)
+    return found

@@ -2,11 +2,8 @@
 
 import base64
 import json
-import re
 from collections.abc import Mapping, Sequence
-from html import unescape
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +12,7 @@ from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.report.page.live import doubles, live_data
 from psa_casadi.units import FloatArray
-from tests.report.browser import SCRIPTS, Browser
-
-_PAGE = (SCRIPTS / "module.html").read_text("utf-8")
-_TOLD = re.compile(r'<pre id="told">(.*?)</pre>', re.DOTALL)
+from tests.report.browser import Browser, driven, script
 
 
 def library(name: str) -> str:
@@ -46,16 +40,11 @@ def run_in_browser(
     Each is run so many `times` more, and `spent` is what one takes then [ms].
     """
     given = {"model": live_data(model, web_module(model)), "cases": list(cases), "times": times}
-    page: Path = browser.folder / "module.html"
-    text = _PAGE.format(
-        library=library("packed.js") + library("live_model.js"), given=json.dumps(given)
-    )
-    page.write_text(text, encoding="utf-8")
-    document, console = browser.document(page)
-    found = _TOLD.search(document)
-    assert found is not None
-    assert console == [], console
-    told: list[dict[str, Any]] = json.loads(unescape(found[1]))
+    page = browser.folder / "module.html"
+    scripts = "".join(map(library, ("packed.js", "live_model.js")))
+    page.write_text(f"<html><body><script>{scripts}</script></body></html>", encoding="utf-8")
+    told = driven(browser, page, f"var given = {json.dumps(given)};\n{script('module')}")
+    assert isinstance(told, list), told
     for row in told:
         if "shown" in row:
             row["shown"] = np.frombuffer(base64.b64decode(row["shown"]), "<f8")

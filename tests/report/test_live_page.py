@@ -22,7 +22,7 @@ from psa_casadi.report.page.live import LiveModel, live_data, live_design, thinn
 from psa_casadi.variables import Interval, Provenance
 from tests.any_model import own_models
 from tests.any_model import own_plants as plants
-from tests.report.browser import DARK, SCRIPTS, Browser, driven
+from tests.report.browser import DARK, Browser, driven, script
 from tests.report.html_page import Page
 from tests.report.report_cases import diagnosis
 from tests.tiers import slow
@@ -62,12 +62,9 @@ def rms_of(d: psa.StackDiagnosis, values: dict[str, float]) -> float:
     return 1e9 * float(np.sqrt(np.mean(residual[seen & e.held_out] ** 2)))
 
 
-MOVES = (SCRIPTS / "live.js").read_text("utf-8")
-
-
 @pytest.fixture(scope="module")
 def moved(browser: Browser, page: Path) -> dict[str, Any]:
-    found: dict[str, Any] = driven(browser, page, MOVES, DARK)
+    found: dict[str, Any] = driven(browser, page, script("live"), DARK)
     return found
 
 

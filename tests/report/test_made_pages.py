@@ -13,11 +13,11 @@ from build_scripts import copied_pages, ports_page
 from build_scripts.commands_page import commands
 from build_scripts.effects_page import PICTURES, overview, section
 from build_scripts.measured_data import ROOT
+from build_scripts.schemas import FILES, schema_texts
 from build_scripts.schemas_page import WRITTEN_BY
 from build_scripts.schemas_page import section as schema_section
 from psa_casadi.cli.app import app
 from psa_casadi.examples.index import examples
-from psa_casadi.report.documents.files import FILES, schema_texts
 
 
 def _options(group: TyperGroup, name: str) -> dict[str, list[str]]:

@@ -19,13 +19,10 @@ from psa_casadi.report.page.playground import playground
 from psa_casadi.simulation.compiler import run_compiler
 from tests.contract.helpers import done
 from tests.model.sampled_models import controller
-from tests.report.browser import SCRIPTS, Browser, driven, on_a_phone
-from tests.report.test_report_browser import told_of
+from tests.report.browser import Browser, driven, script, seen_on_a_phone
 from tests.tiers import slow
 
 pytestmark = pytest.mark.xdist_group("browser")
-
-PLAY = (SCRIPTS / "playground.js").read_text("utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +34,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def played(browser: Browser, page: Path) -> dict[str, Any]:
-    found: dict[str, Any] = driven(browser, page, PLAY, "--window-size=1200,2000")
+    found: dict[str, Any] = driven(browser, page, script("playground"), "--window-size=1200,2000")
     return found
 
 
@@ -142,9 +139,7 @@ def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_said(played: dict[s
 
 @slow
 def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> None:
-    document, console = browser.document(on_a_phone(page))
-    assert console == []
-    found = told_of(document)
+    found = seen_on_a_phone(browser, page)
     assert found["outside"] == []
     assert found["needed"] == found["width"]
     assert found["smallest"] >= 9

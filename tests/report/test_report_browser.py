@@ -1,11 +1,8 @@
 """The pages in a real browser: drawn, without complaint, on a desk, on a phone, at night."""
 
-import json
 import re
 from dataclasses import replace
-from html import unescape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +10,7 @@ from matplotlib.image import imread
 
 from psa_casadi.identification.advice import Advice
 from psa_casadi.report.page.results import write_fit_report, write_report
-from tests.report.browser import DARK, PHONE, Browser, on_a_phone
+from tests.report.browser import DARK, PHONE, Browser, on_a_phone, seen_on_a_phone
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow, slow_but
 
@@ -84,28 +81,17 @@ def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: P
     tiny = '<p style="font-size: 8px">tiny</p>'
     script = "<script>console.error('by hand'); absent.name = 1;</script>"
     broken.write_text(f"<html><body>{wide}{tiny}{script}</body></html>", encoding="utf-8")
-    document, console = browser.document(on_a_phone(broken))
-    assert "by hand" in console[0]
-    assert "Uncaught ReferenceError" in console[1]
-    found = told_of(document)
+    with pytest.raises(pytest.fail.Exception, match=r"by hand.*Uncaught ReferenceError"):
+        seen_on_a_phone(browser, broken)
+    found = seen_on_a_phone(browser, broken, silent=False)
     assert found["needed"] > PHONE
     assert found["outside"] == ["DIV.drawing"]
     assert found["small"] == ["tiny"]
 
 
-def told_of(document: str) -> dict[str, Any]:
-    found = re.search(r'<pre id="told">(.*?)</pre>', document, re.DOTALL)
-    assert found is not None
-    assert found.group(1), "the page in the frame did not report"
-    report: dict[str, Any] = json.loads(unescape(found.group(1)))
-    return report
-
-
 @slow
 def test_a_phone_shows_it_legibly_without_scrolling_sideways(browser: Browser, page: Path) -> None:
-    document, console = browser.document(on_a_phone(page))
-    assert console == []
-    told = told_of(document)
+    told = seen_on_a_phone(browser, page)
     assert told["width"] == told["needed"] == PHONE
     assert told["outside"] == told["small"] == []
     assert told["drawn"] == told["plots"] >= 14

@@ -46,8 +46,9 @@ def read_target(path: str | os.PathLike[str]) -> Target:
     Raises InputError with every mistake found: a column missing, a cell that is no number, times
     that do not increase, fewer than ten samples, a displacement that never changes.
     """
-    outcome, _ = apart.read(str(path), Request(voltage=False))
-    outcome.problems.raise_if_any()
+    outcome = apart.read(str(path), Request(needed=("displacement",)))
+    if outcome.problems:
+        raise InputError(outcome.problems)
     if not outcome.units:
         raise InputError(
             f"{path}: holds no path; name its columns as 'time [s],displacement [um]'."

@@ -9,7 +9,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
@@ -20,9 +20,9 @@ import numpy as np
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
-from psa_casadi.records.read.columns import MARKS, Field, stated_unit
+from psa_casadi.records.read.columns import MARKS, WORDS, Field, stated_unit
 from psa_casadi.records.read.file_bytes import check_there, read_text
-from psa_casadi.records.read.formats import EXPORTS, READERS, ending_of
+from psa_casadi.records.read.formats import READERS, ending_of
 from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Table, parts_of_file
 from psa_casadi.records.read.text import decoded, text_tables
@@ -58,15 +58,10 @@ class Asked:
 
 @dataclass(frozen=True)
 class Answer:
-    """What the other process tells of a file: what is wrong, its head, or what its numbers are."""
+    """What the other process tells of a file: its head, or what it holds but for the numbers."""
 
-    problems: tuple[str, ...] = ()
+    outcome: Outcome
     head: Head | None = None
-    units: Mapping[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    unread: tuple[str, ...] = ()
-    tables: tuple[str, ...] = ()
-    sha256: str = ""
 
 
 def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -> Head:
@@ -100,8 +95,8 @@ _MEMORY, _MEMORY_PER_BYTE = 3 * 2**30, 12
 _MODULE = "psa_casadi.records.read.apart"
 
 
-def read(path: str, request: Request) -> tuple[Outcome, str]:
-    """Return what `samples_of` returns of a file, and the file's SHA-256.
+def read(path: str, request: Request) -> Outcome:
+    """Return what `samples_of` returns of a file, with the file's SHA-256.
 
     Raises:
         InputError: the file is missing, empty, too large, damaged, or needs a package that is not
@@ -110,17 +105,12 @@ def read(path: str, request: Request) -> tuple[Outcome, str]:
     """
     if not ending_of(path):
         tables, digest = text_of(path)
-        return samples_of(path, tables, request), digest
+        return replace(samples_of(path, tables, request), sha256=digest)
     with temporary_folder() as folder:
-        told = answered_apart(Asked(path, request, str(folder)))
-        outcome = Outcome(
-            units=told.units, notes=told.notes, unread=told.unread, tables=told.tables
-        )
-        for sentence in told.problems:
-            outcome.problems.add(sentence)
-        if told.units:
+        outcome = answered_apart(Asked(path, request, str(folder))).outcome
+        if outcome.units:
             outcome.values = np.load(folder / "values.npy")
-        return outcome, told.sha256
+        return outcome
 
 
 def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
@@ -134,7 +124,7 @@ def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
         return head_of_tables(place, text_of(place)[0], count, table)
     told = answered_apart(Asked(place, count=count, table=table))
     if told.head is None:
-        raise InputError(told.problems)
+        raise InputError(told.outcome.problems)
     return told.head
 
 
@@ -145,7 +135,7 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
         InputError: the file is missing, too large, damaged, or no text.
     """
     check_there(path)
-    kind = EXPORTS.get(Path(path).suffix.lower())
+    kind = WORDS["exports"].get(Path(path).suffix.lower())
     content, digest = read_text(path)
     if kind and b"\0" in content[:4096]:
         raise InputError(f"{path}: is {kind}; export the record as CSV and name that file.")
@@ -177,15 +167,30 @@ def answered_apart(asked: Asked) -> Answer:
     if done.returncode:
         why = "the library that reads it fails, or needs more memory than such a file may"
         return _unreadable(path, why)
-    return msgspec.convert(json.loads(done.stdout.splitlines()[-1]), Answer)
+    return answer_in(done.stdout.splitlines()[-1])
+
+
+def text_in(answer: Answer) -> str:
+    """Return an answer in JSON, without the numbers."""
+    return json.dumps(msgspec.to_builtins(answer, enc_hook=lambda _: None))
+
+
+def answer_in(text: str | bytes) -> Answer:
+    """Return the answer that a text in JSON is."""
+    none = np.zeros((0, 0))
+    return msgspec.convert(json.loads(text), Answer, dec_hook=lambda *_: none)
 
 
 def _unreadable(path: str, why: str) -> Answer:
     """Return that a file is damaged."""
     *_, kind = READERS[ending_of(path)]
-    return Answer((
-        f"{path}: is no readable {kind} file ({why}); save it again, or export the record as CSV.",
-    ))  # fmt: skip
+    return _refused(
+        f"{path}: is no readable {kind} file ({why}); save it again, or export the record as CSV."
+    )
+
+
+def _refused(*problems: str) -> Answer:
+    return Answer(Outcome(problems))
 
 
 def answered(asked: Asked) -> Answer:
@@ -194,28 +199,20 @@ def answered(asked: Asked) -> Answer:
     try:
         tables = READERS[ending_of(path)][0](path)
         if asked.request is None:
-            return Answer(head=head_of_tables(path, tables, asked.count, asked.table))
+            return Answer(Outcome(), head_of_tables(path, tables, asked.count, asked.table))
         outcome = samples_of(path, tables, asked.request)
     except InputError as error:
-        return Answer(tuple(error.problems))
+        return _refused(*error.problems)
     except MemoryError:
-        return Answer((f"{path}: needs more memory than a record may; split it.",))
+        return _refused(f"{path}: needs more memory than a record may; split it.")
     except Exception as error:  # noqa: BLE001 - a library may raise anything on a damaged file
         said = str(error).splitlines()
         return _unreadable(path, said[0][:120] if said else type(error).__name__)
     with Path(path).open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        outcome.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
     if outcome.units:
         np.save(Path(asked.out) / "values.npy", outcome.values)
-    return Answer(
-        outcome.problems.sentences(),
-        None,
-        outcome.units,
-        outcome.notes,
-        outcome.unread,
-        outcome.tables,
-        digest,
-    )
+    return Answer(outcome)
 
 
 def main() -> None:
@@ -228,7 +225,7 @@ def main() -> None:
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]
         limit = asked.memory if hard == resource.RLIM_INFINITY else min(asked.memory, hard)
         resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
-    sys.stdout.write(f"\n{json.dumps(msgspec.to_builtins(answered(asked)))}\n")
+    sys.stdout.write(f"\n{text_in(answered(asked))}\n")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import numpy as np
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
     SI_UNITS,
+    WORDS,
     ColumnMap,
     Field,
     Source,
@@ -36,28 +37,12 @@ from psa_casadi.units import parse_unit
 QUANTITIES = {"time": "time", "voltage": "voltage", "displacement": "length"}
 #: What `--columns` takes for its own marks in a name, where a unit follows.
 _MARKS = set(",[]")
-#: Words for what is commanded and for what drives, for what is measured, and for neither.
-_COMMANDED = {
-    "command", "commanded", "cmd", "setpoint", "set", "target", "reference", "ref", "demand",
-    "desired", "soll", "sollwert", "drive", "excitation",
-}  # fmt: skip
-_DRIVING = {"hv", "piezo", "pzt", "amp", "amplifier", "actuator"}
-_MEASURED = {
-    "measured", "meas", "sense", "sensor", "feedback", "readback", "probe", "gauge", "detector",
-    "lvdt", "actual", "ist", "istwert",
-}  # fmt: skip
-_NEITHER = {
-    "mon", "error", "err", "fehler", "offset", "gain", "noise", "rms", "std", "min", "max",
-}  # fmt: skip
-#: Words for what only says when, and for what only counts.
-_MARKING = {
-    "trigger", "trig", "sync", "gate", "ttl", "marker", "flag", "enable", "status", "comment",
-    "remark", "note", "digital", "dio",
-}  # fmt: skip
-_COUNTING = {
-    "sample", "samples", "index", "idx", "nr", "no", "number", "num", "count", "counter", "point",
-    "points", "row", "line", "nummer", "pos",
-}  # fmt: skip
+#: Words for what is commanded and for what drives, for what is measured, and for neither; for what
+#: only says when, and for what only counts.
+_COMMANDED, _DRIVING, _MEASURED, _NEITHER, _MARKING, _COUNTING = (
+    set(WORDS["roles"][role])
+    for role in ("commanded", "driving", "measured", "neither", "marking", "counting")
+)
 _FOR = {"voltage": _COMMANDED | _DRIVING, "displacement": _MEASURED}
 _AGAINST = {
     "time": _MARKING | _COUNTING,

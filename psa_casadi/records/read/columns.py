@@ -3,8 +3,11 @@
 import difflib
 import os
 import re
+import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.record import COLUMNS, Column
@@ -188,35 +191,10 @@ def files_named(wanted: ColumnMap) -> set[str]:
     return {key.rpartition("@")[0] for key in wanted if "@" in key}
 
 
-#: Other names of a column, in lower case with single spaces; single letters are symbols.
-ALIASES: dict[str, tuple[str, ...]] = {
-    "time": (
-        "time", "t", "elapsed", "elapsed time", "timestamp", "time stamp", "x_value", "zeit",
-    ),
-    "voltage": (
-        "voltage", "v", "u", "volt", "volts", "drive voltage", "input voltage", "output voltage",
-        "command voltage", "applied voltage", "control voltage", "piezo voltage", "vin", "v_in",
-        "u_in", "vpzt", "hv out", "hv output", "spannung",
-    ),
-    "displacement": (
-        "displacement", "x", "y", "d", "z", "disp", "position", "pos", "travel", "stroke",
-        "elongation", "extension", "deflection", "sensor position", "measured position",
-        "current position", "actual position", "real position", "weg", "auslenkung",
-    ),
-    "load_force": ("load_force", "load force", "force", "load", "f", "kraft"),
-    "current": ("current", "i", "drive current", "strom"),
-    "temperature": ("temperature", "temp", "temperatur"),
-    "monitor_voltage": (
-        "monitor_voltage", "monitor voltage", "voltage monitor", "monitor", "v_mon", "u_mon",
-        "vmon", "drive monitor", "output monitor", "piezo monitor", "amplifier monitor",
-        "hv monitor", "monitorspannung",
-    ),
-    "charge": ("charge", "q", "ladung"),
-    "displacement_2": (
-        "displacement_2", "displacement 2", "second displacement", "x2", "x_2", "y2",
-    ),
-    "strain": ("strain", "strain gauge", "dehnung"),
-}  # fmt: skip
+#: What laboratories call columns and units, and what their programs keep.
+WORDS: dict[str, dict[str, Any]] = tomllib.loads(
+    files("psa_casadi.records.read").joinpath("words.toml").read_text(encoding="utf-8")
+)
 #: Units as instruments write them out, in lower case, each with its plural.
 _SPELLED = {"s": ("second", "sec"), "V": ("volt",), "m": ("meter", "metre"), "N": ("newton",),
             "A": ("ampere", "amp")}  # fmt: skip
@@ -227,13 +205,10 @@ _UNIT_OF = {
     for word in words
     for prefix, spelled in _MULTIPLES.items()
     for end in ("", "s")
-} | {
-    "msec": "ms", "usec": "us", "sekunden": "s", "micron": "um", "microns": "um",
-    "celsius": "degC", "deg c": "degC", "degrees celsius": "degC",
-}  # fmt: skip
+} | WORDS["units"]
 #: What names the place of a channel behind the quantity: `Current Position of axis 1`.
 _OF_A_PLACE = re.compile(r" of [\w ]*?(axis|chan|channel)\s*:?\s*\w+$")
-_COLUMN_OF = {alias: column for column, names in ALIASES.items() for alias in names}
+_COLUMN_OF = {alias: name for name, aliases in WORDS["columns"].items() for alias in aliases}
 #: With a unit behind it, a symbol that is a unit itself is a name too: `s/um`.
 _WITH_UNIT = _COLUMN_OF | {"s": "displacement"}
 #: A name and its unit: in brackets of any form, after a slash, comma, underscore or space.

@@ -376,7 +376,7 @@ def parquet_tables(path: str) -> list[Table]:
     """Return the table of a Parquet or Feather file; only the columns of a record are read."""
     from pyarrow import feather, parquet  # noqa: PLC0415
 
-    if path.lower().endswith((".feather", ".arrow")):
+    if ending_of(path) in (".feather", ".arrow"):
         whole = feather.read_table(path)
         schema, rows = whole.schema, whole.num_rows
     else:
@@ -462,14 +462,6 @@ READERS: dict[str, tuple[Callable[[str], list[Table]], str, str]] = {
     )
     for ending in endings.split()
 }
-#: Files whose makers' programs write something that is read, by their ending.
-EXPORTS = {
-    ".raw": "a result of SPICE", ".trc": "a LeCroy waveform", ".isf": "a Tektronix waveform",
-    ".wfm": "an oscilloscope's waveform", ".bin": "a binary waveform", ".ibw": "an Igor wave",
-    ".psdata": "a PicoScope file", ".svd": "a Polytec file", ".pvd": "a Polytec file",
-    ".mf4": "a measurement file", ".mdf": "a measurement file", ".opj": "an Origin project",
-    ".opju": "an Origin project", ".d7d": "a Dewesoft file", ".dxd": "a Dewesoft file",
-}  # fmt: skip
 _MAGIC = {
     b"\x89HDF": ".h5", b"PK\x03\x04": ".xlsx", b"PAR1": ".parquet", b"TDSm": ".tdms",
     b"\x93NUM": ".npy", b"MATL": ".mat", b"ARRO": ".feather", b"\xd0\xcf\x11\xe0": ".xls",

@@ -59,8 +59,8 @@ def parts_of(path: str) -> list[str]:
 
 def joined(
     files: Sequence[tuple[str, Sequence[Table], str]], request: Request, *, alone: bool = False
-) -> tuple[Outcome, str]:
-    """Return the samples of files that hold the channels of one record, and a hash of them all.
+) -> Outcome:
+    """Return the samples of files that hold the channels of one record, with a hash of them all.
 
     Each file is given by its path, its tables and its SHA-256. The clock is that of the first;
     where another differs, its channels are interpolated at those instants that both have, and a
@@ -100,8 +100,8 @@ def joined(
             f"{', '.join(resampled)} has another clock: it is interpolated at the instants of"
             f" {Path(files[0][0]).name}.",
         )
-    digest = hashlib.sha256("".join(sha for *_, sha in files).encode()).hexdigest()
-    return outcome, digest
+    outcome.sha256 = hashlib.sha256("".join(sha for *_, sha in files).encode()).hexdigest()
+    return outcome
 
 
 def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
@@ -229,11 +229,9 @@ def read_record(
             found, what was expected, what to do. At most 20 are listed, the others counted. An
             option that a sentence offers reads this file.
     """
-    request = Request(
-        displacement=need_displacement, excitation=need_excitation, sample_time=sample_time
-    )
+    request = _of_stack(need_displacement, need_excitation, sample_time)
     request = _said_of(request, columns, Path(path).name)
-    return _record(str(path), *_read(str(path), request), table=request.table)
+    return _record(str(path), _read(str(path), request), table=request.table)
 
 
 def read_records(
@@ -252,9 +250,7 @@ def read_records(
     Raises:
         InputError: the mistakes of all files together, or no file was named.
     """
-    request = Request(
-        displacement=need_displacement, excitation=need_excitation, sample_time=sample_time
-    )
+    request = _of_stack(need_displacement, need_excitation, sample_time)
     return tuple(_several(paths, columns, request, _record))
 
 
@@ -282,6 +278,11 @@ def read_signals(
     return tuple(_several(several, columns, request, _signals))
 
 
+def _of_stack(displacement: bool, excitation: bool, sample_time: float | None) -> Request:
+    needed = ("voltage", "displacement") if displacement else ("voltage",)
+    return Request(needed=needed, excitation=excitation, sample_time=sample_time)
+
+
 def _request_of(inputs: Sequence[str], outputs: Sequence[str]) -> Request:
     names = tuple(dict.fromkeys((*inputs, *outputs)))
     return Request(names=names, needed=tuple(inputs))
@@ -307,10 +308,8 @@ def _several(
         try:
             each = [own.table]
             if own.table == ALL:
-                each = [*_read(path, replace(own, table=""))[0].tables] or [""]
-            for table in each:
-                found = _read(path, replace(own, table=table))
-                records.append(make(path, *found, table=table))
+                each = [*_read(path, replace(own, table="")).tables] or [""]
+            records += [make(path, _read(path, replace(own, table=t)), table=t) for t in each]
         except InputError as error:
             failed += 1
             problems.extend(error.problems)
@@ -319,7 +318,7 @@ def _several(
         with suppress(InputError):
             outcome = joined([(p, *apart.text_of(p)) for p in places], own, alone=True)
         if outcome is not None:
-            return [make("+".join(places), *outcome)]
+            return [make("+".join(places), outcome)]
     if not places:
         problems.append("no record was named; name at least one CSV file.")
     if problems:
@@ -344,12 +343,12 @@ def record_from(
     Raises:
         InputError: every mistake found, one sentence each.
     """
-    request = Request(displacement=need_displacement, sample_time=sample_time)
-    return _record(name, *_in_memory(table, name, _said_of(request, columns, name)), source="")
+    request = _of_stack(need_displacement, False, sample_time)
+    return _record(name, _in_memory(table, name, _said_of(request, columns, name)), source="")
 
 
-def _in_memory(table: TableLike, name: str, request: Request) -> tuple[Outcome, str]:
-    """Return the samples of a table in memory, and a hash of them."""
+def _in_memory(table: TableLike, name: str, request: Request) -> Outcome:
+    """Return the samples of a table in memory, with a hash of them."""
     own = list(table if isinstance(table, Mapping) else table.columns)
 
     def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
@@ -363,7 +362,8 @@ def _in_memory(table: TableLike, name: str, request: Request) -> tuple[Outcome, 
     digest = hashlib.sha256()
     for (column, unit), values in zip(outcome.units.items(), outcome.values.T, strict=True):
         digest.update(f"{column} [{unit}]".encode() + np.ascontiguousarray(values).tobytes())
-    return outcome, digest.hexdigest()
+    outcome.sha256 = digest.hexdigest()
+    return outcome
 
 
 def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
@@ -393,7 +393,7 @@ def _said_of(request: Request, columns: str | ColumnMap | None, file: str) -> Re
     return replace(request, columns=own, table=chosen)
 
 
-def _read(path: str, request: Request) -> tuple[Outcome, str]:
+def _read(path: str, request: Request) -> Outcome:
     parts = parts_of(path)
     if len(parts) == 1:
         return apart.read(path, request)
@@ -437,8 +437,8 @@ def signals_given(
         if isinstance(given, Signals):
             return Signals(**{f.name: getattr(given, f.name) for f in fields(Signals)})
         if _is_path(given):
-            return _signals(str(given), *_read(str(given), request))
-        return _signals(name, *_in_memory(given, name, request), source="")
+            return _signals(str(given), _read(str(given), request))
+        return _signals(name, _in_memory(given, name, request), source="")
 
     found = _each(given, one, first, f"'{(*inputs, *outputs)[0]}': u")
     if not found:
@@ -483,11 +483,9 @@ def _is_table(given: object) -> TypeGuard[TableLike]:
     return isinstance(given, Mapping) or hasattr(given, "columns")
 
 
-def _record(
-    path: str, outcome: Outcome, digest: str, *, source: str | None = None, table: str = ""
-) -> Record:
+def _record(path: str, outcome: Outcome, *, source: str | None = None, table: str = "") -> Record:
     """Return the record in SI units; one of several is named and hashed with its table."""
-    read, whence = _samples(path, outcome, digest, source, table)
+    read, whence = _samples(path, outcome, source, table)
     columns = {name: to_si(values, outcome.units[name]) for name, values in read.items()}
     for array in columns.values():
         array.flags.writeable = False  # a record need not copy it
@@ -497,11 +495,9 @@ def _record(
     return Record(**{**columns, **whence, "displacement_unit": unit})
 
 
-def _signals(
-    path: str, outcome: Outcome, digest: str, *, source: str | None = None, table: str = ""
-) -> Signals:
+def _signals(path: str, outcome: Outcome, *, source: str | None = None, table: str = "") -> Signals:
     """Return the record on any model, its columns in the units of the file."""
-    columns, whence = _samples(path, outcome, digest, source, table)
+    columns, whence = _samples(path, outcome, source, table)
     time = to_si(columns.pop("time"), outcome.units["time"])
     _check_instants(path, time)
     units = {name: outcome.units[name] for name in columns}
@@ -509,12 +505,14 @@ def _signals(
 
 
 def _samples(
-    path: str, outcome: Outcome, digest: str, source: str | None, table: str
+    path: str, outcome: Outcome, source: str | None, table: str
 ) -> tuple[dict[str, FloatArray], dict[str, Any]]:
     """Return the columns that were read, and what says whence they are."""
-    outcome.problems.raise_if_any()
+    if outcome.problems:
+        raise InputError(outcome.problems)
     if not outcome.units:
         raise InputError(f"{path}: holds no columns; name them as 'time [s]', 'voltage [V]'.")
+    digest = outcome.sha256
     stem = "+".join(Path(part).stem for part in parts_of(path)) if source is None else path
     return dict(zip(outcome.units, outcome.values.T, strict=True)), {
         "name": plain(f"{stem}_{table}" if table else stem),

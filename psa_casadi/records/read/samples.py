@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
@@ -34,7 +33,7 @@ from psa_casadi.records.record import (
     check_length,
     check_time,
 )
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: A sample time [s] to show where a file has no time.
 _EXAMPLE_STEP = 1e-3
@@ -48,30 +47,23 @@ class Request:
     """What is wanted of a file.
 
     `columns` says which column is which, `sample_time` [s] gives the time of samples without one,
-    `table` takes one of several tables; `displacement` and `excitation` demand a displacement, and
-    a voltage that changes. Without `voltage` it is a path to follow, which is checked elsewhere.
-    With `names`, those of a model's inputs and outputs, it is a record on that model, which must
-    have the inputs `needed`.
+    `table` takes one of several tables; `needed` are the columns that must be there beside the
+    time, and `excitation` demands a voltage that changes. With `names`, those of a model's inputs
+    and outputs, it is a record on that model; else one of a stack, or without a voltage among the
+    needed a path to follow, which is checked elsewhere.
     """
 
     columns: ColumnMap = field(default_factory=dict)
     sample_time: float | None = None
     table: str = ""
-    displacement: bool = True
+    needed: tuple[str, ...] = ("voltage", "displacement")
     excitation: bool = False
-    voltage: bool = True
     names: tuple[str, ...] = ()
-    needed: tuple[str, ...] = ()
 
     @property
     def required(self) -> tuple[str, ...]:
         """The columns that must be there."""
-        stack = {"voltage": self.voltage, "displacement": self.displacement}
-        needed = {
-            "time": self.sample_time is None,
-            **(dict.fromkeys(self.needed, True) if self.names else stack),
-        }
-        return tuple(name for name, is_needed in needed.items() if is_needed)
+        return (*(("time",) if self.sample_time is None else ()), *self.needed)
 
     @property
     def whole(self) -> tuple[str, ...]:
@@ -93,16 +85,17 @@ class Outcome:
     reading; there are none where nothing is read. `notes` are sentences on what was taken for what,
     `unread` the labels of other columns where one that a model has is missing.
     `tables` are the choices where there are several records, `offer` the columns and the sample
-    time [s] with which the file is read.
+    time [s] with which the file is read, `sha256` is that of the file.
     """
 
-    problems: Problems = field(default_factory=Problems)
+    problems: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     values: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     notes: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     offer: tuple[ColumnMap, float | None] | None = None
+    sha256: str = ""
 
     @property
     def is_read(self) -> bool:
@@ -148,13 +141,12 @@ def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
         return found[some[0]]
     listed = quoted(some[:MOST_NAMED])
     more = f" and {len(some) - MOST_NAMED} more" if len(some) > MOST_NAMED else ""
-    problems = Problems()
-    problems.add(
+    problem = (
         f"{path}: holds {len(some)} tables that may be the record ({listed}{more}); take one of"
         f" them, such as {ready_line(*(found[some[0]].offer or ({}, None)), some[0])}"
         f"{f', or each as a record: {ready_line({}, None, ALL)}' if read else ''}."
     )
-    return Outcome(problems, tables=tuple(some))
+    return Outcome((problem,), tables=tuple(some))
 
 
 def _of_one(table: Table, request: Request, segment: str) -> Outcome:
@@ -174,7 +166,7 @@ def _of_one(table: Table, request: Request, segment: str) -> Outcome:
     whole = Problems()
     for sentence in (*(f"{s}." for s in said), *tried.problems.sentences()):
         whole.add(sentence)
-    return replace(tried.outcome, problems=whole, offer=offer)
+    return replace(tried.outcome, problems=whole.sentences(), offer=offer)
 
 
 def _offer(
@@ -218,7 +210,7 @@ class _Try:
         self.request, self.open = request, self.choice.open
         if self.choice.fields:
             self._convert(dict(self.choice.fields))
-        self.outcome.problems = self.problems
+        self.outcome.problems = self.problems.sentences()
 
     def _convert(self, fields: dict[str, Field]) -> None:
         """Take the samples of chosen columns, checked, where they make a record."""
@@ -255,7 +247,7 @@ class _Try:
         self.outcome.units, self.outcome.notes = units, tuple(self.notes)
         self.outcome.unread = self.choice.unread
 
-    def _even_time(self, step: float, lines: NDArray[np.int64]) -> Located:
+    def _even_time(self, step: float, lines: IndexArray) -> Located:
         if not 0.0 < step < 1e9:
             raise InputError(
                 f"{self.table.path}: the sample time {step} s is no time; give seconds."
@@ -268,14 +260,14 @@ class _Try:
         return self._located("time", step * np.arange(len(lines), dtype=np.float64), lines)
 
     def _located(
-        self, name: str, values: FloatArray, lines: NDArray[np.int64],
-        wrong: NDArray[np.bool_] | None = None,
+        self, name: str, values: FloatArray, lines: IndexArray,
+        wrong: BoolArray | None = None,
     ) -> Located:  # fmt: skip
         told = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
         return Located(self.table.path, name, values, lines, told, self.table.place)
 
     def _numbers(
-        self, name: str, unit: str, cells: Cells, lines: NDArray[np.int64], point: str
+        self, name: str, unit: str, cells: Cells, lines: IndexArray, point: str
     ) -> Located:
         """Return a column as numbers; what is none is told with its place."""
         table = self.table
@@ -378,7 +370,7 @@ class _Try:
             if count:
                 column = f"'{output}'" if outputs else "the displacement"
                 self.notes.append(f"{count} readings of {column} are missing; they are masked.")
-        if not self.request.voltage:
+        if not self.request.names and "voltage" not in self.request.needed:
             return
         check_length(self.table.path, len(next(iter(found.values())).lines), self.problems)
         checks: dict[str, Check] = {"time": check_time, "displacement": check_displacement}

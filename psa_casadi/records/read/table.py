@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import MARKS, unit_named
 from psa_casadi.records.record import FEWEST_SAMPLES
-from psa_casadi.units import FloatArray, parse_unit, to_si
+from psa_casadi.units import BoolArray, FloatArray, IndexArray, parse_unit, to_si
 
 #: The cells of one column: numbers or instants (n,), or texts.
 Cells = NDArray[Any] | Sequence[str]
@@ -31,7 +31,7 @@ class Columns:
     """Some columns of a table, one value for each row, and the number of each row in the file."""
 
     cells: Sequence[Cells]
-    lines: NDArray[np.int64]
+    lines: IndexArray
 
 
 #: What gives the columns of a table by their indices, at most so many rows of them. It adds rows
@@ -152,7 +152,7 @@ def without_overload(values: FloatArray) -> FloatArray:
     return np.where(over, math.nan, values) if over.any() else values
 
 
-def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray, NDArray[np.bool_]]:
+def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray, BoolArray]:
     """Return the numbers in texts, nan where there is none, and which texts are no numbers.
 
     A word for a missing reading is no such text. The decimal sign is `point`; a cell's own unit is
@@ -336,7 +336,7 @@ def evened(time: FloatArray) -> tuple[FloatArray, float] | None:
     return None
 
 
-def starts_of(time: FloatArray) -> NDArray[np.int64]:
+def starts_of(time: FloatArray) -> IndexArray:
     """Return the indices at which the time begins anew, the first sample among them."""
     with np.errstate(invalid="ignore"):
         return np.flatnonzero(np.r_[True, np.diff(time) < 0.0])

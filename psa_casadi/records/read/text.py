@@ -18,7 +18,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
@@ -44,7 +43,7 @@ from psa_casadi.records.read.table import (
     unit_of_times,
 )
 from psa_casadi.records.record import COLUMNS, FEWEST_SAMPLES
-from psa_casadi.units import to_si, units_of
+from psa_casadi.units import FloatArray, to_si, units_of
 
 #: Lines in which the first header is looked for, and the most that are asked for further ones.
 _MOST_LINES, _MOST_HEADERS = 500, 20_000
@@ -339,7 +338,7 @@ class _Part:
             below += 1
         return kept[: len(kept) - below] if below < _MOST_BELOW else kept
 
-    def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> NDArray[np.float64] | None:
+    def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> FloatArray | None:
         """Let NumPy read all rows; None if any of them needs a closer look."""
         body, mark = "\n".join(rows), self.layout.delimiter
         point = decimal_sign([c for row in rows[:20] for c in self._cells(row)])

@@ -6,11 +6,9 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from inspect import cleandoc
 from pathlib import Path
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
@@ -28,12 +26,11 @@ from psa_casadi.export.check.check import CheckReport
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
-from psa_casadi.model.model_file import ModelFile
 from psa_casadi.notes import Note
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.report.words.fit_words import Degree, grade
 from psa_casadi.shown import Lined
-from psa_casadi.strict_json import decode, json_text, read_json, shown
+from psa_casadi.strict_json import decode, read_json, shown
 from psa_casadi.version import __version__
 
 CHECK_FORMAT: Literal["psa_casadi.check/1"] = "psa_casadi.check/1"
@@ -590,35 +587,3 @@ def diagnosis_in(content: Any, source: str) -> tuple[DiagnosisFile | OwnModelFil
     found = content.get("format") if isinstance(content, dict) else None
     kind = DIAGNOSES.get(found) if isinstance(found, str) else None
     return None if kind is None else decode(kind, content, source), found
-
-
-#: The record of each file that is written as JSON, by the name of its schema.
-FILES: dict[str, type] = {
-    "model": ModelFile,
-    "diagnosis": DiagnosisFile,
-    "own_model": OwnModelFile,
-    "identification": IdentificationFile,
-    "posterior": PosteriorFile,
-    "check": CheckFile,
-    "device": DeviceFile,
-}
-
-
-def schema_texts() -> dict[str, str]:
-    """Return the schemas as they are shipped, by the names of their files."""
-    return {f"{name}.schema.json": json_text(json_schema(file)) for name, file in FILES.items()}
-
-
-def json_schema(record: type) -> dict[str, Any]:
-    """Return the schema (draft 2020-12) of a dataclass; fields with a default may be missing."""
-    _, defined = msgspec.json.schema_components([record], ref_template="#/$defs/{name}")
-    for schema in defined.values():
-        schema["description"] = cleandoc(schema["description"])
-        if "properties" in schema:
-            schema["additionalProperties"] = False
-        for name, rules in schema.get("properties", {}).items():
-            if rules.get("type") == "object" and name not in schema.get("required", ()):
-                rules.setdefault("default", {})  # msgspec says it from 0.23 on
-    root = defined.pop(record.__name__)
-    found = {"$schema": "https://json-schema.org/draft/2020-12/schema", **root}
-    return {**found, "$defs": dict(sorted(defined.items()))} if defined else found

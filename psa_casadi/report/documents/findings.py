@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -183,11 +184,8 @@ def _identification(i: IdentificationFile) -> Finding:
 def _model(model: Model, traces: bool) -> Finding:
     origin = model.provenance
     trace = None
-    if traces:
-        try:
-            trace = replayed(model)
-        except PsaError:  # a page without this curve says more than no page
-            trace = None
+    with suppress(PsaError):  # a page without this curve says more than no page
+        trace = replayed(model) if traces else None
     return Finding(
         device="",
         kind="model",

@@ -61,25 +61,16 @@ class Comparison:
 
     def to_frame(self) -> Any:
         """Return parameters by device as a pandas DataFrame: value, interval, unit, p, differ."""
-        rows = [
-            (d, f.device, f.parameters[d.estimates.name])
-            for d in self.differences
-            for k, f in enumerate(self.findings)
-            if k in d.estimates.places
-        ]
-        ends = [p.interval or (p.value, p.value) for _, _, p in rows]
-        return frame(
-            {
-                "parameter": [d.estimates.name for d, _, _ in rows],
-                "device": [device for _, device, _ in rows],
-                "value": [p.value for _, _, p in rows],
-                "low": [low for low, _ in ends],
-                "high": [high for _, high in ends],
-                "unit": [p.unit for _, _, p in rows],
-                "p_adjusted": [d.p_adjusted for d, _, _ in rows],
-                "differs": [d.differs for d, _, _ in rows],
-            }
-        )
+        names = "parameter", "device", "value", "low", "high", "unit", "p_adjusted", "differs"
+        columns: dict[str, list[Any]] = {name: [] for name in names}
+        for d in self.differences:
+            for f in (self.findings[k] for k in d.estimates.places):
+                p = f.parameters[d.estimates.name]
+                ends = p.interval or (p.value, p.value)
+                row = d.estimates.name, f.device, p.value, *ends, p.unit, d.p_adjusted, d.differs
+                for name, value in zip(names, row, strict=True):
+                    columns[name].append(value)
+        return frame(columns)
 
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write the page, one HTML file that needs no network. Raises InputError."""

@@ -39,11 +39,8 @@ from psa_casadi.simulation.exact.run import ALIKE
 from psa_casadi.simulation.simulate import input_samples, output_of
 from psa_casadi.simulation.start import is_stack
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import convert
+from psa_casadi.units import FloatArray, IndexArray, convert
 from psa_casadi.variables import Output, Parameter, State
-
-FloatArray = npt.NDArray[np.float64]
-IndexArray = npt.NDArray[np.int64]
 
 #: Samples of all records in a page, and records; of more, those that the model misses most.
 _SAMPLES, _RECORDS = 12_000, 6
@@ -156,22 +153,15 @@ class LiveModel:
 
 def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of a diagnosis alive; `rows` are its series."""
-    if not isinstance(d, StackDiagnosis):
-        records = _fitted_records(d.model, d.extended_fit, d.experiments, rows)
-        return LiveModel(d.model, begun_module(d.model), records, extended=added(d))
-    patch = d.patch
-    beyond = (
-        [] if patch is None else [p - x for p, x in zip(patch.predicted, d.extended, strict=True)]
-    )
-    # the page's other errors are judged by the noise of all records together
-    share = d.noise_floor_rms_m / (float(np.sqrt(np.mean([s.noise**2 for s in rows]))) or 1.0)
-    return LiveModel(
-        model=d.model,
-        module=begun_module(d.model),
-        records=_fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond, share),
-        extended=added(d),
-        correction="" if patch is None else f"{patch.name}, as it was found: it does not follow",
-    )
+    module, beyond, share, said = begun_module(d.model), list[FloatArray](), 1.0, ""
+    if isinstance(d, StackDiagnosis):
+        # the page's other errors are judged by the noise of all records together
+        share = d.noise_floor_rms_m / (float(np.sqrt(np.mean([s.noise**2 for s in rows]))) or 1.0)
+        if d.patch is not None:
+            beyond = [p - x for p, x in zip(d.patch.predicted, d.extended, strict=True)]
+            said = f"{d.patch.name}, as it was found: it does not follow"
+    records = _fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond, share)
+    return LiveModel(d.model, module, records, extended=added(d), correction=said)
 
 
 def live_fit(found: Identification, rows: Sequence[Series]) -> LiveModel:

@@ -173,14 +173,12 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
     ]
     return {
         "errors": [
-            {
-                "caption": f"{e.output}: error on held-out samples, rms",
-                "rows": _bars(
-                    d, e.base, e.extended, e.noise, partial(phrases.with_its_unit, unit=e.unit)
-                ),
-                "noise": e.noise,
-                "note": "",
-            }
+            _bars(
+                d,
+                f"{e.output}: error on held-out samples, rms",
+                (e.base, e.extended, e.noise),
+                partial(phrases.with_its_unit, unit=e.unit),
+            )
             for e in d.errors[:_OUTPUTS]
         ],
         "wrong": [[[d.missed.where, *wrong]], []],
@@ -202,12 +200,13 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
     return {
         "stack": True,
         "errors": [
-            {
-                "caption": f"Error on held-out samples, rms; the displacement's range is {reach}",
-                "rows": _bars(d, e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m, scale.text),
-                "noise": d.noise_floor_rms_m,
-                "note": f" It is estimated from: {sources}." if sources else "",
-            }
+            _bars(
+                d,
+                f"Error on held-out samples, rms; the displacement's range is {reach}",
+                (e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m),
+                scale.text,
+                f" It is estimated from: {sources}." if sources else "",
+            )
         ],
         "answers": [f"{label}: {text}" for label, text in answers if text],
         "wrong": [
@@ -398,16 +397,14 @@ def _part(
 
 
 def _bars(
-    d: Diagnosis,
-    base: float,
-    extended: float,
-    noise: float,
-    text: Callable[[float], str],
-) -> list[tuple[str, float, str, str]]:
+    d: Diagnosis, caption: str, errors: tuple[float, float, float],
+    text: Callable[[float], str], note: str = "",
+) -> dict[str, Any]:  # fmt: skip
     """Return held-out errors as bars over the noise, which no model can go below."""
-    rows = [("base model", base, "--base"), ("extended model", extended, "--extended")]
-    rows = [*rows[: 1 + added(d)], ("noise", noise, "--noise")]
-    return [(*row, text(row[1])) for row in rows]
+    names = (("base model", "--base"), ("extended model", "--extended"), ("noise", "--noise"))
+    rows = [(name, e, colour, text(e)) for (name, colour), e in zip(names, errors, strict=True)]
+    rows = rows if added(d) else [rows[0], rows[2]]
+    return {"caption": caption, "rows": rows, "noise": errors[-1], "note": note}
 
 
 def _budget(d: Diagnosis) -> dict[str, Any]:

@@ -87,14 +87,7 @@ def budget_plot(findings: Sequence[Finding]) -> Panel:
 def error_plots(findings: Sequence[Finding]) -> tuple[Panel, Panel, Panel]:
     """Return measured less model over time and over voltage, and the loops, of every device."""
     traced = [
-        (
-            k,
-            f.device,
-            np.array(t.time),
-            np.array(t.voltage),
-            np.array(t.measured),
-            np.array(t.model),
-        )
+        (k, f.device, *np.array([t.time, t.voltage, t.measured, t.model]))
         for k, f in enumerate(findings)
         if (t := f.trace) is not None
     ]

@@ -327,8 +327,8 @@ def posterior_figure(found: Posterior) -> Figure:
     figure = sheet((SIZE_INCHES[0], 4.6 + 2.6 * rows), DPI)
     parts = figure.subfigures(2, 1, height_ratios=(4.6, 2.6 * rows), squeeze=False)
     before, after = parts[0, 0].subplots(1, 2)
-    _draw_prior(before, found, shown)
-    _draw_posterior(after, found, shown)
+    _draw_predicted(before, found, shown, "prior")
+    _draw_predicted(after, found, shown, "posterior")
     axes = np.atleast_1d(parts[1, 0].subplots(rows, min(_COLUMNS, len(figures)))).ravel()
     for each, f in zip(axes, figures, strict=False):
         _draw_parameter(each, found, f)
@@ -353,12 +353,6 @@ def _missed_most(found: Posterior) -> Block:
     return max(found.task.density.blocks, key=share)
 
 
-def _readings(found: Posterior, b: Block) -> tuple[FloatArray, FloatArray]:
-    """Return times (n,) [s] and readings (n,) of a block in its unit."""
-    e = found.task.experiments[b.record]
-    return e.record.time, e.measured(b.channel)
-
-
 def _scale(found: Posterior, b: Block, size: float) -> phrases.Scale:
     """Return what numbers of a block of this size are shown in."""
     unit = found.task.channel(b).unit
@@ -374,42 +368,34 @@ def _band(found: Posterior, group: str, b: Block) -> tuple[FloatArray, FloatArra
     return ends[0], ends[1], ends[2]
 
 
-def _draw_prior(axes: Axes, found: Posterior, block: Block) -> None:
-    time, y = _readings(found, block)
-    if not found.tree["prior_predictive"].sizes["draw"]:
+def _draw_predicted(axes: Axes, found: Posterior, block: Block, group: str) -> None:
+    """Draw a record in the band that prior or posterior predict, of the posterior less its median.
+
+    The prior's is cut where it leaves the record too far behind.
+    """
+    if not found.tree[f"{group}_predictive"].sizes["draw"]:
         style(axes, "No draw of the prior can be simulated", "time [s]", "")
         return
-    low, high, _ = _band(found, "prior_predictive", block)
-    span = float(np.nanmax(y) - np.nanmin(y))
-    scale = _scale(found, block, 3.0 * span)
-    band = f"prior, {100.0 * HDI:.0f} %"
-    ends = (scale.factor * low, scale.factor * high)
-    axes.fill_between(time, *ends, color=colours.BASE, alpha=0.3, label=band)
-    axes.plot(time, scale.factor * y, color=colours.MEASURED, linewidth=1.0, label="measured")
-    middle = 0.5 * float(np.nanmax(y) + np.nanmin(y))
-    axes.set_ylim(scale.factor * (middle - 1.5 * span), scale.factor * (middle + 1.5 * span))
-    style(
-        axes,
-        "Prior predictive",
-        "time [s]",
-        phrases.in_brackets(found.task.channel(block).column, scale.unit),
-    )
-    axes.legend(fontsize=FONT - 1, loc="upper right")
-
-
-def _draw_posterior(axes: Axes, found: Posterior, block: Block) -> None:
-    time, y = _readings(found, block)
-    low, high, middle = _band(found, "posterior_predictive", block)
-    left = y - middle
-    scale = _scale(found, block, float(np.nanmax(np.abs(left))))
-    band = f"posterior, {100.0 * HDI:.0f} %"
-    axes.plot(time, scale.factor * left, color=colours.MEASURED, linewidth=0.8, label="measured")
-    axes.fill_between(
-        time, scale.factor * (low - middle), scale.factor * (high - middle),
-        color=colours.EXTENDED, alpha=0.4, label=band, zorder=3,
-    )  # fmt: skip
-    title = "Posterior predictive, less its median"
-    style(axes, title, "time [s]", phrases.in_brackets("difference", scale.unit))
+    e, is_prior = found.task.experiments[block.record], group == "prior"
+    time, y, name = e.record.time, e.measured(block.channel), "difference"
+    low, high, middle = _band(found, f"{group}_predictive", block)
+    title, look = "Posterior predictive, less its median", (colours.EXTENDED, 0.4, 3)
+    if is_prior:
+        title, look = "Prior predictive", (colours.BASE, 0.3, 1)
+        middle, name = np.zeros_like(y), found.task.channel(block).column
+    ends = np.array([np.nanmin(y), np.nanmax(y)])
+    size = 3.0 * np.ptp(ends) if is_prior else np.nanmax(np.abs(y - middle))
+    scale = _scale(found, block, float(size))
+    low, high, shown = (scale.factor * (v - middle) for v in (low, high, y))
+    if not is_prior:  # measured comes first in its legend
+        axes.plot(time, shown, color=colours.MEASURED, linewidth=0.8, label="measured")
+    colour, alpha, order = look
+    band = f"{group}, {100.0 * HDI:.0f} %"
+    axes.fill_between(time, low, high, color=colour, alpha=alpha, label=band, zorder=order)
+    if is_prior:
+        axes.plot(time, shown, color=colours.MEASURED, linewidth=1.0, label="measured")
+        axes.set_ylim(*(scale.factor * (np.mean(ends) + np.array([-1.5, 1.5]) * np.ptp(ends))))
+    style(axes, title, "time [s]", phrases.in_brackets(name, scale.unit))
     axes.legend(fontsize=FONT - 1, loc="upper right")
 
 

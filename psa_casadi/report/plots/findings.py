@@ -35,6 +35,8 @@ _MOST_FIGURES = 12
 _LOW = 300
 #: Samples of a signature that are drawn behind its means, and of a correction.
 _BEHIND, _SAMPLES = 1000, 3000
+#: Kinds of an unnamed correction that lie over another variable than the time.
+_CURVED = ("curve", "direction", "memory")
 #: The cost is shown up to this many limits; beyond, a curve only hides its foot.
 _TOP = 2.5
 _PARABOLA_POINTS = 81
@@ -160,40 +162,32 @@ def correction_plot(d: Diagnosis, c: Correction) -> tuple[str, Panel]:
     Of a stack it is that of the record to which most is added, of any other model that of all.
     """
     if isinstance(c, FreeFunction):
-        part = slice(None, None, max(1, len(c.along) // _SAMPLES))
-        seen = phrases.prefixed_scale(
-            float(np.max(np.abs(c.along), initial=0.0)), c.variable_unit or "1"
-        )
-        scale = phrases.prefixed_scale(float(np.max(np.abs(c.added), initial=0.0)), c.unit)
-        x, y = (
-            phrases.in_brackets(*row) for row in ((c.variable, seen.unit), ("added", scale.unit))
-        )
-        plot = Panel(x, y, 320)
-        return c.variable, plot.marks(
-            seen.factor * c.along[part], scale.factor * c.added[part], size=3
-        )
-    if not isinstance(c, Patch):
-        raise TypeError(type(c))
-    k = max(range(len(c.added)), key=lambda i: float(np.std(c.added[i])))
-    e, added = d.experiments[k], c.added[k] - np.mean(c.added[k])
-    counts = e.record.displacement_unit == "counts"
-    scale = phrases.length_scale(float(np.max(np.abs(added), initial=1e-12)), counts=counts)
-    curved = c.kind in ("curve", "direction", "memory")
-    if c.kind == "curve" and c.port != "drive voltage":
-        unit, size = ("counts", 1.0) if counts else ("µm", 1e6)
-        at, name = size * d.extended[k], "predicted displacement"
-    elif curved:
-        at, name, unit = e.record.voltage, "voltage", "V"
+        largest = float(np.max(np.abs(c.along), initial=0.0))
+        seen = phrases.prefixed_scale(largest, c.variable_unit or "1")
+        at, added, name, unit = seen.factor * c.along, c.added, c.variable, seen.unit
+        scale = phrases.prefixed_scale(float(np.max(np.abs(added), initial=0.0)), c.unit)
+    elif isinstance(c, Patch):
+        k = max(range(len(c.added)), key=lambda i: float(np.std(c.added[i])))
+        e, added = d.experiments[k], c.added[k] - np.mean(c.added[k])
+        counts = e.record.displacement_unit == "counts"
+        scale = phrases.length_scale(float(np.max(np.abs(added), initial=1e-12)), counts=counts)
+        if c.kind == "curve" and c.port != "drive voltage":
+            unit, size = ("counts", 1.0) if counts else ("µm", 1e6)
+            at, name = size * d.extended[k], "predicted displacement"
+        elif c.kind in _CURVED:
+            at, name, unit = e.record.voltage, "voltage", "V"
+        else:
+            at, name, unit = e.record.time - e.record.time[0], "time", "s"
     else:
-        at, name, unit = e.record.time - e.record.time[0], "time", "s"
+        raise TypeError(type(c))
     part = slice(None, None, max(1, len(at) // _SAMPLES))
-    plot, shown = (
-        Panel(f"{name} [{unit}]", f"added [{scale.unit}]", 320),
-        scale.factor * added[part],
-    )
-    if curved:
-        return f"the {name}", plot.marks(at[part], shown, size=3)
-    return f"the {name}", plot.line(at[part], shown, width=1.5)
+    along, label = (phrases.in_brackets(*row) for row in ((name, unit), ("added", scale.unit)))
+    plot, x, y = Panel(along, label, 320), at[part], scale.factor * added[part]
+    if isinstance(c, FreeFunction) or c.kind in _CURVED:
+        plot.marks(x, y, size=3)
+    else:
+        plot.line(x, y, width=1.5)
+    return (name if isinstance(c, FreeFunction) else f"the {name}"), plot
 
 
 def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:

@@ -5,6 +5,9 @@ import numpy as np
 from psa_casadi.report.plots.panel import Panel, logarithmic, stacked
 from psa_casadi.report.words import colours, series
 from psa_casadi.report.words.phrases import in_brackets
+from psa_casadi.units import FloatArray
+
+Samples = slice | series.IndexArray
 
 #: Points of a part of a record, measured samples shown one by one, and of a spectrum.
 _ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
@@ -27,25 +30,18 @@ def time_plot(s: series.Series, origin: str, limit: int) -> Panel:
     return stacked(measured_plot(s, origin, shown), residual_plot(s, shown), _FULL)
 
 
-def measured_plot(s: series.Series, origin: str, shown: slice | series.IndexArray) -> Panel:
+def measured_plot(s: series.Series, origin: str, shown: Samples) -> Panel:
     """What was measured over time, and the models."""
-    scale, clock = s.scale, s.time_scale
-    time = clock.factor * s.time[shown]
+    clock = s.time_scale
     plot = Panel(f"time [{clock.unit}]", s.label)
-    plot.line(time, scale.factor * s.measured[shown], origin, colours.MEASURED, 3.0)
-    for curve in s.curves:
-        plot.line(time, scale.factor * curve.values[shown], curve.label, curve.colour)
-    return _with_held_out(plot, s)
+    return _with_held_out(_measured(plot, clock.factor * s.time[shown], s, origin, shown, 1.4), s)
 
 
-def residual_plot(s: series.Series, shown: slice | series.IndexArray) -> Panel:
+def residual_plot(s: series.Series, shown: Samples) -> Panel:
     """What the models leave over time, with the noise."""
-    small, clock = s.residual_scale, s.time_scale
-    plot = Panel(f"time [{clock.unit}]", in_brackets("residual", small.unit))
-    for curve in s.curves:
-        residual = small.factor * s.residual(curve)[shown]
-        plot.line(clock.factor * s.time[shown], residual, curve.label, curve.colour, 1.0)
-    return _with_held_out(_with_noise(plot, s), s)
+    clock = s.time_scale
+    plot = Panel(f"time [{clock.unit}]", in_brackets("residual", s.residual_scale.unit))
+    return _with_held_out(_residuals(plot, clock.factor * s.time[shown], s, shown, 1.0), s)
 
 
 def zoom_plot(s: series.Series, origin: str, limit: int) -> Panel:
@@ -53,34 +49,23 @@ def zoom_plot(s: series.Series, origin: str, limit: int) -> Panel:
     window = series.telling_window(s)
     shown = np.arange(len(s.time))[window]
     shown = shown[series.kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
-    scale, clock = s.scale, s.time_scale
-    time = clock.factor * s.time[shown]
-    plot = Panel(f"time [{clock.unit}]", s.label)
+    time, y = s.time_scale.factor * s.time[shown], s.scale.factor * s.measured[shown]
+    plot = Panel(f"time [{s.time_scale.unit}]", s.label)
     thin = {"color": colours.NOISE, "width": 0.7}
-    plot.marks(time, scale.factor * s.measured[shown], origin, colours.MEASURED, 4, line=thin)
-    for curve in s.curves:
-        plot.line(time, scale.factor * curve.values[shown], curve.label, curve.colour, 2.2)
-    return plot
+    plot.marks(time, y, origin, colours.MEASURED, 4, line=thin)
+    return _models(plot, time, s, shown, 2.2)
 
 
-def loop_plot(s: series.Series, origin: str, shown: slice | series.IndexArray) -> Panel:
+def loop_plot(s: series.Series, origin: str, shown: Samples) -> Panel:
     """What was measured over what drives it, such as displacement over voltage."""
-    scale, x = s.scale, s.voltage[shown]
-    plot = Panel(s.against, s.label)
-    plot.line(x, scale.factor * s.measured[shown], origin, colours.MEASURED, 3.0)
-    for curve in s.curves:
-        plot.line(x, scale.factor * curve.values[shown], curve.label, curve.colour, 1.2)
-    return plot
+    return _measured(Panel(s.against, s.label), s.voltage[shown], s, origin, shown, 1.2)
 
 
 def error_loop_plot(s: series.Series, limit: int) -> Panel:
     """Residual over what drives the model: where in the loop the model goes wrong."""
-    small, shown = s.residual_scale, samples(s, limit)
-    plot = Panel(s.against, in_brackets("residual", small.unit), showlegend=len(s.curves) > 1)
-    for curve in s.curves:
-        residual = small.factor * s.residual(curve)[shown]
-        plot.line(s.voltage[shown], residual, curve.label, curve.colour, 0.9)
-    return _with_noise(plot, s)
+    shown, label = samples(s, limit), in_brackets("residual", s.residual_scale.unit)
+    plot = Panel(s.against, label, showlegend=len(s.curves) > 1)
+    return _residuals(plot, s.voltage[shown], s, shown, 0.9)
 
 
 def spectrum_plot(s: series.Series, limit: int) -> Panel:
@@ -146,7 +131,24 @@ def distribution_plot(s: series.Series) -> Panel:
     return plot
 
 
-def _with_noise(plot: Panel, s: series.Series) -> Panel:
+def _measured(
+    plot: Panel, x: FloatArray, s: series.Series, origin: str, shown: Samples, width: float
+) -> Panel:
+    plot.line(x, s.scale.factor * s.measured[shown], origin, colours.MEASURED, 3.0)
+    return _models(plot, x, s, shown, width)
+
+
+def _models(plot: Panel, x: FloatArray, s: series.Series, shown: Samples, width: float) -> Panel:
+    for curve in s.curves:
+        plot.line(x, s.scale.factor * curve.values[shown], curve.label, curve.colour, width)
+    return plot
+
+
+def _residuals(plot: Panel, x: FloatArray, s: series.Series, shown: Samples, width: float) -> Panel:
+    """Add what the models leave, with the noise."""
+    for curve in s.curves:
+        residual = s.residual_scale.factor * s.residual(curve)[shown]
+        plot.line(x, residual, curve.label, curve.colour, width)
     edge = 2.0 * s.residual_scale.factor * s.noise
     return plot.across(-edge, edge, name="noise (2 sigma)") if edge > 0.0 else plot
 

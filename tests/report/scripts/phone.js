@@ -22,5 +22,5 @@ window.addEventListener('load', function () {
       narrowest: Math.min.apply(null, plots.map(function (p) {
         return p.querySelector('svg.main-svg').getBoundingClientRect().width; }))
     }), '*');
-  }, 500);
+  }, 1500);
 });
