@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
+from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
@@ -57,7 +58,9 @@ class Cause:
 
     `explained_share` is what it removes of the held-out error above the noise, beside the others.
     `remedy` says as a code what to do about it, `sizes` what it changes in the tests that the
-    effect declares. Of any model, `port` is where it adds to the equations.
+    effect declares. Of any model, `port` is where it adds to the equations. `families` are the
+    places and kinds that it may be of, the most probable first; `confidence` counts what is not
+    listed.
     """
 
     effect: str
@@ -70,6 +73,7 @@ class Cause:
     sizes: tuple[Size, ...] = ()
     port: str = ""
     description: str = ""
+    families: tuple[Family, ...] = ()
 
 
 @dataclass(frozen=True)

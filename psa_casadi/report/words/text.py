@@ -85,6 +85,7 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     for c in d.causes:
         sure = f"{place_of(c)}, {percent(c.confidence)}"
         lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
+        lines += [("kind", said)] if (said := verdict_words.family_sentence(c)) else []
         lines.append(("rivals", _rivals(d, c)))
     if stack:
         columns = [verdict_words.column_sentence(stack, c) for c in stack.columns]

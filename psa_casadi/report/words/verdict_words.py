@@ -154,6 +154,38 @@ def named_cause(cause: Cause) -> str:
     return f"{phrases.plain(cause.effect)} ({sure})"
 
 
+#: What effects of a kind do, and the places of a rig.
+_DOES = {
+    "curve": "a bent static curve",
+    "hysteresis": "a dependence on past reversals",
+    "relaxation": "a relaxation",
+    "resonance": "a resonance",
+    "lag": "a lag or a delay",
+    "damping": "a loss",
+    "time": "a change with time alone",
+    "changing gain": "a gain that changes",
+    "": "an effect of its own kind",
+}
+_PLACES = {
+    "plant": "the stack or its load",
+    "drive": "the drive",
+    "sensor": "the sensor",
+    "environment": "the surroundings",
+}
+
+
+def family_sentence(cause: Cause) -> str:
+    """Say what a cause does and where it sits, and how far it may be none of the listed effects."""
+    parts = []
+    for f in cause.families:
+        place = _PLACES.get(f.place, f.place)
+        part = f"{_DOES[f.kind]} in {place} ({phrases.probability_text(f.probability)})"
+        if not f.effects:
+            part += ", none of the listed effects"
+        parts.append(part)
+    return phrases.listing(parts, "or")
+
+
 def alternative_sentence(d: StackDiagnosis, a: Alternative) -> str:
     """Say which of two causes an exported plant holds, and what that makes of its displacement."""
     apart = phrases.scale_of(d.experiments, a.plant_differs_m).text(a.plant_differs_m, 2)
