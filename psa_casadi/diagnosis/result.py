@@ -18,6 +18,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame, made, with_units
 
@@ -220,7 +221,7 @@ class Diagnosis(Reported):
     `remaining` what the extended model does. `budget` says where the base's held-out error goes,
     `patch` is the unnamed correction that would remove most of what the named causes leave.
     `doubted` says why held-out samples cannot confirm a cause, None where they can; `remarks` what
-    else there is to say.
+    else there is to say. `noise_kinds` are those in what the extended model leaves of every output.
     """
 
     verdict: Verdict
@@ -239,6 +240,7 @@ class Diagnosis(Reported):
     doubted: Note | None = None
     budget: Budget
     patch: Correction | None = None
+    noise_kinds: tuple[NoiseFound, ...] = ()
 
     @property
     def doubt(self) -> str:
@@ -340,6 +342,7 @@ class Diagnosis(Reported):
             "remaining": told(self.remaining, "seen", "where"),
             "unnamed": self.unnamed,
             "notes": list(self.notes),
+            "noise_kinds": [asdict(n) for n in self.noise_kinds],
             "values": dict(self.model.values),
             "records": [
                 {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments

@@ -10,6 +10,7 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
+from psa_casadi.report.words.noise_words import NOISE
 from psa_casadi.report.words.phrases import (
     are,
     listing,
@@ -370,6 +371,7 @@ SENTENCES: Mapping[str, Sentence] = {
     **DIAGNOSIS,
     **IDENTIFICATION,
     **MISFIT,
+    **NOISE,
     **OWN_MODELS,
 }
 
