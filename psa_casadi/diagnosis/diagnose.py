@@ -334,17 +334,19 @@ def diagnose(
         # from the end: the screening begins at the front
         with compiled_ahead(reversed(screened_with(start, table, laws))):
             found = _diagnose(start, task, scale_given)
-        return _with_noise(found, said)
+        return _with_noise(found, said, (*whole, *held))
     except KeyboardInterrupt:
         if not so_far:
             raise
         raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
-def _with_noise(found: StackDiagnosis, said: Sequence[Note | str]) -> StackDiagnosis:
+def _with_noise(
+    found: StackDiagnosis, said: Sequence[Note | str], given: Sequence[Record]
+) -> StackDiagnosis:
     """Return a diagnosis with what else is `said`, and the noise that its extended model leaves."""
     driven = found.verdict != "not_driven"
-    noise = noise_found(found.extended_fit, found.experiments) if driven else ()
+    noise = noise_found(found.extended_fit, found.experiments, given) if driven else ()
     remarks = *found.remarks, *said, *notes_of(noise)
     return replace(found, remarks=remarks, noise_kinds=noise)
 

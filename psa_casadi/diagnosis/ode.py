@@ -104,7 +104,7 @@ def diagnose_ode(
         attached = [table[c.name] for c in best.model.effects]
         whole = model_of(base.model, best, attached, runs, interrupted=True)
         raise DiagnosisInterrupted(whole) from None
-    noise = noise_found(found.extended_fit, found.experiments)
+    noise = noise_found(found.extended_fit, found.experiments, (*given, *held))
     said = *known.remarks, *told_of_columns(model, runs), *notes_of(noise)
     return replace(found, remarks=(*found.remarks, *said), noise_kinds=noise)
 

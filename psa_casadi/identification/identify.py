@@ -144,7 +144,7 @@ def identify(
                 by="psa identify",
                 sampled=[known[r.sha256] for r in fitted],
             )
-            noise = noise_found(best, experiments)
+            noise = noise_found(best, experiments, parts)
             progress("what further records would tell")
             advised = advice(best, experiments, determined, force_scale_given=given)
         except KeyboardInterrupt:

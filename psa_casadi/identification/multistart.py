@@ -74,10 +74,10 @@ def identify_ode(
     be simulated at its values.
     """
     refuse_unfit(model)
+    given = given_to(model, records, hold)
     runs = experiments_of(
-        model, given_to(model, records, hold), judged=False, zeros=known_zeros(model, zeros),
-        known_start=known_start,
-    )  # fmt: skip
+        model, given, judged=False, zeros=known_zeros(model, zeros), known_start=known_start
+    )
     progress("fitting from several starts")
     best, runs, outcomes = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts, progress=progress
@@ -96,7 +96,7 @@ def identify_ode(
         interrupted=best.interrupted,
     )  # fmt: skip
     doubts = *doubts_of(best, found, outcomes), *_of_outputs(result), *told_of_columns(model, runs)
-    noise = () if best.interrupted else noise_found(best, runs)
+    noise = () if best.interrupted else noise_found(best, runs, given)
     return replace(result, doubts=doubts, notes=notes_of(noise), noise_kinds=noise)
 
 

@@ -3,34 +3,55 @@
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.records.noise import runs_of
 from psa_casadi.records.noise_kinds import NoiseFound, noise_kinds
+from psa_casadi.records.record import Record
+from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment
+from psa_casadi.records.suspects import SPIKE
 from psa_casadi.units import FloatArray
 
 
-def noise_found(fit: Fit, experiments: Sequence[Experiment]) -> tuple[NoiseFound, ...]:
+def noise_found(
+    fit: Fit, experiments: Sequence[Experiment], given: Sequence[Record | Signals] = ()
+) -> tuple[NoiseFound, ...]:
     """Return the kinds of noise in every output of every record, fitted and held-out samples.
 
-    The model is simulated once more. Raises SimulationError where it cannot be.
+    The noise is that of the samples as they were `given`, not of averages or without outliers; the
+    prediction is a straight line between those of the experiments' samples. The model is simulated
+    once more. Raises SimulationError where it cannot be.
     """
-    found = []
+    known, found = {r.sha256: r for r in given}, list[NoiseFound]()
     for e, shown in zip(experiments, fit.shown(experiments), strict=True):
-        named = (e.record.column(n) for n in fit.model.input_names)
-        moving = [u for u in named if u is not None and np.isfinite(u).all() and np.ptp(u) > 0.0]
+        times, whole = e.record.time, known.get(e.record.sha256, e.record)
+        inside = (whole.time >= times[0]) & (whole.time <= times[-1])
+        time = whole.time[inside]
+        named = [c for n in fit.model.input_names if (c := whole.column(n)) is not None]
+        moving = [u[inside] for u in named if np.isfinite(u).all() and np.ptp(u[inside]) > 0.0]
+        near = np.searchsorted(0.5 * (times[1:] + times[:-1]), time)
         for j, channel in enumerate(e.channels):
-            y = shown[:, j]
+            reading = whole.column(channel.column)
+            if reading is None or not np.isfinite(shown[:, j]).any():
+                continue
+            y = np.interp(time, times, shown[:, j])
             inputs = sorted(moving, key=lambda u: -_correlation(u, y))
-            used = e.at(j, e.used | e.held_out)
-            kinds = noise_kinds(e.record.time, e.measured(j), y, inputs, used)
+            used = _used(e, j)[near]
+            kinds = noise_kinds(time, reading[inside], y, inputs, used)
             found.append(NoiseFound(e.record.name, channel.column, channel.unit, kinds))
     return tuple(found)
 
 
+def _used(e: Experiment, channel: int) -> npt.NDArray[np.bool_]:
+    """Return the samples (n,) that are fitted or judged, and outliers that are masked there."""
+    used = e.at(channel, e.used | e.held_out)
+    for start, stop in runs_of(~used):
+        used[start:stop] = stop - start <= SPIKE
+    return used
+
+
 def _correlation(u: FloatArray, y: FloatArray) -> float:
     """Return the size of the correlation of an input with an output (n,), 0 where there is none."""
-    there = np.isfinite(y)
-    if not there.any() or not np.ptp(y[there]) > 0.0 or not np.ptp(u[there]) > 0.0:
-        return 0.0
-    return abs(float(np.corrcoef(u[there], y[there])[0, 1]))
+    return abs(float(np.corrcoef(u, y)[0, 1])) if np.ptp(y) > 0.0 and np.ptp(u) > 0.0 else 0.0

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.records.noise import convolved, filtered, peaks
+from psa_casadi.records.noise_spectra import Colour, colour_of, score
 from psa_casadi.units import FloatArray
 
 IntArray = npt.NDArray[np.int64]
@@ -38,7 +40,7 @@ class Jumps:
     """Levels (n,) of a signal, the places where it jumps, and what they gain over none [nats].
 
     `apart` is the distance of the two levels, or the median size of the steps; `noise` the standard
-    deviation on them.
+    deviation on them. They are `sharp` where they stand out of a noise that is coloured.
     """
 
     gain: float
@@ -46,6 +48,7 @@ class Jumps:
     places: IntArray
     apart: float
     noise: float
+    sharp: bool = False
 
 
 def two_levels(signal: FloatArray) -> Jumps | None:
@@ -226,3 +229,68 @@ def _kept(signal: FloatArray, total: FloatArray, edges: list[int], noise: float)
             return Jumps(gain, levels, at[1:-1], float(np.median(sizes)), float(np.sqrt(left)))
         del edges[weakest + 1]
     return None
+
+
+#: Whitened samples after a jump by which it is told, rounds in which colour and jumps are found,
+#: standard deviations of a jump, samples between two, and jumps at most.
+_TELLS, _TIMES, _STANDS_OUT, _APART, _MANY = 48, 3, 6.0, 4, 80
+
+
+def jumps_on(signal: FloatArray, colour: Colour) -> Jumps | None:
+    """Return the steps, or jumps between two levels, of a signal (n,) on a noise that is coloured.
+
+    None where none are clear, or too many for steps. A matched filter finds the response of the
+    whitening filter to a step; the colour is that of what the jumps leave, and the `gain` is over
+    white noise, as elsewhere.
+    """
+    n, places, best = signal.size, np.zeros(0, np.int64), None
+    least = score(signal, colour) + _CLEAR
+    for _ in range(_TIMES):
+        shape = np.cumsum(np.r_[colour.filter(n), np.zeros(_TELLS - colour.filter(n).size)])
+        levels = np.zeros(n) if best is None else best.levels
+        white = colour.whitened(signal - levels)
+        kernel = np.r_[shape[::-1], np.zeros(_TELLS - 1)]
+        match = convolved(white[:, None], kernel)[:, 0] / float(np.linalg.norm(shape))
+        size = np.abs(match) / (1.4826 * float(np.median(np.abs(match))))
+        size[: 2 * _APART] = size[-2 * _APART :] = 0.0
+        more = peaks(size, _APART, _MANY)
+        more = more[size[more] > _STANDS_OUT]
+        places = np.unique(np.r_[places, more])
+        if not more.size or places.size > _MANY:
+            break
+        levels, sizes = _fitted_steps(signal, places, colour)
+        own = colour_of(signal - levels)
+        value = score(signal - levels, own) - 1.5 * places.size * float(np.log(n))
+        if value < least:
+            break
+        white_alone = -0.5 * n * float(np.log(max(float(np.var(signal)), 1e-300)))
+        noise = float(np.std(signal - levels))
+        apart = float(np.median(np.abs(sizes)))
+        best = Jumps(value - white_alone, levels, places, apart, noise, sharp=True)
+        least, colour = value, own
+        if colour.family == "white":
+            break
+    few = best is None or best.places.size <= _MOST or alternates(best)
+    return best if few else None
+
+
+def _fitted_steps(
+    signal: FloatArray, places: IntArray, colour: Colour
+) -> tuple[FloatArray, FloatArray]:
+    """Return steps (n,) at the places and their sizes, by least squares in a noise of the colour.
+
+    Whitened steps are alike but for where they begin: only their beginnings are not orthogonal.
+    """
+    steps = (np.arange(signal.size)[:, None] >= places).astype(np.float64)
+    rows = np.column_stack([np.ones(signal.size), steps])
+    white = filtered(colour.filter(signal.size), [1.0], rows)
+    sizes = np.linalg.lstsq(white[1:], colour.whitened(signal)[1:], rcond=1e-10)[0][1:]
+    levels = steps @ sizes
+    return levels - float(np.mean(levels)), np.asarray(sizes, dtype=np.float64)
+
+
+def alternates(found: Jumps) -> bool:
+    """Whether jumps go up and down in turn, by nearly the same: between two levels."""
+    sizes = np.diff(found.levels)[found.places - 1]
+    turns = np.sign(sizes[1:]) != np.sign(sizes[:-1])
+    return bool(turns.mean() > 0.8 and np.std(np.abs(sizes)) < 0.4 * np.mean(np.abs(sizes)))

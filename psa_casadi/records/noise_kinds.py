@@ -26,7 +26,7 @@ from psa_casadi.records.driven import (
     price_of_return,
     returning,
 )
-from psa_casadi.records.jumps import Jumps, steps_in, two_levels
+from psa_casadi.records.jumps import Jumps, alternates, jumps_on, steps_in, two_levels
 from psa_casadi.records.noise import high_frequency_noise, local_scale, quantum_of
 from psa_casadi.records.noise_spectra import (
     LEAST,
@@ -220,10 +220,12 @@ class _Seen:
             at = tuple(t.frequency / self.dt for t in tones)
             found.append(NoiseKind("lines", {"amplitude": tones[0].amplitude}, at))
         smooth = colour.figures.get("slope", 0.0) > _SMOOTH
+        white = colour.whitened(flat - steps - misfit - gone)
+        if colour.family == "autoregressive":
+            smooth = float(np.var(_robust(white))) < _PREDICTED * float(np.var(left))
         told = colour.told and not (smooth or of_drive)
         sure = colour is WHITE or (told and self._is_noise(left, misfit))
         found.append(self._coloured(colour, left) if sure else self._only_coloured(left))
-        white = colour.whitened(flat - steps - misfit - gone)
         kept = np.ones(white.size, dtype=np.bool_)
         if jumps is not None:
             kept[np.clip(jumps[1].places[:, None] + np.arange(-2, 2), 0, white.size - 1)] = False
@@ -232,7 +234,8 @@ class _Seen:
         if jumps is not None and jumps[0].kind == "telegraph":
             return found
         whole = sure and jumps is None
-        return found + self._innovations(white / max(scale, 1e-300), scale, sure=whole)
+        spikes = None if sure else flat != robust
+        return found + self._innovations(white / max(scale, 1e-300), scale, whole, spikes)
 
     def _parts(
         self, robust: FloatArray
@@ -242,13 +245,13 @@ class _Seen:
         misfit, price, own = self._misfit(robust, colour)
         if own is WHITE:
             return None, misfit, own
-        jumps = self._jumps(robust, score(robust - misfit, own) - price)
+        jumps = self._jumps(robust, score(robust - misfit, own) - price, colour)
         if jumps is not None:
             rest = robust - jumps[1].levels
             other, _, colour = self._misfit(rest, colour_of(rest))
-            if colour.gain < _SLIGHT * LEAST or not other.any():
+            if jumps[1].sharp or colour.gain < _SLIGHT * LEAST or not other.any():
                 return jumps, other, colour
-        jumps = self._jumps(robust - misfit, score(robust - misfit, own)) if price else None
+        jumps = self._jumps(robust - misfit, score(robust - misfit, own), own) if price else None
         if jumps is not None:
             colour = colour_of(robust - misfit - jumps[1].levels)
             if colour.gain < _SLIGHT * LEAST:
@@ -264,10 +267,10 @@ class _Seen:
             misfit, price = followed(robust, columns, weights.pop())
             own = colour_of(robust - misfit) if price else colour
             value = score(robust - misfit, own) - price
-            much = price and float(np.var(robust - misfit)) < (1.0 - _MUCH) * float(np.var(robust))
-            if much and highest - LEAST < value <= highest + LEAST:
+            share = 1.0 - float(np.var(robust - misfit)) / float(np.var(robust))
+            if share > _MUCH and highest - LEAST < value <= highest + LEAST:
                 best = best[0], best[1], replace(best[2], told=False)
-            if value > highest + LEAST:
+            if value > highest + LEAST and share > 0.0:
                 best, highest = (misfit, price, own), value
                 weights += [own] if len(weights) < 1 and own is not WHITE else []
         if self.period is not None and best[2] is not WHITE:
@@ -328,26 +331,32 @@ class _Seen:
         return period_of(self.inputs[0]) if self.inputs and np.ptp(self.inputs[0]) > 0.0 else None
 
     def _is_noise(self, left: FloatArray, misfit: FloatArray) -> bool:
-        """Whether what is coloured cannot be a misfit's form: no misfit, or one that is smaller.
+        """Whether what is coloured cannot be a misfit's form: there is none, or a slight one.
 
-        And one whose drive returns, so that what does not return with it is none.
+        Or one that is no larger, and whose drive returns, so that what does not is none.
         """
-        if not misfit.any():
-            return True
-        return self.period is not None and float(np.std(left)) > _FORM * float(np.std(misfit))
+        size, noise = float(np.std(misfit)), float(np.std(left))
+        return size < _LITTLE * noise or (self.period is not None and noise > _FORM * size)
 
-    def _jumps(self, left: FloatArray, least: float) -> tuple[NoiseKind, Jumps] | None:
+    def _jumps(
+        self, left: FloatArray, least: float, colour: Colour
+    ) -> tuple[NoiseKind, Jumps] | None:
         """Return the jumps whose score exceeds the `least`, if they do not follow the drive."""
         white = -0.5 * left.size * float(np.log(max(float(np.var(left)), 1e-300)))
         tried: list[tuple[Kind, Jumps]] = []
         two = two_levels(left)
         if two is not None and two.places.size > _FEW:
-            tried.append(("telegraph", two))
+            more = colour_of(left - two.levels).gain
+            tried.append(("telegraph", replace(two, gain=two.gain + more, sharp=True)))
         steps = steps_in(left)
         if steps is not None:
             more = colour_of(left - steps.levels).gain
             tried.append(("steps", replace(steps, gain=steps.gain + more)))
         tried = [t for t in tried if white + t[1].gain > least + LEAST]
+        on = None if tried or colour is WHITE else jumps_on(left, colour)
+        if on is not None and white + on.gain > least + LEAST:
+            two_kinds = on.places.size > _FEW and alternates(on)
+            tried.append(("telegraph" if two_kinds else "steps", on))
         if not tried:
             return None
         kind, best = max(tried, key=lambda pair: pair[1].gain)
@@ -401,8 +410,13 @@ class _Seen:
         lag = int(below[0]) if below.size else products.size
         return NoiseKind("coloured", {"rms": float(np.std(left)), "time": lag * self.dt})
 
-    def _innovations(self, z: FloatArray, scale: float, *, sure: bool = True) -> list[NoiseKind]:
-        """Return what else the innovations z (m,) over their scale show: size, tails, outliers."""
+    def _innovations(
+        self, z: FloatArray, scale: float, sure: bool, spikes: BoolArray | None
+    ) -> list[NoiseKind]:
+        """Return what else the innovations z (m,) over their scale show: size, tails, outliers.
+
+        Where it is not `sure` that they are noise, outliers alone; of given `spikes`, only these.
+        """
         rate = np.gradient(self.predicted, self.time)[self.index]
         reading = self.predicted[self.index]
         sizes: list[tuple[Kind, FloatArray]] = [("jitter", rate), ("grows", reading)]
@@ -418,8 +432,8 @@ class _Seen:
             return [*found, NoiseKind("heavy_tails", {"freedom": tails[1]})]
         if outliers is None:
             return found
-        places = np.flatnonzero(outliers.where)
-        if self._with_drive(places):
+        places = np.flatnonzero(outliers.where if spikes is None else outliers.where & spikes)
+        if not places.size or self._with_drive(places):
             return found
         return [*found, NoiseKind("outliers", {"count": float(places.size)}, self._times(places))]
 
@@ -430,16 +444,19 @@ class _Seen:
 _HARMONICS, _SHARP, _BROAD, _LINE, _DOMINANT = 40, 0.75, 0.1, 30.0, 0.5
 #: A misfit of this share that is as likely as a colour leaves open which of the two it is.
 _MUCH = 0.2
-#: What is left of a misfit may be its form where it is smaller than this share of it.
-_FORM = 0.5
+#: What is left of a misfit may be its form where it is smaller than this share of it; a misfit of
+#: less than this share of the noise is slight.
+_FORM, _LITTLE = 0.5, 0.3
 #: Two levels with fewer jumps are steps; the chance below which places follow the drive; samples
 #: about a turn that are at it, and the share of the range by which a turn comes back.
 _FEW, _NO_CHANCE, _NEAR, _TURN = 3, 1e-3, 3, 0.01
 #: Mains frequencies [Hz], and the share by which a line may be off one.
 _MAINS, _OFF = (50.0, 60.0), 0.004
-#: A spectrum that falls faster is a smooth signal's, not a noise's; and times the least gain below
-#: which the colour beside jumps is that of jumps that were missed.
-_SMOOTH, _SLIGHT = 2.2, 5.0
+#: A spectrum that falls faster is a smooth signal's, not a noise's, and so is one of which no more
+#: than this share is new in each sample.
+_SMOOTH, _PREDICTED = 2.1, 0.01
+#: Times the least gain below which the colour beside jumps is that of jumps that were missed.
+_SLIGHT = 5.0
 #: An input moves at a frequency where it has this share of its range.
 _LOUD = 5e-3
 

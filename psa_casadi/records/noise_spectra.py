@@ -59,11 +59,15 @@ class Colour:
         """Return a signal (n,) through the filter of order 24 that makes this noise white."""
         if self.family == "white":
             return signal
-        covariance = self.covariance(signal.size)[: _FILTER + 1]
-        a = scipy.linalg.solve_toeplitz(covariance[:-1], covariance[1:])
-        white = filtered([1.0, *(-a)], [1.0], signal)
+        white = filtered(self.filter(signal.size), [1.0], signal)
         white[:_FILTER] = 0.0  # nothing is known before
         return white
+
+    def filter(self, n: int) -> FloatArray:
+        """Return the coefficients (25,) of the filter that makes noise of n samples white."""
+        covariance = self.covariance(n)[: _FILTER + 1]
+        a = scipy.linalg.solve_toeplitz(covariance[:-1], covariance[1:])
+        return np.asarray(np.r_[1.0, -a])
 
     def covariance(self, n: int) -> FloatArray:
         """Return the shape of the autocovariance (n,) that belongs to the spectrum."""

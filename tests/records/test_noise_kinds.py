@@ -163,6 +163,23 @@ def test_two_at_once_are_both_named() -> None:
     assert each[frozenset({"outliers", "lines"})] >= 19, each
 
 
+def on_a_wander(noise: Noise) -> Noise:
+    """Return a noise on a slow wander, such as a fit that the noise has bent leaves."""
+
+    def both(rng: Rng, y: FloatArray) -> FloatArray:
+        return noise(rng, y) + power_law(3.0, rng)
+
+    return both
+
+
+@pytest.mark.parametrize(("kind", "least"), [("telegraph", 17), ("steps", 17)])
+def test_jumps_are_seen_on_a_wander(kind: str, least: int) -> None:
+    each = Counter(
+        kind in named(found(on_a_wander(KINDS[kind]), DRIVES[seed % 3], seed)) for seed in SEEDS
+    )
+    assert each[True] >= least, each
+
+
 def test_figures_are_those_of_the_noise() -> None:
     def figures(kind: str, seed: int) -> NoiseKind:
         kinds = found(KINDS[kind], fading, seed)

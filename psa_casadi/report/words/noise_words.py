@@ -62,8 +62,8 @@ _EACH: Mapping[str, Callable[..., str]] = {
     ),
     "noise_steps": lambda where, unit, at, count, size: (
         f"The readings of {where} jump {_times(count)} by about {quantity(size, unit)} and stay"
-        f" ({_places(at, count)}). Look for skipped fringes or counts, or a clamp that slips, and"
-        " cut the record there."
+        f" ({_places(at, count)}). Look for skipped fringes or counts, a clamp that slips, or"
+        " samples that were dropped, and cut the record there."
     ),
     "noise_heavy_tails": lambda where, unit, at, freedom: (
         f"The noise of {where} has heavy tails (Student's t with {freedom:.2g} degrees of freedom)."
