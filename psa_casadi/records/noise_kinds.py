@@ -35,6 +35,7 @@ from psa_casadi.records.noise_spectra import (
     Tone,
     colour_of,
     score,
+    straightened,
     tones_in,
 )
 from psa_casadi.units import FloatArray
@@ -344,19 +345,18 @@ class _Seen:
         """Return the jumps whose score exceeds the `least`, if they do not follow the drive."""
         white = -0.5 * left.size * float(np.log(max(float(np.var(left)), 1e-300)))
         tried: list[tuple[Kind, Jumps]] = []
-        two = two_levels(left)
+        two = two_levels(straightened(left))
         if two is not None and two.places.size > _FEW:
-            more = colour_of(left - two.levels).gain
+            more = colour_of(left - two.levels).gain + score(left, WHITE) - white
             tried.append(("telegraph", replace(two, gain=two.gain + more, sharp=True)))
         steps = steps_in(left)
         if steps is not None:
             more = colour_of(left - steps.levels).gain
-            tried.append(("steps", replace(steps, gain=steps.gain + more)))
+            tried.append((_kind_of(steps), replace(steps, gain=steps.gain + more)))
         tried = [t for t in tried if white + t[1].gain > least + LEAST]
         on = None if tried or colour is WHITE else jumps_on(left, colour)
         if on is not None and white + on.gain > least + LEAST:
-            two_kinds = on.places.size > _FEW and alternates(on)
-            tried.append(("telegraph" if two_kinds else "steps", on))
+            tried.append((_kind_of(on), on))
         if not tried:
             return None
         kind, best = max(tried, key=lambda pair: pair[1].gain)
@@ -459,6 +459,10 @@ _SMOOTH, _PREDICTED = 2.1, 0.01
 _SLIGHT = 5.0
 #: An input moves at a frequency where it has this share of its range.
 _LOUD = 5e-3
+
+
+def _kind_of(jumps: Jumps) -> Kind:
+    return "telegraph" if jumps.places.size > _FEW and alternates(jumps) else "steps"
 
 
 def _unlike(own: FloatArray, every: FloatArray) -> bool:
