@@ -24,9 +24,10 @@ def noise_found(
     prediction is a straight line between those of the experiments' samples. The model is simulated
     once more. Raises SimulationError where it cannot be.
     """
-    known, found = {r.sha256: r for r in given}, list[NoiseFound]()
+    found = list[NoiseFound]()
     for e, shown in zip(experiments, fit.shown(experiments), strict=True):
-        times, whole = e.record.time, known.get(e.record.sha256, e.record)
+        times = e.record.time
+        whole = next((r for r in given if _holds(r, e)), e.record)
         inside = (whole.time >= times[0]) & (whole.time <= times[-1])
         time = whole.time[inside]
         named = [c for n in fit.model.input_names if (c := whole.column(n)) is not None]
@@ -42,6 +43,13 @@ def noise_found(
             kinds = noise_kinds(time, reading[inside], y, inputs, used)
             found.append(NoiseFound(e.record.name, channel.column, channel.unit, kinds))
     return tuple(found)
+
+
+def _holds(record: Record | Signals, e: Experiment) -> bool:
+    """Whether an experiment's record was made of a record: of its file, within its time."""
+    begins, ends = e.record.time[0], e.record.time[-1]
+    within = record.time[0] <= begins and ends <= record.time[-1]
+    return bool(record.sha256 == e.record.sha256 and within)
 
 
 def _used(e: Experiment, channel: int) -> npt.NDArray[np.bool_]:

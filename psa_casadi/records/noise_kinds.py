@@ -98,19 +98,17 @@ def notes_of(found: Sequence[NoiseFound]) -> tuple[Note, ...]:
 
     White noise, and a misfit, need no word.
     """
-    outputs = {f.output for f in found}
-    said: dict[tuple[str, str], Note] = {}
+    several = len({f.output for f in found}) > 1
+    told: dict[tuple[str, str], tuple[NoiseFound, NoiseKind, list[str]]] = {}
     for f in found:
-        where = f"{f.output} in {f.record}" if len(outputs) > 1 else f.record
         for k in f.kinds:
-            first = said.get((f.output, k.kind))
-            if first is not None:
-                names = (*first.values["where"], where)
-                said[f.output, k.kind] = note(first.code, **{**first.values, "where": names})
-            elif k.kind not in ("white", "misfit"):
-                values = {"where": (where,), "unit": f.unit, "at": k.at, **k.figures}
-                said[f.output, k.kind] = note(f"noise_{k.kind}", **values)
-    return tuple(said.values())
+            names = told.setdefault((f.output, k.kind), (f, k, []))[2]
+            names.append(f"{f.output} in {f.record}" if several else f.record)
+    return tuple(
+        note("noise_kind", where=(*names,), unit=f.unit, kind=k.kind, figures=k.figures, at=k.at)
+        for f, k, names in told.values()
+        if k.kind not in ("white", "misfit")
+    )
 
 
 def noise_kinds(

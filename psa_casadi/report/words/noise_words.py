@@ -1,7 +1,6 @@
 """What is said of the noise that a model leaves, and what to do about it."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
 
 from psa_casadi.report.words.phrases import listing, quantity
 
@@ -49,52 +48,52 @@ def _one_over_f(
 
 
 _EACH: Mapping[str, Callable[..., str]] = {
-    "noise_autoregressive": _autoregressive,
-    "noise_one_over_f": _one_over_f,
-    "noise_coloured": lambda where, unit, at, rms, time: (
+    "autoregressive": _autoregressive,
+    "one_over_f": _one_over_f,
+    "coloured": lambda where, unit, at, rms, time: (
         f"What is left of {where} is correlated over {quantity(time, 's')}; from these records it"
         " may be noise, or something that the model lacks. A voltage that is played twice tells."
     ),
-    "noise_telegraph": lambda where, unit, at, count, apart: (
+    "telegraph": lambda where, unit, at, count, apart: (
         f"The noise of {where} jumps {_times(count)} between two levels, {quantity(apart, unit)}"
         " apart (random telegraph noise). Look for a loose contact, a range that switches, a sensor"
         " between two states."
     ),
-    "noise_steps": lambda where, unit, at, count, size: (
+    "steps": lambda where, unit, at, count, size: (
         f"The readings of {where} jump {_times(count)} by about {quantity(size, unit)} and stay"
         f" ({_places(at, count)}). Look for skipped fringes or counts, a clamp that slips, or"
         " samples that were dropped, and cut the record there."
     ),
-    "noise_heavy_tails": lambda where, unit, at, freedom: (
+    "heavy_tails": lambda where, unit, at, freedom: (
         f"The noise of {where} has heavy tails (Student's t with {freedom:.2g} degrees of freedom)."
         " Look for interference; of repeats the median is better than the mean."
     ),
-    "noise_outliers": lambda where, unit, at, count: (
+    "outliers": lambda where, unit, at, count: (
         f"{where} has {'1 outlier' if count == 1 else f'{count:.0f} outliers'}"
         f" ({_places(at, count)}). Empty these cells, and look for interference at these instants."
     ),
-    "noise_jitter": lambda where, unit, at, rms: (
+    "jitter": lambda where, unit, at, rms: (
         f"The clock of {where} jitters by {quantity(rms, 's')} rms: the error grows with the rate"
         " of the motion. Use its own time stamps, or let the generator's clock trigger the samples."
     ),
-    "noise_grows": lambda where, unit, at, share: (
+    "grows": lambda where, unit, at, share: (
         f"The noise of {where} grows with the reading, by {100.0 * share:.2g} % of it. Look for a"
         " supply or a gain of the sensor that fluctuates."
     ),
-    "noise_quantised": lambda where, unit, at, step, rms: (
+    "quantised": lambda where, unit, at, step, rms: (
         f"What is left of {where} is rounding to steps of {quantity(step, unit)}. Take a smaller"
         " range of the sensor or a finer converter."
     ),
-    "noise_held": lambda where, unit, at, share, run: (
+    "held": lambda where, unit, at, share, run: (
         f"{100.0 * share:.0f} % of the readings of {where} repeat the one before: the sensor is"
         " read more slowly than it is sampled, or misses samples. Record"
         f" {f'one of {run:.0f} samples' if run > 1.5 else 'with the time stamps of the sensor'}."
     ),
-    "noise_dropped": lambda where, unit, at, count: (
+    "dropped": lambda where, unit, at, count: (
         f"{where} lacks {count:.0f} sample{'s' * (count > 1)} of an even clock. The model is driven"
         " on a straight line there: see that the recorder's buffer does not overflow."
     ),
-    "noise_lines": lambda where, unit, at, amplitude: (
+    "lines": lambda where, unit, at, amplitude: (
         f"The noise of {where} has {'a line' if len(at) == 1 else 'lines'} whatever the drive does:"
         f" {listing([_line(f) for f in at])}, the strongest with an amplitude of"
         f" {quantity(amplitude, unit)}. Look for hum and vibration: shield, earth at one point, and"
@@ -103,12 +102,16 @@ _EACH: Mapping[str, Callable[..., str]] = {
 }
 
 
-def _of_all(sentence: Callable[..., str], *, where: tuple[str, ...], **values: object) -> str:
+def _noise_kind(
+    where: tuple[str, ...],
+    unit: str,
+    kind: str,
+    figures: Mapping[str, float],
+    at: tuple[float, ...],
+) -> str:
     """Return a sentence on the first record, and which others have noise of the same kind."""
     others = f" (and likewise of {listing(where[1:], most=3)})" if len(where) > 1 else ""
-    return sentence(where=where[0] + others, **values)
+    return _EACH[kind](where=where[0] + others, unit=unit, at=at, **figures)
 
 
-NOISE: Mapping[str, Callable[..., str]] = {
-    code: partial(_of_all, sentence) for code, sentence in _EACH.items()
-}
+NOISE: Mapping[str, Callable[..., str]] = {"noise_kind": _noise_kind}
