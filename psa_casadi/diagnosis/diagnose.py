@@ -265,8 +265,6 @@ def decided(
 
 #: So many further stuck readings are worth a second search.
 MORE = 3
-#: Steps of a sensor over a record's range below which it is coarse.
-COARSE = 32
 
 
 @interruptible_work()
@@ -352,7 +350,7 @@ def _with_noise(
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
-    """Return the records without suspect samples, and where a sensor was saturated or coarse.
+    """Return the records without suspect samples, and where a sensor was saturated.
 
     And the share of the readings that a saturated sensor has made.
 
@@ -363,13 +361,11 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
     refuse_other_time(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
-    both = list(zip(records, found, strict=True))
-    saturation = tuple(s for r, own in both for s in own.saturation(r.name))
+    saturation = tuple(
+        s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)
+    )
     refuse_few(records, clean, texts(saturation))
     said: list[Note | str] = [*saturation]
-    for r, own in both:
-        if own.quantum is not None and r.range_m < COARSE * own.quantum:
-            said.append(note("coarse", record=r.name, steps=r.range_m / own.quantum))
     saturated = sum(own.counts["saturated"] for own in found)
     return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 

@@ -81,8 +81,8 @@ _EACH: Mapping[str, Callable[..., str]] = {
         " supply or a gain of the sensor that fluctuates."
     ),
     "quantised": lambda where, unit, at, step, rms: (
-        f"What is left of {where} is rounding to steps of {quantity(step, unit)}. Take a smaller"
-        " range of the sensor or a finer converter."
+        f"What is left of {where} is rounding to steps of {quantity(step, unit)}; nothing smaller"
+        " can be told. Take a smaller range of the sensor or a finer converter."
     ),
     "held": lambda where, unit, at, share, run: (
         f"{100.0 * share:.0f} % of the readings of {where} repeat the one before: the sensor is"
