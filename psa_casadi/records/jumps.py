@@ -253,8 +253,7 @@ def jumps_on(signal: FloatArray, colour: Colour) -> Jumps | None:
         match = convolved(white[:, None], kernel)[:, 0] / float(np.linalg.norm(shape))
         size = np.abs(match) / (1.4826 * float(np.median(np.abs(match))))
         size[: 2 * _APART] = size[-2 * _APART :] = 0.0
-        more = peaks(size, _APART, _MANY)
-        more = more[size[more] > _STANDS_OUT]
+        more = peaks(np.where(size > _STANDS_OUT, size, 0.0), _APART, _MANY)
         places = np.unique(np.r_[places, more])
         if not more.size or places.size > _MANY:
             break
