@@ -23,6 +23,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import unfinished
+from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
 from psa_casadi.identification.refitting import relevelled
 from psa_casadi.identification.search import (
@@ -52,6 +53,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.progress import Progress, silent
+from psa_casadi.records.noise_kinds import notes_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
@@ -263,8 +265,6 @@ def decided(
 
 #: So many further stuck readings are worth a second search.
 MORE = 3
-#: Steps of a sensor over a record's range below which it is coarse.
-COARSE = 32
 
 
 @interruptible_work()
@@ -332,15 +332,25 @@ def diagnose(
         # from the end: the screening begins at the front
         with compiled_ahead(reversed(screened_with(start, table, laws))):
             found = _diagnose(start, task, scale_given)
-        return replace(found, remarks=(*found.remarks, *said))
+        return _with_noise(found, said, (*whole, *held))
     except KeyboardInterrupt:
         if not so_far:
             raise
         raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
+def _with_noise(
+    found: StackDiagnosis, said: Sequence[Note | str], given: Sequence[Record]
+) -> StackDiagnosis:
+    """Return a diagnosis with what else is `said`, and the noise that its extended model leaves."""
+    driven = found.verdict != "not_driven"
+    noise = noise_found(found.extended_fit, found.experiments, given) if driven else ()
+    remarks = *found.remarks, *said, *notes_of(noise)
+    return replace(found, remarks=remarks, noise_kinds=noise)
+
+
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
-    """Return the records without suspect samples, and where a sensor was saturated or coarse.
+    """Return the records without suspect samples, and where a sensor was saturated.
 
     And the share of the readings that a saturated sensor has made.
 
@@ -351,13 +361,11 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
     refuse_other_time(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
-    both = list(zip(records, found, strict=True))
-    saturation = tuple(s for r, own in both for s in own.saturation(r.name))
+    saturation = tuple(
+        s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)
+    )
     refuse_few(records, clean, texts(saturation))
     said: list[Note | str] = [*saturation]
-    for r, own in both:
-        if own.quantum is not None and r.range_m < COARSE * own.quantum:
-            said.append(note("coarse", record=r.name, steps=r.range_m / own.quantum))
     saturated = sum(own.counts["saturated"] for own in found)
     return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 

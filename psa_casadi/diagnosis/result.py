@@ -19,6 +19,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame, made, with_units
 
@@ -224,7 +225,7 @@ class Diagnosis(Reported):
     `remaining` what the extended model does. `budget` says where the base's held-out error goes,
     `patch` is the unnamed correction that would remove most of what the named causes leave.
     `doubted` says why held-out samples cannot confirm a cause, None where they can; `remarks` what
-    else there is to say.
+    else there is to say. `noise_kinds` are those in what the extended model leaves of every output.
     """
 
     verdict: Verdict
@@ -243,6 +244,7 @@ class Diagnosis(Reported):
     doubted: Note | None = None
     budget: Budget
     patch: Correction | None = None
+    noise_kinds: tuple[NoiseFound, ...] = ()
 
     @property
     def doubt(self) -> str:
@@ -344,6 +346,7 @@ class Diagnosis(Reported):
             "remaining": told(self.remaining, "seen", "where"),
             "unnamed": self.unnamed,
             "notes": list(self.notes),
+            "noise_kinds": [asdict(n) for n in self.noise_kinds],
             "values": dict(self.model.values),
             "records": [
                 {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments

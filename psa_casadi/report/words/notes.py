@@ -10,6 +10,7 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
+from psa_casadi.report.words.noise_words import NOISE
 from psa_casadi.report.words.phrases import (
     are,
     listing,
@@ -146,10 +147,6 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         f"The search for causes ended at its budget of work ({work:.2g} steps of simulations): the"
         f" answer is the best so far. Not tried: {', '.join(_LEFT[name] for name in left)}."
     ),
-    "coarse": (
-        "{record}: the sensor resolves {steps:.0f} steps over the whole range. They make up the"
-        " model's error: nothing smaller can be distinguished from them."
-    ),
     "stuck": (
         "{count} readings repeat the last one far from the model, as a stuck sensor does; masked."
     ),
@@ -159,9 +156,8 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " is driven by the curve, and a simulation of such a record needs more samples for each"
         " period."
     ),
-    "noise": lambda record, level, how, samples, coloured, quantum, rounding: (
-        f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples), and"
-        f" {'correlated from sample to sample' if coloured else 'white'}."
+    "noise": lambda record, level, how, samples, quantum, rounding: (
+        f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples)."
         f"{_steps(quantum, rounding) if quantum is not None else ''}"
     ),
     "noise_fast": "from the fast part of what the model leaves",
@@ -370,6 +366,7 @@ SENTENCES: Mapping[str, Sentence] = {
     **DIAGNOSIS,
     **IDENTIFICATION,
     **MISFIT,
+    **NOISE,
     **OWN_MODELS,
 }
 
