@@ -410,11 +410,11 @@ def _on_one_clock(records: Sequence[Record], said: list[Note | str]) -> list[Rec
 
 def _against(since: Since | None, start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
     """Diagnose what is left of healthy records, where there are any."""
-    found = _diagnose(start, task, scale_given)
     if since is None:
-        return found
+        return _diagnose(start, task, scale_given)
     return since.concluded(
-        found, lambda free: _diagnose(start, replace(task, free=free), scale_given)
+        task.method,
+        lambda method, free: _diagnose(start, replace(task, method=method, free=free), scale_given),
     )
 
 

@@ -69,13 +69,17 @@ _CAUSES, _FURTHER = 2, 0.1
 _NEAR, _LEAST, _TURNS = 0.1, 0.25, 0.01
 #: Multiple of what healthy records differ by that is no change, where the new voltage was played
 #: before and where not; and the share of the range by which any stack does.
-_MORE, _REPEATS = (1.5, 3.0), 1e-3
+_MORE, _REPEATS = (1.5, 2.0), 1e-3
+#: A test's share of what is left may be larger than what is open.
+_DEAF = 2.0
 #: Verdicts beside which no parameter is asked for; parameters that no healthy record may tell, but
 #: a change of which shows.
 _NOTHING, _SCALES = ("adequate", "not_driven"), ("k_P", "k")
-#: A parameter takes the place of causes where it leaves less than this share of their error beside
-#: the noise, which is told from this share of the noise on.
-_CLEARLY, _FORM = 0.5, 0.3
+#: A parameter has changed where it leaves no more than this share of what has; it replaces causes
+#: where it leaves less than this share of what they do, told from a share of the noise on.
+_REST, _CLEARLY, _FORM = 0.1, 0.5, 0.3
+#: Parameters that leave less than so many times the best one explain as much.
+_ALIKE = 1.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,19 +162,19 @@ class Healthy:
     def open(self) -> float:
         """What the device may differ by beyond the noise, rms [m].
 
-        Each of the healthy records, or half of a single one, is predicted from the others; the
-        largest error counts.
+        Each of the healthy records, or half of a single one, is predicted from the others.
         """
         parts = [e.record for e in self.experiments]
         if len(parts) == 1:
             half = parts[0].n // 2
             parts = [parts[0].slice(0, half), parts[0].slice(half, parts[0].n)]
-        worst = 0.0
+        powers, counts = [0.0], [1]
         for k, part in enumerate(parts):
             others = tuple(whole(r) for j, r in enumerate(parts) if j != k)
             with suppress(PsaError):
-                worst = max(worst, self._unlike(part, others))
-        return float(np.sqrt(worst))
+                powers.append(max(self._unlike(part, others), 0.0))
+                counts.append(part.n)
+        return float(np.sqrt(np.average(powers, weights=counts)))
 
     def _unlike(self, part: Record, others: tuple[Experiment, ...]) -> float:
         """Return the power [m^2] beyond the noise of what others do not predict of a record."""
@@ -231,49 +235,63 @@ class Since:
         return max(more * self.healthy.open, _REPEATS * widest)
 
     def method(self, method: Method) -> Method:
-        """Return the method to which less than what is open says nothing."""
-        widest, limits = max(r.range_m for r in self.records), method.thresholds
-        return replace(
-            method,
-            without=method.without | _BASE_STEPS,
-            thresholds=replace(
-                limits,
-                form_of_range=max(limits.form_of_range, self.open / widest),
-                further=max(limits.further, _FURTHER),
-                most_causes=min(limits.most_causes, _CAUSES),
-            ),
+        """Return the method for a base that is held, and a change that may be large."""
+        limits = method.thresholds
+        limits = replace(
+            limits,
+            further=max(limits.further, _FURTHER),
+            most_causes=min(limits.most_causes, _CAUSES),
         )
+        return replace(method, without=method.without | _BASE_STEPS, thresholds=limits)
+
+    def deaf(self, method: Method, level: float) -> Method:
+        """Return the method to which less than a level, rms [m], says nothing."""
+        widest = max(r.range_m for r in self.records)
+        limits = replace(method.thresholds, form_of_range=_DEAF * level / widest)
+        return replace(method, thresholds=limits)
 
     def concluded(
-        self, found: StackDiagnosis, again: Callable[[tuple[str, ...]], StackDiagnosis]
+        self, method: Method, diagnosed: Callable[[Method, tuple[str, ...]], StackDiagnosis]
     ) -> StackDiagnosis:
-        """Return a diagnosis with what was taken off, or that with a parameter which has changed.
+        """Diagnose by a method, and tell what was taken off and which parameter has changed.
 
-        `again` diagnoses with parameters of the base free. One takes the place of the causes where
-        it leaves clearly less beside the noise than they do; where it leaves as little it is told.
+        `diagnosed` does it by a method with parameters of the base free. What is left of no more
+        than is open is no change. A parameter takes the place of the causes where it leaves clearly
+        less beside the noise than they do, and a stiffness where it leaves as little; what it
+        leaves is its form. Another that leaves as little is told beside them.
         """
-        rms, least = float(np.sqrt(np.mean(np.concatenate(self.added) ** 2))), self.open
-        shown = float(np.mean(np.concatenate(self.shown)))
+        found, rms = diagnosed(method, ()), np.sqrt(np.mean(np.concatenate(self.added) ** 2))
+        noise, base, least = found.noise_floor_rms_m, found.base_fit, self.open**2
+        excess = base.rms**2 - noise**2
+        if excess < least and found.verdict not in _NOTHING:
+            found = diagnosed(self.deaf(method, self.open), ())
         said = [
-            note("since", removed=(rms, "m"), places=self.places, open=(least, "m"), shown=shown)
-        ]
+            note("since", removed=(float(rms), "m"), places=self.places, open=(self.open, "m"),
+                 shown=float(np.mean(np.concatenate(self.shown))))
+        ]  # fmt: skip
         best = None if found.verdict in _NOTHING else self._moved(found)
         if best is not None:
-            (name,), before = best.unknowns.names, found.base_fit.model
-            noise = found.noise_floor_rms_m
-            left, theirs = (max(f.rms**2 - noise**2, 0.0) for f in (best, found.extended_fit))
-            least = least**2 + (_FORM * noise) ** 2
+            (name,) = best.unknowns.names
+            left, theirs = (f.rms**2 - noise**2 for f in (best, found.extended_fit))
+            least += (_FORM * noise) ** 2
+            as_good = left < max(theirs, least)
             alone = left < _CLEARLY * theirs and theirs > least
-            if alone:
-                found = again((name,))
-            if alone or left < max(theirs, least) / _CLEARLY:
-                values = (before.values[name], best.model.values[name])
-                unit = before.parameter(name).unit
+            alone |= as_good and name in _SCALES  # no effect is a gain alone
+            if left < max(_REST * excess, least) and (alone or as_good):
+                if alone:
+                    found = diagnosed(
+                        self.deaf(method, float(np.hypot(best.rms, least**0.5))), (name,)
+                    )
+                unit = base.model.parameter(name).unit
+                values = (base.model.values[name], best.model.values[name])
                 said.append(note("since_moved", name=name, values=values, unit=unit, alone=alone))
         return replace(found, remarks=(*said, *found.remarks))
 
     def _moved(self, found: StackDiagnosis) -> Fit | None:
-        """Fit every parameter of the base alone; return the fit that leaves least."""
+        """Fit every parameter of the base alone; return the fit that leaves least.
+
+        The stiffness, which is a gain of slow records, comes first of those that leave as little.
+        """
         fits, base = [], found.base_fit
         for name in dict.fromkeys((*self.healthy.fit.unknowns.names, *_SCALES)):
             if name in base.model.values:
@@ -282,7 +300,9 @@ class Since:
                         fit(base.model, found.experiments, (name,), sigma=base.sigma,
                             start_states=base.starts(), evaluations=_EVALUATIONS)
                     )  # fmt: skip
-        return min(fits, key=lambda f: f.rms, default=None)
+        best = min((f.rms for f in fits), default=0.0)
+        alike = (f for f in fits if f.rms < _ALIKE * best)
+        return min(alike, key=lambda f: (f.unknowns.names[0] not in _SCALES, f.rms), default=None)
 
 
 def _place(record: Record, span: float) -> FloatArray:
