@@ -273,11 +273,11 @@ class Since:
         if best is not None:
             (name,) = best.unknowns.names
             left, theirs = (f.rms**2 - noise**2 for f in (best, found.extended_fit))
-            least += (_FORM * noise) ** 2
-            as_good = left < max(theirs, least)
-            alone = left < _CLEARLY * theirs and theirs > least
+            form = (_FORM * noise) ** 2
+            as_good = left < max(theirs, 0.0) + form
+            alone = left < _CLEARLY * theirs and theirs > least + form
             alone |= as_good and name in _SCALES  # no effect is a gain alone
-            if left < max(_REST * excess, least) and (alone or as_good):
+            if left < max(_REST * excess, least + form) and (alone or as_good):
                 if alone:
                     found = diagnosed(
                         self.deaf(method, float(np.hypot(best.rms, least**0.5))), (name,)
