@@ -78,8 +78,15 @@ _NOTHING, _SCALES = ("adequate", "not_driven"), ("k_P", "k")
 #: A parameter has changed where it leaves no more than this share of what has; it replaces causes
 #: where it leaves less than this share of what they do, told from a share of the noise on.
 _REST, _CLEARLY, _FORM = 0.1, 0.5, 0.3
+#: Effects of a form with so many weights that it imitates others; they are looked for where all
+#: others leave more than this share of what has changed.
+_GENERIC, _SPECIAL = ("hysteresis_memory",), 0.05
 #: Parameters that leave less than so many times the best one explain as much.
 _ALIKE = 1.02
+
+
+#: Diagnoses by a method, with parameters of the base free and without some effects.
+Diagnosed = Callable[[Method, tuple[str, ...], tuple[str, ...]], StackDiagnosis]
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,21 +257,24 @@ class Since:
         limits = replace(method.thresholds, form_of_range=_DEAF * level / widest)
         return replace(method, thresholds=limits)
 
-    def concluded(
-        self, method: Method, diagnosed: Callable[[Method, tuple[str, ...]], StackDiagnosis]
-    ) -> StackDiagnosis:
+    def concluded(self, method: Method, diagnosed: Diagnosed) -> StackDiagnosis:
         """Diagnose by a method, and tell what was taken off and which parameter has changed.
 
-        `diagnosed` does it by a method with parameters of the base free. What is left of no more
+        What is left of no more
         than is open is no change. A parameter takes the place of the causes where it leaves clearly
         less beside the noise than they do, and a stiffness where it leaves as little; what it
         leaves is its form. Another that leaves as little is told beside them.
         """
-        found, rms = diagnosed(method, ()), np.sqrt(np.mean(np.concatenate(self.added) ** 2))
+        found, rms = (
+            diagnosed(method, (), _GENERIC),
+            np.sqrt(np.mean(np.concatenate(self.added) ** 2)),
+        )
         noise, base, least = found.noise_floor_rms_m, found.base_fit, self.open**2
         excess = base.rms**2 - noise**2
+        if found.extended_fit.rms**2 - noise**2 > max(_SPECIAL * excess, (_FORM * noise) ** 2):
+            found = diagnosed(method, (), ())
         if excess < least and found.verdict not in _NOTHING:
-            found = diagnosed(self.deaf(method, self.open), ())
+            found = diagnosed(self.deaf(method, self.open), (), ())
         said = [
             note("since", removed=(float(rms), "m"), places=self.places, open=(self.open, "m"),
                  shown=float(np.mean(np.concatenate(self.shown))))
@@ -279,9 +289,8 @@ class Since:
             alone |= as_good and name in _SCALES  # no effect is a gain alone
             if left < max(_REST * excess, least + form) and (alone or as_good):
                 if alone:
-                    found = diagnosed(
-                        self.deaf(method, float(np.hypot(best.rms, least**0.5))), (name,)
-                    )
+                    deaf = self.deaf(method, float(np.hypot(best.rms, self.open)))
+                    found = diagnosed(deaf, (name,), ())
                 unit = base.model.parameter(name).unit
                 values = (base.model.values[name], best.model.values[name])
                 said.append(note("since_moved", name=name, values=values, unit=unit, alone=alone))
