@@ -412,14 +412,10 @@ def _against(since: Since | None, start: Model, task: Task, scale_given: bool) -
     """Diagnose what is left of healthy records, where there are any."""
     if since is None:
         return _diagnose(start, task, scale_given)
-
-    def diagnosed(
-        method: Method, free: tuple[str, ...], without: tuple[str, ...]
-    ) -> StackDiagnosis:
-        table = tuple(e for e in task.table if e.name not in without)
-        return _diagnose(start, replace(task, method=method, free=free, table=table), scale_given)
-
-    return since.concluded(task.method, diagnosed)
+    return since.concluded(
+        task.method,
+        lambda method, free: _diagnose(start, replace(task, method=method, free=free), scale_given),
+    )
 
 
 def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:

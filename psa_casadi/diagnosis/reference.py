@@ -78,15 +78,12 @@ _NOTHING, _SCALES = ("adequate", "not_driven"), ("k_P", "k")
 #: A parameter has changed where it leaves no more than this share of what has; it replaces causes
 #: where it leaves less than this share of what they do, told from a share of the noise on.
 _REST, _CLEARLY, _FORM = 0.1, 0.5, 0.3
-#: Effects of a form with so many weights that it imitates others; they are looked for where all
-#: others leave more than this share of what has changed.
-_GENERIC, _SPECIAL = ("hysteresis_memory",), 0.05
 #: Parameters that leave less than so many times the best one explain as much.
 _ALIKE = 1.02
 
 
-#: Diagnoses by a method, with parameters of the base free and without some effects.
-Diagnosed = Callable[[Method, tuple[str, ...], tuple[str, ...]], StackDiagnosis]
+#: Diagnoses by a method, with parameters of the base free.
+Diagnosed = Callable[[Method, tuple[str, ...]], StackDiagnosis]
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,16 +262,11 @@ class Since:
         less beside the noise than they do, and a stiffness where it leaves as little; what it
         leaves is its form. Another that leaves as little is told beside them.
         """
-        found, rms = (
-            diagnosed(method, (), _GENERIC),
-            np.sqrt(np.mean(np.concatenate(self.added) ** 2)),
-        )
+        found, rms = diagnosed(method, ()), np.sqrt(np.mean(np.concatenate(self.added) ** 2))
         noise, base, least = found.noise_floor_rms_m, found.base_fit, self.open**2
         excess = base.rms**2 - noise**2
-        if found.extended_fit.rms**2 - noise**2 > max(_SPECIAL * excess, (_FORM * noise) ** 2):
-            found = diagnosed(method, (), ())
         if excess < least and found.verdict not in _NOTHING:
-            found = diagnosed(self.deaf(method, self.open), (), ())
+            found = diagnosed(self.deaf(method, self.open), ())
         said = [
             note("since", removed=(float(rms), "m"), places=self.places, open=(self.open, "m"),
                  shown=float(np.mean(np.concatenate(self.shown))))
@@ -290,7 +282,7 @@ class Since:
             if left < max(_REST * excess, least + form) and (alone or as_good):
                 if alone:
                     deaf = self.deaf(method, float(np.hypot(best.rms, self.open)))
-                    found = diagnosed(deaf, (name,), ())
+                    found = diagnosed(deaf, (name,))
                 unit = base.model.parameter(name).unit
                 values = (base.model.values[name], best.model.values[name])
                 said.append(note("since_moved", name=name, values=values, unit=unit, alone=alone))
