@@ -215,7 +215,8 @@ class Task:
     """The records, the effects to search, what knows the device, the method, and who is told.
 
     `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
-    interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made.
+    interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made. Of a
+    base that is known but for its parameters `free` only these are fitted.
     """
 
     experiments: tuple[Experiment, ...]
@@ -226,6 +227,7 @@ class Task:
     keep: Callable[[Fit], None] = lambda _: None
     watch: Callable[[Tried], None] = lambda _: None
     hidden: float = 0.0
+    free: tuple[str, ...] | None = None
 
     @property
     def limits(self) -> Thresholds:

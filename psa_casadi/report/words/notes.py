@@ -57,6 +57,22 @@ _LACKING = {
 }
 
 
+def _known_from(places: int) -> str:
+    if not places:
+        return "predicted from the voltage"
+    often = "once" if places == 1 else f"{places} times"
+    return f"as it was where this voltage was played before, {often}"
+
+
+def _not_shown(shown: float) -> str:
+    if shown > 0.995:
+        return ""
+    return (
+        f" The voltage of {100.0 * (1.0 - shown):.0f} % of the samples is not in the reference:"
+        " they are left out."
+    )
+
+
 def correction(kind: str, port: str) -> str:
     """Return what an unnamed correction is."""
     return CORRECTIONS.get(kind) or CORRECTIONS.get(f"{kind} at {port}", kind)
@@ -155,6 +171,16 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " difference the base model's error held {share:.2f} ({low:.2f} to {high:.2f}): the model"
         " is driven by the curve, and a simulation of such a record needs more samples for each"
         " period."
+    ),
+    "since": lambda removed, places, open, shown: (
+        f"What the base model leaves of the reference is taken off the displacement,"
+        f" {quantity(*removed)} rms, {_known_from(places)}.{_not_shown(shown)} A sound device may"
+        f" differ by {quantity(*open)} rms: less is no change."
+    ),
+    "since_moved": lambda name, values, unit, alone: (
+        f"{name} of the base model has changed from {with_its_unit(values[0], unit)} to"
+        f" {with_its_unit(values[1], unit)} since the reference: that alone explains"
+        f" {'more than any effect of the table' if alone else 'as much as the named causes'}."
     ),
     "noise": lambda record, level, how, samples, quantum, rounding: (
         f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples)."
