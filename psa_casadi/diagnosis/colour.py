@@ -356,6 +356,8 @@ def own_colour(
                 return
             reached = found.nats()
             yield found, left
+            if not a.size and not lost:
+                return  # the fit is the likeliest one already
             white = _innovations(columns, at, a) / spread[at, None]
             share = (found.level / max(rms(left[used]), 1e-300)) ** 2
             normal = white.T @ white + share * begun.T @ begun + np.diag(found.level**2 * weight)

@@ -61,6 +61,8 @@ def families(
     has, and that E of the cause, the odds that the cause is not listed are
 
         sum_k exp((F_k - E) / T),   T = max(temperature, form_of_evidence E)
+
+    Without any effect the corrections share all.
     """
     scale = max(temperature(evidence, limits), limits.form_of_evidence * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
@@ -70,7 +72,7 @@ def families(
         if family[1] not in own and c.evidence > limits.price:
             odds = float(np.exp(min((c.evidence - evidence) / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
-    listed = 1.0 / (1.0 + sum(others.values()))
+    listed = 1.0 / (bool(probability) + sum(others.values())) if probability or others else 0.0
     found: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
     for name, p in probability.items():
         if name in places:

@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
-from psa_casadi.diagnosis.families import families
+from psa_casadi.diagnosis.families import Family, families
 from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
@@ -243,11 +243,23 @@ class Judge:
         return self.last if self.kept else self.first
 
     @cached_property
+    def beside_final(self) -> Sequence[Correction]:
+        """The unnamed corrections beside the extended model."""
+        return self.corrections(self.final.view.of) if self.kept else self.weighed.corrections
+
+    @cached_property
     def best_correction(self) -> Correction | None:
         """The unnamed correction that would remove most of what the extended model leaves."""
         of, colour = self.final.view.of, self.last.screening.colour
-        found = self.corrections(of) if self.kept else self.weighed.corrections
-        return best_of(found, self.experiments, of.errors, colour, self.limits)
+        return best_of(self.beside_final, self.experiments, of.errors, colour, self.limits)
+
+    @property
+    def families_left(self) -> tuple[Family, ...]:
+        """The places and kinds that what has no name may be of, where something is left."""
+        if self.best_correction is None:
+            return ()
+        most = self.best_correction.evidence
+        return families({}, {}, most, self.beside_final, self.limits)
 
     @cached_property
     def budget(self) -> Budget:
@@ -384,6 +396,7 @@ class Judge:
             "base_fit": self.first.fit,
             "extended_fit": self.final.fit,
             "model": self.model,
+            "families": self.families_left,
             "doubted": self.doubt if self.verdict in ("adequate", "unexplained") else None,
             "budget": self.budget,
             "patch": None if best is None else replace(best, share=share),

@@ -223,7 +223,8 @@ class Diagnosis(Reported):
     are the predictions of every record in full, in the order of `experiments`. `candidates` are all
     effects tried, `errors` those of every measured output. `missed` is what the base leaves,
     `remaining` what the extended model does. `budget` says where the base's held-out error goes,
-    `patch` is the unnamed correction that would remove most of what the named causes leave.
+    `patch` is the unnamed correction that would remove most of what the named causes leave,
+    `families` are the places and kinds that this may be of.
     `doubted` says why held-out samples cannot confirm a cause, None where they can; `remarks` what
     else there is to say. `noise_kinds` are those in what the extended model leaves of every output.
     """
@@ -244,6 +245,7 @@ class Diagnosis(Reported):
     doubted: Note | None = None
     budget: Budget
     patch: Correction | None = None
+    families: tuple[Family, ...] = ()
     noise_kinds: tuple[NoiseFound, ...] = ()
 
     @property
@@ -345,6 +347,7 @@ class Diagnosis(Reported):
             "missed": told(self.missed, "seen", "where"),
             "remaining": told(self.remaining, "seen", "where"),
             "unnamed": self.unnamed,
+            "families": [asdict(f) for f in self.families],
             "notes": list(self.notes),
             "noise_kinds": [asdict(n) for n in self.noise_kinds],
             "values": dict(self.model.values),

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.result import (
     ANY_MODEL,
@@ -285,6 +286,7 @@ class AnyDiagnosisFile(Told):
     missed: Remaining | None = None
     remaining: Remaining
     unnamed: str = ""
+    families: tuple[Family, ...] = ()
     notes: tuple[str, ...]
     noise_kinds: tuple[NoiseFound, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)

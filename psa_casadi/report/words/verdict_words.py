@@ -1,8 +1,11 @@
 """The verdict of a diagnosis and its error budget in sentences."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from psa_casadi.diagnosis.corrections import Correction, Patch
+from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis, StackDiagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
@@ -174,13 +177,13 @@ _PLACES = {
 }
 
 
-def family_sentence(cause: Cause) -> str:
+def family_sentence(families: Sequence[Family]) -> str:
     """Say what a cause does and where it sits, and how far it may be none of the listed effects."""
     parts = []
-    for f in cause.families:
+    for f in families:
         place = _PLACES.get(f.place, f.place)
         part = f"{_DOES[f.kind]} in {place} ({phrases.probability_text(f.probability)})"
-        if not f.effects:
+        if not f.effects and any(other.effects for other in families):
             part += ", none of the listed effects"
         parts.append(part)
     return phrases.listing(parts, "or")
