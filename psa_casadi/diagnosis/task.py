@@ -56,7 +56,7 @@ class Thresholds:
       largest, before it becomes a probability. From the reliability table of the benchmark
       `diagnose`: the effects are not the true equations.
     * `form_of_evidence`: share of a cause's evidence by which an unnamed correction of another
-      family may differ and be as likely. The listed effects' forms are not the true ones.
+      kind may differ and be as likely. The listed effects' forms are not the true ones.
     * `credible`: probability that the set of effects that cannot be told apart holds the cause.
     * `clearly`: tempered odds [nats] below which another correction, or another effect in a
       cause's place, is as likely as the best one: 20 to 1.
