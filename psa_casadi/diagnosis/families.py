@@ -1,7 +1,7 @@
 """What data say of a cause first: its family, the place where it sits and what it does.
 
 Which effect of a family it is comes second, and it may be none that is listed: unnamed corrections
-of other families compete with the listed effects on the scale of evidence.
+of other kinds compete with the listed effects on the scale of evidence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,8 +57,8 @@ def families(
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
     families; `evidence` is that of the best of them over the model without the cause, beside which
-    the `corrections` stand. With the evidence F_k of a correction whose family no likely effect
-    has, and that E of the cause, the odds that the cause is not listed are
+    the `corrections` stand. With the evidence F_k, above the price of a cause, of a correction
+    whose kind no likely effect has, and that E of the cause, the odds that it is not listed are
 
         sum_k exp((F_k - E) / T),   T = max(temperature, form_of_evidence E)
 
