@@ -11,7 +11,6 @@ import numpy as np
 
 from psa_casadi.component import Kind
 from psa_casadi.diagnosis.corrections import Correction, Patch
-from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.task import Thresholds
 
 #: What a correction of a kind does, where it has another name, and the places of its ports.
@@ -64,7 +63,7 @@ def families(
 
     Without any effect the corrections share all.
     """
-    scale = max(temperature(evidence, limits), limits.form_of_evidence * evidence)
+    scale = max(limits.temperature, limits.form_of_evidence * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
     others: dict[tuple[str, str], float] = {}
     for c in corrections:
