@@ -59,7 +59,7 @@ def families(
     the `corrections` stand. With the evidence F_k, above the price of a cause, of a correction
     whose kind no likely effect has, and that E of the cause, the odds that it is not listed are
 
-        sum_k exp((F_k - E) / T),   T = max(temperature, form_of_evidence E)
+        sum_k exp((F_k - E) / T),   T = max(temperature 2, form_of_evidence E)
 
     Without any effect the corrections share all.
     """
