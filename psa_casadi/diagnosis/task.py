@@ -77,7 +77,7 @@ class Thresholds:
     form_of_range: float = 2e-5
     dithered: float = 1.2
     price: float = 8.0
-    noise: float = 20.0
+    noise: float = 15.0
     further: float = 0.02
     static: float = 0.9
     form: float = 0.05
