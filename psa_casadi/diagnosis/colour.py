@@ -494,26 +494,26 @@ def omnibus(
     *,
     lengths: Sequence[int],
     knowable: float,
-    even: bool,
+    own: bool,
     alarms_below: float,
 ) -> Omnibus:
     """Test a residual (samples,) [m] for structure that noise of the given colour does not have.
 
-    Three tests with Bonferroni's correction: Ljung-Box on the whitened residual; Fisher's g for a
-    line in its spectrum; and an F test on general features of the voltage and time. With `even` a
-    fourth one asks whether its size is the same everywhere: a sensor's noise is, what a colour may
-    have swallowed of a misfit is not. `excess` is the share of the residual's power above the noise
+    Four tests with Bonferroni's correction: are neighbours of the whitened residual correlated;
+    Fisher's g for a line in its spectrum; an F test on general features of the voltage and time;
+    and is its size the same everywhere? A sensor's noise is, what a colour may have swallowed of a
+    misfit is not. Where the colour is the residual's `own`, correlation and size are what it and
+    its jitter are for: the two others remain. `excess` is the share of the residual's power above the noise
     `floor` [m]; what is seen must be larger than what is `knowable` [m]; `lengths` are the records'
     numbers of samples.
     """
     white = colour.whiten(residual)
     tests: dict[Seen, tuple[float, float]] = {
-        "correlation": whiteness(white),
         "line": _fisher_line(white),
         "drive": _features(white, voltage, time, colour),
     }
-    if even:
-        tests["size"] = _sizes(white, voltage, time, lengths)
+    if not own:
+        tests |= {"correlation": whiteness(white), "size": _sizes(white, voltage, time, lengths)}
     seen, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))
     size = float(np.sqrt(share * power))

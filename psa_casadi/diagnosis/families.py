@@ -19,6 +19,8 @@ _DOES: dict[str, Kind] = {
     "modes": "resonance", "time": "time", "gain in time": "changing gain",
 }  # fmt: skip
 _PLACES = {"drive voltage": "drive", "force": "plant", "reading": "sensor"}
+#: The largest probability that is stated.
+SUREST = 0.99
 #: Families less probable than this are not told.
 _LEAST = 0.01
 
@@ -80,7 +82,7 @@ def families(
     rows = (
         Family(
             *family,
-            probability=sum(effects.values()) + others.get(family, 0.0) * listed,
+            probability=min(SUREST, sum(effects.values()) + others.get(family, 0.0) * listed),
             effects={n: p for n, p in effects.items() if p > _LEAST},
             not_listed=others.get(family, 0.0) * listed,
         )

@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
-from psa_casadi.diagnosis.families import Family, families, place_and_kind
+from psa_casadi.diagnosis.families import SUREST, Family, families, place_and_kind
 from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
@@ -283,7 +283,7 @@ class Judge:
     @property
     def families_left(self) -> tuple[Family, ...]:
         """The places and kinds that what has no name may be of, where something is left."""
-        if self.best_correction is None:
+        if self.best_correction is None or self.left(self.final).white:
             return ()
         most = self.best_correction.evidence
         return families({}, {}, most, self.beside_final, self.limits)
@@ -328,7 +328,7 @@ class Judge:
         return Cause(
             effect=name,
             belongs_to=step.cause.belongs_to,
-            confidence=float(min(0.99, sure)),
+            confidence=float(min(SUREST, sure)),
             parameters=estimates(step.cause, self.model),
             cannot_be_told_from=told_from(step, self.limits),
             explained_share=0.0 if own is None else own.shown[0],

@@ -50,14 +50,14 @@ class Pack:
 
     def tested(
         self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
-        colour: Colour, limits: Thresholds, *, even: bool,
+        colour: Colour, limits: Thresholds, *, own: bool,
     ) -> Omnibus:  # fmt: skip
         """Test the residual of every output along every input; the most telling one counts.
 
         With Bonferroni's correction for their number.
         """
         rows = []
-        for f, left, own in zip(fit.channels, residuals, colour.each, strict=True):
+        for f, left, noise in zip(fit.channels, residuals, colour.each, strict=True):
             time, inputs = [], []
             for k in f.records:
                 e, at = experiments[k], experiments[k].at(f.number)
@@ -66,8 +66,8 @@ class Pack:
             moving = [column for column in np.vstack(inputs).T if np.ptp(column) > 0]
             for along in moving or [np.zeros(len(left))]:
                 found = omnibus(
-                    left, along, np.concatenate(time), own, noise_rms(f.residuals, own),
-                    lengths=f.lengths, knowable=f.straight, even=even, alarms_below=limits.alarm,
+                    left, along, np.concatenate(time), noise, noise_rms(f.residuals, noise),
+                    lengths=f.lengths, knowable=f.straight, own=own, alarms_below=limits.alarm,
                 )  # fmt: skip
                 rows.append(replace(found, output=f.column if fit.further else ""))
         p = min(1.0, len(rows) * min(r.p_value for r in rows))
@@ -123,30 +123,30 @@ class StackPack(Pack):
 
     def tested(
         self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
-        colour: Colour, limits: Thresholds, *, even: bool,
+        colour: Colour, limits: Thresholds, *, own: bool,
     ) -> Omnibus:  # fmt: skip
         """Test the displacement's residual, or that of a column where only this one alarms."""
 
         def test_of(
-            residual: FloatArray, parts: Sequence[Experiment], own: Colour, least: float
+            residual: FloatArray, parts: Sequence[Experiment], of: Colour, least: float
         ) -> Omnibus:
             voltage, time = (
                 np.concatenate([getattr(e.record, name)[e.used] for e in parts])
                 for name in ("voltage", "time")
             )
-            noise = noise_rms(residual, own)
+            noise = noise_rms(residual, of)
             return omnibus(
-                residual, voltage, time, own, noise,
-                lengths=[int(e.used.sum()) for e in parts], knowable=least, even=even,
+                residual, voltage, time, of, noise,
+                lengths=[int(e.used.sum()) for e in parts], knowable=least, own=own,
                 alarms_below=limits.alarm,
             )  # fmt: skip
 
         first, *beside = residuals
         test = test_of(first, experiments, colour, knowable_of(fit, experiments, limits))
-        for f, left, own in zip(fit.further, beside, colour.further, strict=True):
+        for f, left, of in zip(fit.further, beside, colour.further, strict=True):
             if test.alarm:
                 break
-            found = test_of(left, [experiments[k] for k in f.records], own, f.straight)
+            found = test_of(left, [experiments[k] for k in f.records], of, f.straight)
             p = min(1.0, found.p_value * (1 + len(fit.further)))
             if found.alarm and p < limits.alarm:
                 size = max(test.size, 2.0 * test.knowable)

@@ -64,7 +64,7 @@ def test_the_power_of_noise_is_as_uncertain_as_draws_of_it_show(correlation: flo
 
 
 def _size_test(
-    residual: FloatArray, *, even: bool = True, lengths: tuple[int, ...] = (N,)
+    residual: FloatArray, *, own: bool = False, lengths: tuple[int, ...] = (N,)
 ) -> float:
     colour = Colour(tuple(np.zeros(0) for _ in lengths), 1.0, lengths)
     return omnibus(
@@ -75,7 +75,7 @@ def _size_test(
         1.0,
         lengths=lengths,
         knowable=0.0,
-        even=even,
+        own=own,
         alarms_below=1e-3,
     ).p_value
 
@@ -86,7 +86,7 @@ def test_noise_of_one_size_is_no_misfit_and_noise_after_reversals_only_is() -> N
     assert min(quiet) > 1e-3
     after = 1.0 + np.exp(-((TIME % 0.5) / 0.05))
     assert _size_test(after * noise(0.0)) < 1e-6
-    assert _size_test(after * noise(0.0), even=False) > 1e-3
+    assert _size_test(after * noise(0.0), own=True) > 1e-3
 
 
 def _own(error: FloatArray, columns: FloatArray, rate: FloatArray) -> OwnColour:

@@ -325,11 +325,10 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     finite = "finite steps" not in task.method.without
     kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
-    residuals, colour = [f.residuals for f in fit.channels], screening.colour
+    residuals, colour, own = [f.residuals for f in fit.channels], screening.colour, False
     if not of.causes:  # is there anything but noise of some colour?
-        residuals, colour = [own.residuals for own in of.own], of.colour
-    even = bool(of.causes)
-    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, even=even)
+        residuals, colour, own = [c.residuals for c in of.own], of.colour, True
+    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=own)
     return View(of, tuple(kept), screening, test, task.pack)
 
 
