@@ -26,7 +26,7 @@ def test_the_records_are_told_apart_and_hide_what_exists() -> None:
         assert set(record.hidden) <= set(CAUSES)
         assert record.test.voltage in VOLTAGES
         of_group = {"clean": 0, "one": 1, "two": 2, "foreign": len(record.accepted)}
-        assert len(record.accepted) == of_group[record.group]
+        assert len(record.accepted) == of_group[record.question.group]
     assert {c for r in RECORDS for c in r.hidden} == set(CAUSES)
     assert {r.test.voltage for r in RECORDS} == set(VOLTAGES)
 
@@ -69,4 +69,4 @@ CREEP, HUM, PLAY = ("slow_creep", 0.99, ()), ("mains_hum", 0.6, ()), ("backlash"
     ],
 )
 def test_marks_of_answers_made_by_hand(name: str, answer: m.Answer, mark: str) -> None:
-    assert m.mark(BY_NAME[name], answer) == mark
+    assert m.mark(BY_NAME[name].question, answer) == mark
