@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 
@@ -26,6 +26,11 @@ _TABLES = (
     ("psa_casadi.effects.mechanics", "MODAL_SERIES"),
     ("psa_casadi.effects.patches", "PATCHES"),
 )
+
+#: What effects do, whatever their place.
+Kind = Literal[
+    "", "curve", "hysteresis", "relaxation", "resonance", "lag", "damping", "time", "changing gain"
+]
 
 #: Probe value that stands for "the frequencies where the residual's spectrum peaks", in Hz.
 SPECTRAL_PEAKS = "spectral_peaks"
@@ -170,7 +175,8 @@ class Component:
     `probe` holds trial values of parameters that have no influence while the gain is 0;
     `finite_step` is the size of the gain, as a share of its scale, at which the effect is looked
     for when its derivative vanishes at 0. `looks_like` is the signature an engineer sees.
-    `tone` names a parameter that is the frequency of a tone: among the harmonics of a periodic
+    `kind` says what an effect does, whatever its place: the effects of one kind and place are a
+    family. `tone` names a parameter that is the frequency of a tone: among harmonics of a periodic
     drive it cannot be told from distortion. `belongs_to` is plant, drive, sensor or environment;
     the last two stay out of exported plants. `needs` names components without which this one
     means nothing. `remedy` is what can be done about it, where that is more than its place says.
@@ -207,6 +213,7 @@ class Component:
     tone: str | None = None
     looks_like: str = ""
     equation_text: str = ""
+    kind: Kind = ""
     belongs_to: str = "plant"
     remedy: Remedy | None = None
     needs: tuple[str, ...] = ()

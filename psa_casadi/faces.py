@@ -73,6 +73,7 @@ def diagnose(
     records: Records,
     *,
     holdout: Records = (),
+    reference: Records = (),
     model: Model | None = None,
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,

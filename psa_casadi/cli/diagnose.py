@@ -22,6 +22,7 @@ def diagnose(
     records: list[Path],
     *,
     holdout: list[Path] | None = None,
+    reference: list[Path] | None = None,
     model: Path | None = None,
     stack: StackName = None,
     stiffness: float | None = None,
@@ -54,6 +55,8 @@ def diagnose(
         model: MODEL.json whose values the fits start from, or a model of your own.
         holdout: Record kept for judging only (repeat the option for several); without it, a quarter
             of every record, in blocks.
+        reference: Record of the same device when it was healthy (repeat the option for several):
+            what has changed since is named.
         output: MODEL.json of the extended model.
         patch: MODEL.json of the extended model with the unnamed correction, where one helps.
         json: DIAGNOSIS.json to write.
@@ -81,6 +84,7 @@ def diagnose(
         "--figure": figure,
     }  # fmt: skip
     began, left_out, held = clock.perf_counter(), leave_out or [], holdout or []
+    healthy = reference or []
     own = own_model(given, model, fitting)
     with timed() as spent:
         with stage("loading"):
@@ -89,18 +93,23 @@ def diagnose(
             from psa_casadi.report.words.tables import timings_table
         with stage("reading"):
             beside = {"--next": next_, "--events": events, "--junit": junit}
-            given.outputs({**outputs, **beside}, [*records, *held, model])
+            given.outputs({**outputs, **beside}, [*records, *held, *healthy, model])
             if own is None:
                 run = _of_stack(
-                    records, held, model, (stack, stiffness, hysteresis), reading, given, left_out
+                    (records, held, healthy),
+                    model,
+                    (stack, stiffness, hysteresis),
+                    reading,
+                    given,
+                    left_out,
                 )
                 _keep_apart(given, output, model)
             else:
                 run = own_diagnosis(
                     own, records, held, fitting, reading, given, leave_out=left_out,
                     others={
-                        "--next": next_, "--stack": stack, "--stiffness": stiffness,
-                        "--hysteresis": hysteresis,
+                        "--reference": healthy, "--next": next_, "--stack": stack,
+                        "--stiffness": stiffness, "--hysteresis": hysteresis,
                     },
                 )  # fmt: skip
             wanted = files.expected(given, expect, max_error)
@@ -128,8 +137,7 @@ def diagnose(
 
 
 def _of_stack(
-    records: Sequence[Path],
-    held: Sequence[Path],
+    paths: tuple[Sequence[Path], Sequence[Path], Sequence[Path]],
     model: Path | None,
     device: tuple[StackName, float | None, Hysteresis],
     reading: Reading,
@@ -138,17 +146,20 @@ def _of_stack(
 ) -> Callable[..., psa.Diagnosis]:
     """Read the records of a stack; return what diagnoses them, given `progress` and `watch`.
 
-    `device` are --stack, --stiffness and --hysteresis.
+    `paths` are those to diagnose, to hold out and of the healthy device; `device` are --stack,
+    --stiffness and --hysteresis.
     """
     from psa_casadi.diagnosis.diagnose import diagnose as run
 
     stack, stiffness, hysteresis = device
     table = _searched(given, left_out)
     given.stiffness(stiffness)
-    found = given.records(records, reading, held)
+    new, held, healthy = paths
+    found = given.records([*new, *healthy], reading, held)
+    first, last = len(new), given.fitted
     start = given.model_or_stack(model, stack, needed=False)
     return partial(
-        run, found[: given.fitted], holdout=found[given.fitted :], model=start,
+        run, found[:first], reference=found[first:last], holdout=found[last:], model=start,
         stiffness=stiffness, hysteresis=hysteresis, effects=table,
     )  # fmt: skip
 

@@ -35,7 +35,7 @@ class Course:
         return 0
 
 
-_BASE = ("starting values", ("starting values",))
+_BASE = ("starting values", ("starting values", "what the reference"))
 _FIT = (
     "the base model",
     (

@@ -1,6 +1,6 @@
 """The colour of the noise as an autoregression for each record, and tests for what it is not."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -17,6 +17,8 @@ from psa_casadi.records.repeats import autoregression_of
 from psa_casadi.records.split import Experiment, noise_share
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IndexArray = npt.NDArray[np.int64]
 
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
 _WHITE = 0.05
@@ -32,13 +34,17 @@ class Colour:
 
     `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
     records' numbers of samples. `further` are the colours of the columns beside the displacement,
-    each with a level in its own unit.
+    each with a level in its own unit. The first samples of a record count over the noise's rms, or
+    with 0 where a record does not say how it `begins`; every sample over its `spread` (samples,),
+    where the noise is not as large everywhere.
     """
 
     autoregression: tuple[FloatArray, ...]
     level: float
     lengths: tuple[int, ...]
     further: tuple["Colour", ...] = ()
+    begins: bool = True
+    spread: FloatArray | None = None
 
     @property
     def each(self) -> tuple["Colour", ...]:
@@ -70,7 +76,7 @@ class Colour:
 
     def whiten(self, signal: FloatArray) -> FloatArray:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
-        if not signal.size or not any(a.size for a in self.autoregression):
+        if not signal.size or (self.spread is None and not any(map(len, self.autoregression))):
             return signal
         white = signal.copy()
         first = 0
@@ -80,8 +86,10 @@ class Colour:
             if a.size and length > a.size:
                 own = white[first : first + length]
                 own[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
-                own[: a.size] = part[: a.size] / np.sqrt(power)
+                own[: a.size] = self.begins * part[: a.size] / np.sqrt(power)
             first += length
+        if self.spread is not None:
+            white /= self.spread.reshape(-1, *(1,) * (signal.ndim - 1))
         return white
 
     def whiten_all(self, signal: FloatArray, further: Sequence[FloatArray]) -> FloatArray:
@@ -245,6 +253,192 @@ def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
     return _with_level(tuple(each), residual, lengths)
 
 
+#: Orders of an autoregression that a residual may have, and samples that each of its terms needs.
+_ORDERS, _EACH = (0, 1, 2, 4, 8, 16), 20
+#: Colour and parameters follow each other so often.
+_TURNS = 4
+#: Poles beyond this radius whose damping ratio is below this ring.
+_SHARP, _DAMPED = 0.95, 0.1
+#: Powers of jitter over that of the other noise that are tried, and nats that they must gain.
+_JITTERS, _UNEVEN = tuple(np.geomspace(0.1, 1000.0, 13).tolist()), 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class OwnColour:
+    """The noise that a residual would be if it were nothing else: an autoregression of order p.
+
+    Its `level` is the rms of the n innovations at the ends of all windows without gaps that are
+    longer than the highest order, so that n is the same for every model of the same samples.
+    Where the reading's clock jitters, the innovations have a `spread` (samples,), which costs the
+    likelihood `lost` nats. `residuals` are those of all fitted samples, where the parameters have
+    followed the colour; `runs` are the numbers of these between gaps. Where the parameters stay as
+    they were fitted, `learnt` (n,) and `ahead` (m,) are the innovations in fitted and in held-out
+    samples.
+    """
+
+    autoregression: FloatArray
+    level: float
+    samples: int
+    residuals: FloatArray
+    runs: tuple[int, ...]
+    learnt: FloatArray
+    ahead: FloatArray
+    spread: FloatArray | None
+    lost: float
+
+    def nats(self, straight: float = 0.0) -> float:
+        """Ln of the likelihood, up to a constant, less p/2 ln n for p coefficients.
+
+        What is `straight` is not told of an output and adds to the level.
+        """
+        level = float(np.hypot(self.level, straight))
+        return _nats(self.samples, level, self.autoregression.size) - self.lost
+
+    @property
+    def colour(self) -> Colour:
+        """It as the colour of the fitted samples, which begins anew after every gap."""
+        each = (self.autoregression,) * len(self.runs)
+        level = max(self.level, 1e-15)
+        return Colour(each, level, self.runs, begins=False, spread=self.spread)
+
+
+def own_colour(
+    errors: Sequence[FloatArray],
+    fitted: Sequence[BoolArray],
+    judged: Sequence[BoolArray],
+    jacobian: FloatArray,
+    prior: FloatArray,
+    rates: Sequence[FloatArray],
+) -> OwnColour:
+    """Return the colour that the errors (n,) of all records have by themselves.
+
+    `fitted` and `judged` (n,) say which samples count, `rates` (n,) how fast the prediction changes
+    from sample to sample: a clock that jitters makes an error in proportion to it. `jacobian`
+    (fitted samples, k) is that of the prediction, `prior` (k,) the parameters' standard deviations.
+    A fit by least squares is not the likeliest one under a colour: linearly, colour and parameters
+    follow each other. All orders on the same windows, the order by Schwarz's criterion (Ljung,
+    System Identification, 2nd ed. 1999, sections 3.2 and 16.4).
+    """
+    error = np.concatenate(errors)
+    used, held = (np.concatenate(rows).astype(np.bool_) for rows in (fitted, judged))
+    begins = np.cumsum([0, *(len(e) for e in errors[:-1])])
+    runs = _runs(used, begins)
+    for most in _ORDERS[::-1]:
+        at = _ends(used, begins, most)
+        if len(at) >= _EACH * most:
+            break
+    columns = np.zeros((len(error), jacobian.shape[1]))
+    columns[used] = jacobian
+    rate, first = np.concatenate(rates), used.copy()
+    first[at] = False  # no innovation is known of these: they count over the noise's rms
+    begun = columns[first]
+    fixed = np.where(used | held, error, 0.0)
+    known = np.isfinite(prior)
+    weight = np.where(known, 1.0 / np.where(known, prior, 1.0) ** 2, 0.0)
+
+    def follow(start: FloatArray, uneven: bool) -> Iterator[tuple[OwnColour, FloatArray]]:
+        """Yield colours and the errors that they are of, each likelier than the one before."""
+        left, reached = start, -np.inf
+        for _ in range(_TURNS):
+            a = _autoregression(left, at, most)
+            new = _innovations(left, at, a)
+            spread, lost = _jitter(new, rate, at) if uneven else (np.ones_like(rate), 0.0)
+            new = new / spread[at]
+            learnt, ahead = (
+                _innovations(fixed, k, a) / spread[k]
+                for k in (at, _ends(used | held, begins, a.size, held))
+            )
+            found = OwnColour(
+                a, rms(new), len(at), left[used], runs, learnt, ahead,
+                spread[used] if lost else None, lost,
+            )  # fmt: skip
+            if found.nats() <= reached:
+                return
+            reached = found.nats()
+            yield found, left
+            if not a.size and not lost:
+                return  # the fit is the likeliest one already
+            white = _innovations(columns, at, a) / spread[at, None]
+            share = (found.level / max(rms(left[used]), 1e-300)) ** 2
+            normal = white.T @ white + share * begun.T @ begun + np.diag(found.level**2 * weight)
+            along = white.T @ new + share * begun.T @ left[first]
+            left = left - columns @ np.linalg.lstsq(normal, along, rcond=1e-12)[0]
+
+    *_, even = follow(fixed, uneven=False)
+    *_, jittering = follow(even[1], uneven=True)
+    return max(even, jittering, key=lambda found: found[0].nats())[0]
+
+
+def _jitter(new: FloatArray, rates: FloatArray, at: IndexArray) -> tuple[FloatArray, float]:
+    """Return the spread sqrt(1 + c r^2) of noise at the rate r (n,), and what it costs [nats].
+
+    The likeliest c for innovations `new` (n,) at some samples, 0 unless they ask for it.
+    """
+    n, power = len(new), float(np.mean(rates[at] ** 2)) if len(at) else 0.0
+    squares = rates**2 / max(power, 1e-300)
+    best, found = -n * float(np.log(max(rms(new), 1e-300))) + _UNEVEN, (np.ones_like(rates), 0.0)
+    for c in _JITTERS if n and power > 0 else ():
+        spread = np.sqrt(1.0 + c * squares)
+        lost = float(np.sum(np.log(spread[at]))) + 0.5 * float(np.log(n + 2.0))
+        nats = -n * float(np.log(max(rms(new / spread[at]), 1e-300))) - lost
+        if nats > best:
+            best, found = nats, (spread, lost)
+    return found
+
+
+def _nats(samples: int, level: float, order: int) -> float:
+    return -samples * float(np.log(max(level, 1e-300))) - 0.5 * order * float(np.log(samples + 2.0))
+
+
+def _autoregression(left: FloatArray, at: IndexArray, most: int) -> FloatArray:
+    """Return the best autoregression of windows that end at some samples."""
+    rows = left[at[:, None] - np.arange(most + 1)]
+    n, products = len(rows), rows.T @ rows
+    found: list[tuple[float, FloatArray]] = [(-np.inf, np.zeros(0))]
+    for p in (p for p in _ORDERS if p <= most and n and products[0, 0] > 0):
+        past, along = products[1 : p + 1, 1 : p + 1], products[1 : p + 1, 0]
+        a = np.linalg.lstsq(past, along, rcond=1e-12)[0]
+        level = float(np.sqrt(max(float(products[0, 0] - along @ a), 0.0) / n))
+        if not _rings(a):
+            found.append((_nats(n, level, p), a))
+    return max(found, key=lambda row: row[0])[1]
+
+
+def _rings(a: FloatArray) -> bool:
+    """Whether an autoregression rings: that is a vibration or a hum, and no noise of a sensor."""
+    poles = np.roots(np.concatenate([[1.0], -a])) if a.size else np.zeros(0)
+    poles = poles[(np.imag(poles) > 0.0) & (np.abs(poles) > _SHARP)]
+    rates = np.log(poles)
+    return bool(np.any(-np.real(rates) < _DAMPED * np.abs(rates)))
+
+
+def _innovations(signal: FloatArray, at: IndexArray, a: FloatArray) -> FloatArray:
+    """Return what an autoregression leaves of a signal (samples,) or columns at some samples."""
+    found: FloatArray = signal[at].copy()
+    for k, share in enumerate(a, 1):
+        found -= share * signal[at - k]
+    return found
+
+
+def _ends(
+    there: BoolArray, begins: IndexArray, most: int, ends: BoolArray | None = None
+) -> IndexArray:
+    """Return the samples, of some `ends`, with so many before them without a gap in one record."""
+    index = np.arange(len(there))
+    first = there & ~np.concatenate([[False], there[:-1]])
+    first[begins[begins < len(there)]] = True
+    since = index - np.maximum.accumulate(np.where(first, index, 0))
+    return np.flatnonzero((there if ends is None else ends) & (since >= most))
+
+
+def _runs(there: BoolArray, begins: IndexArray) -> tuple[int, ...]:
+    """Return the numbers of samples between gaps and ends of records."""
+    at = np.flatnonzero(there)
+    record = np.searchsorted(begins, at, side="right")
+    new = np.flatnonzero((np.diff(at) > 1) | (np.diff(record) > 0)) + 1
+    return tuple(np.diff([0, *new, len(at)]).tolist()) if len(at) else ()
+
+
 def _with_level(
     autoregression: tuple[FloatArray, ...], signal: FloatArray, lengths: Sequence[int]
 ) -> Colour:
@@ -298,6 +492,7 @@ def omnibus(
     colour: Colour,
     floor: float,
     *,
+    lengths: Sequence[int],
     knowable: float,
     even: bool,
     alarms_below: float,
@@ -308,7 +503,8 @@ def omnibus(
     line in its spectrum; and an F test on general features of the voltage and time. With `even` a
     fourth one asks whether its size is the same everywhere: a sensor's noise is, what a colour may
     have swallowed of a misfit is not. `excess` is the share of the residual's power above the noise
-    `floor` [m]; what is seen must be larger than what is `knowable` [m].
+    `floor` [m]; what is seen must be larger than what is `knowable` [m]; `lengths` are the records'
+    numbers of samples.
     """
     white = colour.whiten(residual)
     tests: dict[Seen, tuple[float, float]] = {
@@ -317,7 +513,7 @@ def omnibus(
         "drive": _features(white, voltage, time, colour),
     }
     if even:
-        tests["size"] = _sizes(white, voltage, time, colour)
+        tests["size"] = _sizes(white, voltage, time, lengths)
     seen, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))
     size = float(np.sqrt(share * power))
@@ -327,18 +523,23 @@ def omnibus(
 
 
 def whiteness(white: FloatArray) -> tuple[float, float]:
-    """Return the p-value of Ljung and Box's test (1978) that neighbours are not correlated.
+    """Return the p-value that neighbours are not correlated, and the largest correlation.
 
-    And the largest correlation: what is correlated has that share.
+    What is correlated has that share. Box and Pierce's test with the variance that each product
+    has by itself: noise whose size changes is not correlated (Lobato, Nankervis and Savin,
+    International Economic Review 42 (2001) 187).
     """
     n = len(white)
     centred = white - np.mean(white)
     power = float(centred @ centred)
     if power <= 0 or n <= 2 * _LAGS:
         return 1.0, 0.0
-    r = np.array([centred[k:] @ centred[:-k] / power for k in range(1, _LAGS + 1)])
-    statistic = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, _LAGS + 1)))
-    return float(scipy.special.chdtrc(_LAGS, statistic)), float(np.max(np.abs(r)))
+    pairs = [(centred[k:], centred[:-k]) for k in range(1, _LAGS + 1)]
+    sums = np.array([a @ b for a, b in pairs])
+    spread = np.array([a**2 @ b**2 for a, b in pairs])
+    statistic = float(np.sum(sums**2 / np.maximum(spread, 1e-300)))
+    share = float(np.max(np.abs(sums))) / power
+    return float(scipy.special.chdtrc(_LAGS, statistic)), share
 
 
 def _fisher_line(white: FloatArray) -> tuple[float, float]:
@@ -363,14 +564,14 @@ def _features(
 
 
 def _sizes(
-    white: FloatArray, voltage: FloatArray, time: FloatArray, colour: Colour
+    white: FloatArray, voltage: FloatArray, time: FloatArray, records: Sequence[int]
 ) -> tuple[float, float]:
     """F test of the squares on voltage, rate, time and way since the last reversal.
 
     Breusch and Pagan, Econometrica 47 (1979) 1287, with Koenker's correction; squares are over
     their mean in each record, and those above `_MOST` count as that.
     """
-    lengths = [n for n in colour.lengths if n]
+    lengths = [n for n in records if n]
     parts = np.split(white, np.cumsum(lengths)[:-1])
     powers = np.array([np.mean(part**2) for part in parts])
     if not np.all(powers > 0):

@@ -1,13 +1,13 @@
 """Whether held-out samples confirm a cause, what they cover, and whether a model holds there."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.diagnosis.colour import Colour, rms
+from psa_casadi.diagnosis.colour import OwnColour, rms
 from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
 from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
 from psa_casadi.diagnosis.task import Thresholds
@@ -88,14 +88,14 @@ def held_out_excess(
     fit: Fit,
     experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
-    colour: Colour,
+    colour: OwnColour,
     noise: Sequence[NoiseFloor],
     limits: Thresholds,
 ) -> Excess:
     """Return by which factor held-out errors exceed those of the fit; 1 where noise would do so.
 
-    Samples of records that are fitted for the most part are compared with the fitted ones, both
-    whitened by `colour` and scaled by the records' noise. The ratio F of their mean squares is
+    Samples of records that are fitted for the most part are compared with the fitted ones: the
+    innovations of the residual's own `colour`. The ratio F of their mean squares is
     about normal under noise of kurtosis K, with mean (n + k)/(n - k) for k fitted parameters and n
     samples of the fit, and variance (K - 1)(1/m + 1/n) for m held-out samples. Whole records that
     are held out are compared with their own `noise`: parameters that the fitted ones leave open
@@ -109,7 +109,7 @@ def held_out_excess(
         for part, floor, mine in zip(parts, noise, own, strict=True)
         if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
     ]
-    found = _within(fit, experiments, parts, colour, own, limits)
+    found = _within(colour, len(fit.theta), limits) if all(own) else Excess()
     worst = max(beyond, default=0.0)
     if worst > max(limits.unseen_ratio_of_records, found.factor):
         found = Excess(worst, limits.unseen_alarm)
@@ -117,26 +117,10 @@ def held_out_excess(
     return found if size > knowable_of(fit, experiments, limits) else Excess()
 
 
-def _within(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    parts: Sequence[FloatArray],
-    colour: Colour,
-    own: Sequence[bool],
-    limits: Thresholds,
-) -> Excess:
-    scales = [1.0 / s if mine else 0.0 for s, mine in zip(fit.sigma, own, strict=True)]
-    held = np.concatenate([p * s for p, s in zip(parts, scales, strict=True)])
-    used = np.concatenate(
-        [r * s for r, s in zip(fit.residuals_of(experiments), scales, strict=True)]
-    )
-    counts = np.repeat(own, [len(p) for p in parts])
-    fitted = np.repeat(own, [int(e.used.sum()) for e in experiments])
-    lengths = tuple(len(p) for p in parts)
-    squares = np.sort(replace(colour, lengths=lengths).whiten(held)[counts] ** 2)[:-_STRAY]
-    learnt = colour.whiten(used)[fitted] ** 2
-    n, m, k = len(learnt), len(squares), len(fit.theta)
-    power = float(np.mean(learnt)) if n else 0.0
+def _within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:
+    squares = np.sort(colour.ahead**2)[:-_STRAY]
+    learnt = colour.learnt**2
+    n, m, power = len(learnt), len(squares), rms(colour.learnt) ** 2
     if m < _FEWEST or n <= 2 * k or power <= 0:
         return Excess()
     ratio = float(np.mean(squares)) / power

@@ -322,7 +322,7 @@ def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> 
     """Return all corrections beside a fit, the one of the highest evidence first."""
     try:
         full = fit.predictions(experiments)
-        signals = Signals(experiments, [p.displacement for p in full], _responses(fit, experiments))
+        signals = Signals(experiments, [p.displacement for p in full], responses(fit, experiments))
     except PsaError:
         return ()
     follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
@@ -419,7 +419,7 @@ def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float
     return best[1], max(best[0] - float(np.log(len(_SIZES))), 0.0) if best[0] > 0 else best[0]
 
 
-def _responses(
+def responses(
     fit: Fit, experiments: Sequence[Experiment]
 ) -> Callable[[int, FloatArray], FloatArray]:
     """Return the filter of the plant from force to displacement, for records that show it.

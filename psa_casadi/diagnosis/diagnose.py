@@ -13,6 +13,7 @@ from psa_casadi.diagnosis.judgement import NAMING, told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.probes import laws_of, screened_with
+from psa_casadi.diagnosis.reference import Healthy, Since
 from psa_casadi.diagnosis.result import Decision, DiagnosisInterrupted, StackDiagnosis, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
@@ -20,11 +21,12 @@ from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.errors import PsaError
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.identify import unfinished
+from psa_casadi.identification.identify import identify, unfinished
+from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
-from psa_casadi.identification.refitting import relevelled
+from psa_casadi.identification.refitting import noise_levels, relevelled
 from psa_casadi.identification.search import (
     LOAD,
     fit_base,
@@ -52,6 +54,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.progress import Progress, silent
+from psa_casadi.records.noise_kinds import notes_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
@@ -263,8 +266,6 @@ def decided(
 
 #: So many further stuck readings are worth a second search.
 MORE = 3
-#: Steps of a sensor over a record's range below which it is coarse.
-COARSE = 32
 
 
 @interruptible_work()
@@ -273,6 +274,7 @@ def diagnose(
     records: Records,
     *,
     holdout: Records = (),
+    reference: Records = (),
     model: Model | None = None,
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
@@ -288,14 +290,43 @@ def diagnose(
     quarter of every record in blocks (see `divided`). No fit uses them; they may reject an
     extension, and blocks help to choose between fitted models.
 
+    Records of the same device when it was healthy are its `reference`: what the base model leaves
+    there is learnt and taken off, so that causes are named of what has changed since (see
+    `reference.Healthy`).
+
     `model` is where the base fit starts; `stiffness` [N/m] fixes the force scale; `hysteresis` is
     the form of the base's (see `identify`); `effects` is the table to search; `method` can leave
     parts of the method out (for its ablation). `progress` gets what is done in words, `watch` every
     hypothesis of the search (`Tried`). Raises InputError, and DiagnosisInterrupted with the best
     model so far at a keyboard interrupt once there is one.
     """
-    method = method or Method()
+    method, device = method or Method(), (model, stiffness, hysteresis)
     given, kept = records_given(records), records_given(holdout)
+    sound, since = records_given(reference), None
+    if sound:
+        known = identify(
+            sound, model=model, stiffness=stiffness, hysteresis=hysteresis, progress=progress
+        )
+        progress("what the reference leaves open")
+        since = Healthy(known.fit, known.experiments).since([*given, *kept])
+        given, kept = since.taken_off(len(given))
+        method, device = since.method(method), (known.model, stiffness, hysteresis)
+    return _diagnosed((given, kept), device, effects, (method, progress, watch), since)
+
+
+def _diagnosed(
+    records: tuple[Sequence[Record], Sequence[Record]],
+    device: tuple[Model | None, float | None, Hysteresis | None],
+    effects: Sequence[Component] | None,
+    work: tuple[Method, Progress, Callable[[Tried], None]],
+    since: Since | None,
+) -> StackDiagnosis:
+    """Diagnose records and held-out ones of a device, by a method.
+
+    `device` are model, stiffness and hysteresis as `diagnose` takes them, `work` are method,
+    progress and watch; `since` is what is known of healthy records.
+    """
+    (given, kept), (model, stiffness, hysteresis), (method, progress, watch) = records, device, work
     with stage("preparing"):
         table = list(effects if effects is not None else known_effects().values())
         (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
@@ -325,22 +356,40 @@ def diagnose(
         said += [*columns.left_out, *([why] if why else [])]
     so_far: list[Fit] = []
     task = Task(
-        experiments, tuple(table), STACK, method, progress, so_far.append, watch, hidden=hidden
+        experiments,
+        tuple(table),
+        STACK,
+        method,
+        progress,
+        so_far.append,
+        watch,
+        hidden=hidden,
+        free=() if since else None,
     )
     try:
         laws = laws_of(start, [e.record for e in experiments if e.stop], table)
         # from the end: the screening begins at the front
         with compiled_ahead(reversed(screened_with(start, table, laws))):
-            found = _diagnose(start, task, scale_given)
-        return replace(found, remarks=(*found.remarks, *said))
+            found = _against(since, start, task, scale_given)
+        return _with_noise(found, said, (*whole, *held))
     except KeyboardInterrupt:
         if not so_far:
             raise
         raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
+def _with_noise(
+    found: StackDiagnosis, said: Sequence[Note | str], given: Sequence[Record]
+) -> StackDiagnosis:
+    """Return a diagnosis with what else is `said`, and the noise that its extended model leaves."""
+    driven = found.verdict != "not_driven"
+    noise = noise_found(found.extended_fit, found.experiments, given) if driven else ()
+    remarks = *found.remarks, *said, *notes_of(noise)
+    return replace(found, remarks=remarks, noise_kinds=noise)
+
+
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
-    """Return the records without suspect samples, and where a sensor was saturated or coarse.
+    """Return the records without suspect samples, and where a sensor was saturated.
 
     And the share of the readings that a saturated sensor has made.
 
@@ -351,13 +400,11 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
     refuse_other_time(records)
     found = [suspects(r) for r in records]
     clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
-    both = list(zip(records, found, strict=True))
-    saturation = tuple(s for r, own in both for s in own.saturation(r.name))
+    saturation = tuple(
+        s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)
+    )
     refuse_few(records, clean, texts(saturation))
     said: list[Note | str] = [*saturation]
-    for r, own in both:
-        if own.quantum is not None and r.range_m < COARSE * own.quantum:
-            said.append(note("coarse", record=r.name, steps=r.range_m / own.quantum))
     saturated = sum(own.counts["saturated"] for own in found)
     return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 
@@ -367,6 +414,16 @@ def _on_one_clock(records: Sequence[Record], said: list[Note | str]) -> list[Rec
     done = [on_one_clock(r) for r in records]
     said += [s for _, own in done for s in own]
     return [r for r, _ in done]
+
+
+def _against(since: Since | None, start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
+    """Diagnose what is left of healthy records, where there are any."""
+    if since is None:
+        return _diagnose(start, task, scale_given)
+    return since.concluded(
+        task.method,
+        lambda method, free: _diagnose(start, replace(task, method=method, free=free), scale_given),
+    )
 
 
 def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
@@ -422,7 +479,10 @@ def _base(start: Model, task: Task) -> tuple[Fit, Task]:
 
     Raises KeyboardInterrupt after a fit that was interrupted.
     """
-    base = fit_base(start, task.experiments, progress=task.progress)
+    if task.free is None:
+        base = fit_base(start, task.experiments, progress=task.progress)
+    else:
+        base = fit(start, task.experiments, task.free, sigma=noise_levels(task.experiments))
     base, experiments = relevelled(base, task.experiments)
     task.keep(base)
     if base.interrupted:

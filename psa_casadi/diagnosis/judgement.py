@@ -11,6 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
+from psa_casadi.diagnosis.families import Family, families
 from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
@@ -135,6 +136,10 @@ class Judge:
         """Return a cause with where it sits and what it changes, beside what all causes have."""
         raise NotImplementedError
 
+    def family(self, effect: Component) -> tuple[str, str]:
+        """Return the place and the kind of an effect."""
+        return effect.belongs_to, effect.kind
+
     # What is said of any
 
     def left(self, step: Step) -> Remaining:
@@ -193,18 +198,20 @@ class Judge:
         return self.weighed.beaten_by() is None and self.doubt is None
 
     @cached_property
-    def vague(self) -> dict[str, Correction]:
-        """Those of several causes that an unnamed correction describes better, by name.
-
-        Each is weighed beside the model without it, all others kept.
-        """
+    def each(self) -> dict[str, Weighed]:
+        """Every cause by itself, against corrections of the model without it, all others kept."""
         last, found = self.last.view.of, {}
-        for s in self.steps if self.stands and len(self.steps) > 2 else ():
+        for s in self.steps if self.stands else ():
             if s.chosen is not None and s.without is not None:
-                better = self.weigh(s.without, last).beaten_by()
-                if better is not None:
-                    found[s.cause.name] = better[0]
+                alone = s.without.fit is self.first.fit
+                found[s.cause.name] = self.weighed if alone else self.weigh(s.without, last)
         return found
+
+    @cached_property
+    def vague(self) -> dict[str, Correction]:
+        """Those of several causes that an unnamed correction describes better, by name."""
+        better = {n: w.beaten_by() for n, w in self.each.items() if len(self.steps) > 2}
+        return {n: by[0] for n, by in better.items() if by is not None}
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -236,11 +243,23 @@ class Judge:
         return self.last if self.kept else self.first
 
     @cached_property
+    def beside_final(self) -> Sequence[Correction]:
+        """The unnamed corrections beside the extended model."""
+        return self.corrections(self.final.view.of) if self.kept else self.weighed.corrections
+
+    @cached_property
     def best_correction(self) -> Correction | None:
         """The unnamed correction that would remove most of what the extended model leaves."""
         of, colour = self.final.view.of, self.last.screening.colour
-        found = self.corrections(of) if self.kept else self.weighed.corrections
-        return best_of(found, self.experiments, of.errors, colour, self.limits)
+        return best_of(self.beside_final, self.experiments, of.errors, colour, self.limits)
+
+    @property
+    def families_left(self) -> tuple[Family, ...]:
+        """The places and kinds that what has no name may be of, where something is left."""
+        if self.best_correction is None:
+            return ()
+        most = self.best_correction.evidence
+        return families({}, {}, most, self.beside_final, self.limits)
 
     @cached_property
     def budget(self) -> Budget:
@@ -276,12 +295,17 @@ class Judge:
 
     def cause(self, step: Step, sizes: Sequence[Size], port: str = "") -> Cause:
         """Return a cause: its probability, the share of the error that it removes."""
-        shares = {c.what: c for c in self.budget.causes}
-        own = shares.get(step.cause.name)
+        name, shares = step.cause.name, {c.what: c for c in self.budget.causes}
+        own, weighed = shares.get(name), self.each.get(name)
+        places = {e.name: self.family(e) for e in (*self.task.table, step.cause)}
+        of = () if weighed is None else families(
+            step.probability, places, weighed.evidence, weighed.corrections, self.limits
+        )  # fmt: skip
+        sure = step.probability[name] * (1.0 - sum(f.not_listed for f in of))
         return Cause(
-            effect=step.cause.name,
+            effect=name,
             belongs_to=step.cause.belongs_to,
-            confidence=float(min(0.99, step.probability[step.cause.name])),
+            confidence=float(min(0.99, sure)),
             parameters=estimates(step.cause, self.model),
             cannot_be_told_from=told_from(step, self.limits),
             explained_share=0.0 if own is None else own.shown[0],
@@ -289,6 +313,7 @@ class Judge:
             sizes=tuple(sizes),
             port=port,
             description=step.cause.description,
+            families=of,
         )
 
     def withdrawn(self) -> tuple[Note, ...]:
@@ -371,6 +396,7 @@ class Judge:
             "base_fit": self.first.fit,
             "extended_fit": self.final.fit,
             "model": self.model,
+            "families": self.families_left,
             "doubted": self.doubt if self.verdict in ("adequate", "unexplained") else None,
             "budget": self.budget,
             "patch": None if best is None else replace(best, share=share),
@@ -432,6 +458,10 @@ class ModelJudge(Judge):
 
     def _changes(self, effects: Sequence[Component]) -> tuple[Size, ...]:
         return changes(effects, self.final.fit, self.experiments, self.extended)
+
+    def family(self, effect: Component) -> tuple[str, str]:
+        """Return the port and the kind of an effect."""
+        return self.table[effect.name].port.words, effect.kind
 
     def named(self, step: Step) -> Cause:
         """Return a cause with its port, and what it changes of every output."""

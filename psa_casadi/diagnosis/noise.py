@@ -23,8 +23,6 @@ Source = Literal["repeats", "holds", "fast part"]
 
 #: Fewer samples than this give no level to a few per cent.
 ENOUGH = 200
-#: Noise is called white where no autocorrelation exceeds this.
-VISIBLE = 0.1
 #: Samples from which the colour of the noise is known without a model.
 _COLOUR = 500
 #: Lags of the autocovariance that a first-order autoregression is given with.
@@ -140,11 +138,10 @@ def _floor(record: Record, valid: FloatArray) -> NoiseFloor:
     if level < rounding:
         covariance[0] += rounding**2 - level**2
         level = rounding
-    coloured = bool(np.any(np.abs(covariance[1:]) > VISIBLE * covariance[0]))
     unit = record.displacement_unit
     finding = note(
         "noise", record=record.name, level=(level, unit), how=how, samples=found.samples,
-        coloured=coloured, quantum=None if quantum is None else (quantum, unit),
+        quantum=None if quantum is None else (quantum, unit),
         rounding=(rounding, unit),
     )  # fmt: skip
     return NoiseFloor(

@@ -20,9 +20,11 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.multistart import free_of, known_zeros, refuse_unfit, search_starts
+from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
+from psa_casadi.records.noise_kinds import notes_of
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized, sizes_of
@@ -102,8 +104,9 @@ def diagnose_ode(
         attached = [table[c.name] for c in best.model.effects]
         whole = model_of(base.model, best, attached, runs, interrupted=True)
         raise DiagnosisInterrupted(whole) from None
-    said = *known.remarks, *told_of_columns(model, runs)
-    return replace(found, remarks=(*found.remarks, *said))
+    noise = noise_found(found.extended_fit, found.experiments, (*given, *held))
+    said = *known.remarks, *told_of_columns(model, runs), *notes_of(noise)
+    return replace(found, remarks=(*found.remarks, *said), noise_kinds=noise)
 
 
 def _table(

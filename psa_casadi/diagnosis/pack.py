@@ -49,25 +49,25 @@ class Pack:
         return None
 
     def tested(
-        self, fit: Fit, experiments: Sequence[Experiment], colour: Colour, limits: Thresholds,
-        *, even: bool,
+        self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
+        colour: Colour, limits: Thresholds, *, even: bool,
     ) -> Omnibus:  # fmt: skip
         """Test the residual of every output along every input; the most telling one counts.
 
         With Bonferroni's correction for their number.
         """
         rows = []
-        for f, own in zip(fit.channels, colour.each, strict=True):
+        for f, left, own in zip(fit.channels, residuals, colour.each, strict=True):
             time, inputs = [], []
             for k in f.records:
                 e, at = experiments[k], experiments[k].at(f.number)
                 time.append((e.record.time - e.record.time[0])[at])
                 inputs.append(record_inputs(fit.model, e.record, e.record.n)[at])
             moving = [column for column in np.vstack(inputs).T if np.ptp(column) > 0]
-            for along in moving or [np.zeros(len(f.residuals))]:
+            for along in moving or [np.zeros(len(left))]:
                 found = omnibus(
-                    f.residuals, along, np.concatenate(time), own, noise_rms(f.residuals, own),
-                    knowable=f.straight, even=even, alarms_below=limits.alarm,
+                    left, along, np.concatenate(time), own, noise_rms(f.residuals, own),
+                    lengths=f.lengths, knowable=f.straight, even=even, alarms_below=limits.alarm,
                 )  # fmt: skip
                 rows.append(replace(found, output=f.column if fit.further else ""))
         p = min(1.0, len(rows) * min(r.p_value for r in rows))
@@ -122,8 +122,8 @@ class StackPack(Pack):
         return [known_colour(e.record, r) for e, r in zip(experiments, residuals, strict=True)]
 
     def tested(
-        self, fit: Fit, experiments: Sequence[Experiment], colour: Colour, limits: Thresholds,
-        *, even: bool,
+        self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
+        colour: Colour, limits: Thresholds, *, even: bool,
     ) -> Omnibus:  # fmt: skip
         """Test the displacement's residual, or that of a column where only this one alarms."""
 
@@ -137,14 +137,16 @@ class StackPack(Pack):
             noise = noise_rms(residual, own)
             return omnibus(
                 residual, voltage, time, own, noise,
-                knowable=least, even=even, alarms_below=limits.alarm,
+                lengths=[int(e.used.sum()) for e in parts], knowable=least, even=even,
+                alarms_below=limits.alarm,
             )  # fmt: skip
 
-        test = test_of(fit.residuals, experiments, colour, knowable_of(fit, experiments, limits))
-        for f, own in zip(fit.further, colour.further, strict=True):
+        first, *beside = residuals
+        test = test_of(first, experiments, colour, knowable_of(fit, experiments, limits))
+        for f, left, own in zip(fit.further, beside, colour.further, strict=True):
             if test.alarm:
                 break
-            found = test_of(f.residuals, [experiments[k] for k in f.records], own, f.straight)
+            found = test_of(left, [experiments[k] for k in f.records], own, f.straight)
             p = min(1.0, found.p_value * (1 + len(fit.further)))
             if found.alarm and p < limits.alarm:
                 size = max(test.size, 2.0 * test.knowable)
@@ -213,7 +215,8 @@ class Task:
     """The records, the effects to search, what knows the device, the method, and who is told.
 
     `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
-    interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made.
+    interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made. Of a
+    base that is known but for its parameters `free` only these are fitted.
     """
 
     experiments: tuple[Experiment, ...]
@@ -224,6 +227,7 @@ class Task:
     keep: Callable[[Fit], None] = lambda _: None
     watch: Callable[[Tried], None] = lambda _: None
     hidden: float = 0.0
+    free: tuple[str, ...] | None = None
 
     @property
     def limits(self) -> Thresholds:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
+from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
@@ -18,6 +19,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
+from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame, made, with_units
 
@@ -57,7 +59,9 @@ class Cause:
 
     `explained_share` is what it removes of the held-out error above the noise, beside the others.
     `remedy` says as a code what to do about it, `sizes` what it changes in the tests that the
-    effect declares. Of any model, `port` is where it adds to the equations.
+    effect declares. Of any model, `port` is where it adds to the equations. `families` are the
+    places and kinds that it may be of, the most probable first; `confidence` counts what is not
+    listed.
     """
 
     effect: str
@@ -70,6 +74,7 @@ class Cause:
     sizes: tuple[Size, ...] = ()
     port: str = ""
     description: str = ""
+    families: tuple[Family, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -218,9 +223,10 @@ class Diagnosis(Reported):
     are the predictions of every record in full, in the order of `experiments`. `candidates` are all
     effects tried, `errors` those of every measured output. `missed` is what the base leaves,
     `remaining` what the extended model does. `budget` says where the base's held-out error goes,
-    `patch` is the unnamed correction that would remove most of what the named causes leave.
+    `patch` is the unnamed correction that would remove most of what the named causes leave,
+    `families` are the places and kinds that this may be of.
     `doubted` says why held-out samples cannot confirm a cause, None where they can; `remarks` what
-    else there is to say.
+    else there is to say. `noise_kinds` are those in what the extended model leaves of every output.
     """
 
     verdict: Verdict
@@ -239,6 +245,8 @@ class Diagnosis(Reported):
     doubted: Note | None = None
     budget: Budget
     patch: Correction | None = None
+    families: tuple[Family, ...] = ()
+    noise_kinds: tuple[NoiseFound, ...] = ()
 
     @property
     def doubt(self) -> str:
@@ -339,7 +347,9 @@ class Diagnosis(Reported):
             "missed": told(self.missed, "seen", "where"),
             "remaining": told(self.remaining, "seen", "where"),
             "unnamed": self.unnamed,
+            "families": [asdict(f) for f in self.families],
             "notes": list(self.notes),
+            "noise_kinds": [asdict(n) for n in self.noise_kinds],
             "values": dict(self.model.values),
             "records": [
                 {"name": e.record.name, "sha256": e.record.sha256} for e in self.experiments

@@ -406,25 +406,33 @@ def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     # what is left beside the unknowns to tell the noise
     share = max(len(before.residuals) - before.unknowns.size, 0) / len(before.residuals)
     gained = share * _gained(before.residuals, after.residuals, colour)
-    jacobians = []
-    level = _level(after.residuals, colour, 0.0)
-    jacobians.append(colour.whiten(after.jacobian) / max(level, 1e-300))
-    for own, f in zip(colour.further, after.further, strict=True):
-        jacobians.append(own.whiten(f.jacobian) / _level(f.residuals, own, f.straight))
     gained += sum(further_gains(before, after, colour).values())
+    levels = [_level(after.residuals, colour, 0.0)]
+    levels += [
+        _level(f.residuals, own, f.straight)
+        for own, f in zip(colour.further, after.further, strict=True)
+    ]
+    return gained - occam(before, after, colour, levels)
+
+
+def occam(before: Fit, after: Fit, colour: Colour, levels: Sequence[float]) -> float:
+    """Return 1/2 ln det(1 + P H P), what the evidence loses by the unknowns that a fit adds.
+
+    `levels` are those of the noise in every channel.
+    """
+    rows = zip(colour.each, after.channels, levels, strict=True)
+    jacobian = np.concatenate([c.whiten(f.jacobian) / max(own, 1e-300) for c, f, own in rows])
     known, other = before.unknowns, after.unknowns
     added = [k for k, n in enumerate(other.names) if n not in known.names]
     for record, states in enumerate(other.started):
         first, old_ones = other.first(record), known.started[record]
         added += [first + k for k, s in enumerate(states) if s not in old_ones]
-    jacobian = np.concatenate(jacobians)
     kept = [k for k in range(after.unknowns.size) if k not in added]
     new, old = jacobian[:, added], jacobian[:, kept]
     free = new - old @ np.linalg.lstsq(old, new, rcond=1e-10)[0]
     prior = after.unknowns.prior[added]
     scaled = free * np.where(np.isfinite(prior), prior, 1.0)
-    _, penalty = np.linalg.slogdet(np.eye(len(added)) + scaled.T @ scaled)
-    return gained - 0.5 * float(penalty)
+    return 0.5 * float(np.linalg.slogdet(np.eye(len(added)) + scaled.T @ scaled)[1])
 
 
 def further_gains(before: Fit, after: Fit, colour: Colour) -> dict[str, float]:

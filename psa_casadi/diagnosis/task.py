@@ -34,6 +34,8 @@ class Thresholds:
 
     * `price`: prior of a cause [nats]. The largest evidence of any effect on 114 of 115 clean
       records was 7.8.
+    * `noise`: evidence of a cause [nats] where each residual may be noise of a colour of its own.
+      The largest of any effect on clean records with odd noise was 11.2.
     * `further`: share of what the other causes remove that a further one must. An effect's own form
       is not the true one; less may be that.
     * `static`: share of what a cause with a memory adds that may be a curve of the voltage alone.
@@ -53,6 +55,8 @@ class Thresholds:
     * `temperature`, `temperature_share`: evidence is divided by this, or by this share of the
       largest, before it becomes a probability. From the reliability table of the benchmark
       `diagnose`: the effects are not the true equations.
+    * `form_of_evidence`: share of a cause's evidence by which an unnamed correction of another
+      family may differ and be as likely. The listed effects' forms are not the true ones.
     * `credible`: probability that the set of effects that cannot be told apart holds the cause.
     * `clearly`: tempered odds [nats] below which another correction is as likely as the best one,
       and at which a free function takes names away: 20 to 1.
@@ -73,6 +77,7 @@ class Thresholds:
     form_of_range: float = 2e-5
     dithered: float = 1.2
     price: float = 8.0
+    noise: float = 20.0
     further: float = 0.02
     static: float = 0.9
     form: float = 0.05
@@ -82,6 +87,7 @@ class Thresholds:
     better: float = 0.95
     temperature: float = 2.0
     temperature_share: float = 0.004
+    form_of_evidence: float = 0.02
     credible: float = 0.95
     clearly: float = 3.0
     enough: float = 0.7
@@ -115,6 +121,7 @@ STEPS = (
     "rejected",  # no neighbours of what held-out data reject are fitted
     "held out",  # held-out data are not asked
     "between samples",  # the voltage between two samples is a straight line, whatever the data say
+    "noise",  # noise of another colour may explain as much as a cause
     "form",  # a further cause may be smaller than the first one's form is known
 )
 

@@ -308,7 +308,7 @@ class StackJudge(Judge):
     def unseen(self, step: Step) -> tuple[Note, float] | None:
         """Return by which factor held-out errors exceed those of the fit."""
         found = held_out_excess(
-            step.fit, self.experiments, step.predicted, step.screening.colour, self.floors,
+            step.fit, self.experiments, step.predicted, step.view.of.own[0], self.floors,
             self.limits,
         )  # fmt: skip
         return (note("held_out_error", factor=found.factor), found.p_value) if found else None

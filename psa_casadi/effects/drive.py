@@ -33,6 +33,7 @@ def _scale(p: Values) -> float:
 
 CURRENT_LIMIT = Component(
     name="current_limit",
+    kind="lag",
     description="the amplifier delivers at most a certain current",
     source="amplifier data sheets; C_p u' = sat(i, i_max)",
     belongs_to="drive",
@@ -69,6 +70,7 @@ def _voltage_saturation(s: Symbols) -> Equations:
 
 VOLTAGE_SATURATION = Component(
     name="voltage_saturation",
+    kind="curve",
     description="the amplifier's output voltage saturates at a level",
     source="output swing of amplifier data sheets; softplus: Dugas et al., NIPS 13 (2000)",
     belongs_to="drive",
@@ -111,6 +113,7 @@ def _drive_lag(s: Symbols) -> Equations:
 
 DRIVE_LAG = Component(
     name="drive_lag",
+    kind="lag",
     description="the amplifier follows its command through a lag of second order",
     source=(
         "amplifier of finite bandwidth with one or two poles; Horowitz and Hill, The Art of"
@@ -162,6 +165,7 @@ def _amplifier_nonlinearity(s: Symbols) -> Equations:
 
 AMPLIFIER_NONLINEARITY = Component(
     name="amplifier_nonlinearity",
+    kind="curve",
     description="the amplifier's gain changes with its output voltage",
     source="output-dependent gain of amplifiers: Horowitz and Hill, The Art of Electronics",
     belongs_to="drive",
@@ -206,6 +210,7 @@ def _charge_leakage(s: Symbols) -> Equations:
 
 CHARGE_LEAKAGE = Component(
     name="charge_leakage",
+    kind="relaxation",
     description="a charge drive loses charge through its stabilising resistor",
     source=(
         "charge amplifier as a high-pass: Fleming and Moheimani, Rev. Sci. Instrum. 76 (2005)"

@@ -23,6 +23,7 @@ def _offset_drift(s: Symbols) -> Equations:
 
 OFFSET_DRIFT = Component(
     name="offset_drift",
+    kind="time",
     description="the sensor's zero moves with time alone",
     source="zero drift of sensors: slow polynomial of time",
     belongs_to="sensor",
@@ -79,6 +80,7 @@ def _part(name: str) -> State:
 
 MAINS_HUM = Component(
     name="mains_hum",
+    kind="time",
     description="a line at one frequency in the reading, whatever the drive does",
     source="pick-up of 50 or 60 Hz mains: Morrison, Grounding and Shielding Techniques (Wiley)",
     belongs_to="environment",
@@ -132,6 +134,7 @@ def _temperature(s: Symbols) -> Equations:
 
 TEMPERATURE = Component(
     name="temperature",
+    kind="changing gain",
     description="length and gain of the stack follow its temperature",
     source="Physik Instrumente, piezo tutorial, Temperature Effects: expansion and piezo gain",
     belongs_to="environment",

@@ -52,6 +52,7 @@ def _rate_dependent_hysteresis(s: Symbols) -> Equations:
 
 RATE_DEPENDENT_HYSTERESIS = Component(
     name="rate_dependent_hysteresis",
+    kind="hysteresis",
     description="loop width and stroke change with the logarithm of the voltage rate",
     source=(
         "Damjanovic, Phys. Rev. B 55 (1997) R649: logarithm of frequency; elements that grow with"
@@ -112,6 +113,7 @@ def _hysteresis_memory(s: Symbols) -> Equations:
 
 HYSTERESIS_MEMORY = Component(
     name="hysteresis_memory",
+    kind="hysteresis",
     description="a spectrum of further hysteresis elements, symmetric or not",
     source=(
         "generalised Prandtl-Ishlinskii: plays, their squares and cubes (Al Janaideh, Rakheja and"
@@ -158,6 +160,7 @@ def _asymmetry_scale(p: Values) -> float:
 
 RATE_INDEPENDENT_ASYMMETRY = Component(
     name="rate_independent_asymmetry",
+    kind="hysteresis",
     description="ascending and descending branch curve differently at every frequency",
     source=(
         "the paper's asymmetry (eq. 8, delta) made rate-independent, u sgn(u') -> u |u'|, with the"

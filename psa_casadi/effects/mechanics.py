@@ -53,6 +53,7 @@ def _mode(q: str, r: str, frequency: str, text: str) -> tuple[State, State]:
 
 STRUCTURAL_MODE = Component(
     name="structural_mode",
+    kind="resonance",
     description="a further resonance, of the mount or the guide",
     source="modal superposition, one second-order mode driven by the output mass",
     gain="mode_gain",
@@ -97,6 +98,7 @@ def _load_stiffness(s: Symbols) -> Equations:
 
 LOAD_STIFFNESS = Component(
     name="load_stiffness",
+    kind="curve",
     description="an elastic load or guide whose stiffness changes with displacement",
     source="Duffing's spring; flexures that stretch: Howell 2001; contacts: Johnson 1985",
     gain="load_gain",
@@ -144,6 +146,7 @@ def _preload_loss(s: Symbols) -> Equations:
 
 PRELOAD_LOSS = Component(
     name="preload_loss",
+    kind="curve",
     description="a spring touches, or a guide changes its stiffness, at one displacement",
     source="unilateral contact (Signorini) with an elastic load: Johnson, Contact Mechanics, 1985",
     gain="contact_gain",
@@ -198,6 +201,7 @@ def _stop_scale(p: Values) -> float:
 
 BACKLASH = Component(
     name="backlash",
+    kind="hysteresis",
     description="play, or a guide that sticks, between the output mass and what is measured",
     source=(
         "play and stop operators (Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989) in"
@@ -257,6 +261,7 @@ def _reciprocal_coupling(s: Symbols) -> Equations:
 
 RECIPROCAL_COUPLING = Component(
     name="reciprocal_coupling",
+    kind="resonance",
     description="the bonding layers push back on the wafers: two masses with action and reaction",
     source="Newton's third law, whose reaction Yang and Zhu 2015, eqs. 4 and 5, leave out",
     needs=("cascade_mechanics",),
@@ -331,6 +336,7 @@ def modal_series(count: int) -> Component:
     gain = Parameter("series_gain", 0.0, "1", (0.0, 2.0), "1 with the modes", fitted=False)
     return Component(
         name=f"modal_series_{count}",
+        kind="resonance",
         description=f"{count} further resonances, of the mount, the guide or the load",
         source="modal superposition; Ewins, Modal Testing, 2nd ed. 2000, ch. 2",
         gain=gain.name,

@@ -42,6 +42,7 @@ def _states(index: int) -> tuple[State, State]:
 
 SENSOR_DELAY = Component(
     name="sensor_delay",
+    kind="lag",
     description="the measured displacement arrives late by a fixed time",
     source="Pade approximation of exp(-s T), two second-order sections in series",
     belongs_to="sensor",
@@ -77,6 +78,7 @@ def _sensor_lag(s: Symbols) -> Equations:
 
 SENSOR_LAG = Component(
     name="sensor_lag",
+    kind="lag",
     description="the sensor follows the displacement with a time constant",
     source="bandwidth of position sensors: Fleming, Sensors and Actuators A 190 (2013) 106",
     belongs_to="sensor",
@@ -108,6 +110,7 @@ def _sensor_nonlinearity(s: Symbols) -> Equations:
 
 SENSOR_NONLINEARITY = Component(
     name="sensor_nonlinearity",
+    kind="curve",
     description="the sensor's reading is a bent function of the displacement",
     source="linearity error of position sensors: Fleming, Sensors and Actuators A 190 (2013) 106",
     belongs_to="sensor",
@@ -156,6 +159,7 @@ def _second(name: str) -> Parameter:
 
 SENSOR_RIPPLE = Component(
     name="sensor_ripple",
+    kind="curve",
     description="an error of the reading that repeats with the displacement",
     source=(
         "quadrature errors of encoders and interferometers: Heydemann, Applied Optics 20 (1981)"
@@ -208,6 +212,7 @@ def _place_scale(p: Values) -> float:
 
 SENSOR_JUMP = Component(
     name="sensor_jump",
+    kind="curve",
     description="the reading jumps where the displacement passes one place",
     source=(
         "wide or missing code of a converter (IEEE Std 1241), stitching error of a scale: a static"

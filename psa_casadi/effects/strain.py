@@ -25,6 +25,7 @@ def _slow_creep(s: Symbols) -> Equations:
 
 SLOW_CREEP = Component(
     name="slow_creep",
+    kind="relaxation",
     description="displacement that keeps growing for seconds to hours at constant voltage",
     source="Croft, Shed and Devasia, J. Dyn. Sys. Meas. Control 123 (2001) 35: relaxations",
     gain="creep_gain",
@@ -65,6 +66,7 @@ def _field_dependent_gain(s: Symbols) -> Equations:
 
 FIELD_DEPENDENT_GAIN = Component(
     name="field_dependent_gain",
+    kind="curve",
     description="the displacement per volt grows with the voltage",
     source=(
         "Rayleigh's law d = d_0 + alpha E of domain walls: Damjanovic and Demartin, J. Phys. D 29"
@@ -98,6 +100,7 @@ def _field_dependent_capacitance(s: Symbols) -> Equations:
 
 FIELD_DEPENDENT_CAPACITANCE = Component(
     name="field_dependent_capacitance",
+    kind="lag",
     description="the capacitance of the stack grows with the voltage",
     source=(
         "Rayleigh's law of the permittivity: Hall, J. Mater. Sci. 36 (2001) 4575; large-signal"
@@ -123,6 +126,7 @@ def _saturation_of_strain(s: Symbols) -> Equations:
 
 SATURATION_OF_STRAIN = Component(
     name="saturation_of_strain",
+    kind="curve",
     description="the strain saturates as the domains that can still turn run out",
     source=(
         "saturating anhysteretic polarisation: Smith, Smart Material Systems, SIAM 2005, chapter 2;"
@@ -174,6 +178,7 @@ def _heating_scale(p: Values) -> float:
 
 SELF_HEATING = Component(
     name="self_heating",
+    kind="changing gain",
     description="the gain changes as losses warm the stack, and recovers when it rests",
     source=(
         "Zheng, Takahashi, Yoshikawa, Uchino and de Vries, J. Am. Ceram. Soc. 79 (1996) 3193: heat"
@@ -225,6 +230,7 @@ def _ageing(s: Symbols) -> Equations:
 
 AGEING = Component(
     name="ageing",
+    kind="changing gain",
     description="the gain falls with the logarithm of time or of the cycles made",
     source=(
         "Jaffe, Cook and Jaffe, Piezoelectric Ceramics, 1971: ageing per decade of time; Hall and"

@@ -10,6 +10,7 @@ from psa_casadi.identification.combinations import Combination, free_combination
 from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import record_rms, refit, relevelled
 from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
@@ -38,6 +39,7 @@ from psa_casadi.model.evidence import Evidence
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise import high_frequency_noise
+from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
@@ -131,6 +133,7 @@ def identify(
     open_ones = free_combinations(best.model, determined, force_scale_given=given)
     advised: tuple[Advice, ...] | None = None
     told: Evidence | None = None
+    noise: tuple[NoiseFound, ...] = ()
     if not best.interrupted:
         try:
             told = evidence_of(
@@ -141,6 +144,7 @@ def identify(
                 by="psa identify",
                 sampled=[known[r.sha256] for r in fitted],
             )
+            noise = noise_found(best, experiments, parts)
             progress("what further records would tell")
             advised = advice(best, experiments, determined, force_scale_given=given)
         except KeyboardInterrupt:
@@ -168,10 +172,12 @@ def identify(
             *((preferred,) if preferred else ()),
             *columns.left_out,
             *(" ".join(texts(f.notes)) for f in best.further),
+            *notes_of(noise),
         ),
         combinations=open_ones,
         advice=advised or (),
         interrupted=advised is None,
+        noise_kinds=noise,
     )
 
 

@@ -10,6 +10,7 @@ from psa_casadi.errors import InputError, PsaError, quoted
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.refitting import (
     refit,
     relevelled,
@@ -28,6 +29,7 @@ from psa_casadi.identification.result import (
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent
+from psa_casadi.records.noise_kinds import notes_of
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized
@@ -72,10 +74,10 @@ def identify_ode(
     be simulated at its values.
     """
     refuse_unfit(model)
+    given = given_to(model, records, hold)
     runs = experiments_of(
-        model, given_to(model, records, hold), judged=False, zeros=known_zeros(model, zeros),
-        known_start=known_start,
-    )  # fmt: skip
+        model, given, judged=False, zeros=known_zeros(model, zeros), known_start=known_start
+    )
     progress("fitting from several starts")
     best, runs, outcomes = search_starts(
         sized(model, runs), runs, free_of(model, free), starts=starts, progress=progress
@@ -94,7 +96,8 @@ def identify_ode(
         interrupted=best.interrupted,
     )  # fmt: skip
     doubts = *doubts_of(best, found, outcomes), *_of_outputs(result), *told_of_columns(model, runs)
-    return replace(result, doubts=doubts)
+    noise = () if best.interrupted else noise_found(best, runs, given)
+    return replace(result, doubts=doubts, notes=notes_of(noise), noise_kinds=noise)
 
 
 def _of_outputs(found: Identification) -> list[Note]:

@@ -12,6 +12,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise import first_order_noise
+from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment, noise_share
@@ -46,6 +47,7 @@ class Identification(Reported):
     `starts` tells what became of every start of the search; `notes` what was done to the records
     (samples masked, averaged), which is no doubt. `warnings` and `sentences` are both in words.
     `interrupted` says that a keyboard interrupt ended the search, or what came after it.
+    `noise_kinds` are those of every output of every record; `notes` say what to do about them.
     """
 
     model: Model
@@ -56,6 +58,7 @@ class Identification(Reported):
     starts: tuple[StartOutcome, ...] = ()
     notes: tuple[Note | str, ...] = ()
     interrupted: bool = False
+    noise_kinds: tuple[NoiseFound, ...] = ()
 
     def __repr__(self) -> str:
         """Return the parameters with their standard errors, and what is left of the outputs."""

@@ -124,10 +124,12 @@ BLOCK = 32
 def local_scale(away: FloatArray) -> FloatArray:
     """Return the robust standard deviation around every sample: the largest of three blocks'."""
     count = max(1, away.size // BLOCK)
-    blocks = np.array_split(np.abs(away), count)
-    each = np.array([1.4826 * np.median(b) for b in blocks])
+    size, longer = divmod(away.size, count)  # the first ones have one sample more
+    parts = np.split(np.abs(away), [longer * (size + 1)])
+    blocks = [p.reshape(-1, b) for p, b in zip(parts, (size + 1, size), strict=True) if p.size]
+    each = 1.4826 * np.concatenate([np.median(b, axis=1) for b in blocks])
     each = np.maximum(scipy.ndimage.maximum_filter1d(each, 3, mode="nearest"), np.median(each))
-    return np.repeat(each, [b.size for b in blocks])
+    return np.repeat(each, [size + (k < longer) for k in range(count)])
 
 
 def runs_of(found: BoolArray) -> list[tuple[int, int]]:

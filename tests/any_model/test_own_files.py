@@ -1,5 +1,6 @@
 """Records of a model of one's own in files and tables, in other units than the model's."""
 
+import json
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -299,6 +300,25 @@ def test_a_clean_record_with_outliers_is_adequate() -> None:
         assert any(
             n.startswith(f"{name} of record: 30 samples stand out as spikes") for n in d.notes
         )
+
+
+def test_identification_and_diagnosis_tell_the_same_noise() -> None:
+    given = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
+    fitted = psa.identify(motor(), given, starts=1)
+    found = psa.diagnose(motor(), given, leave_out=["hysteresis", "stop", "curve", "delay"])
+    for result in (fitted, found):
+        assert [(n.record, n.output) for n in result.noise_kinds] == [
+            ("record", "w"),
+            ("record", "i"),
+        ]
+        for n in result.noise_kinds:
+            assert [k.kind for k in n.kinds] == ["white", "outliers"]
+            assert n.kinds[1].figures == {"count": 30.0}
+        file = json.loads(result.to_json())
+        assert [n["kinds"][1]["kind"] for n in file["noise_kinds"]] == ["outliers"] * 2
+    said = [n for n in fitted.sentences if "outliers (at " in n]
+    assert said == [n for n in found.notes if "outliers (at " in n]
+    assert said[0].startswith("w in record has 30 outliers (at ")
 
 
 def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_told() -> None:

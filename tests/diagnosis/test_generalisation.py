@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.colour import colour_of
+from psa_casadi.diagnosis.colour import OwnColour, own_colour
 from psa_casadi.diagnosis.confirmation import held_out_excess
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.noise import noise_floor
@@ -19,7 +19,7 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import divided, split
+from psa_casadi.records.split import Experiment, divided, split
 from psa_casadi.simulation.simulate import simulate
 from tests.studies.plants.again import play_again
 from tests.studies.plants.make import make_record
@@ -40,13 +40,20 @@ def fitted() -> tuple[Fit, FloatArray, FloatArray]:
     return fit(model, (split(record),), ["k_L"], sigma=[LEVEL]), voltage, clean
 
 
+def _own(experiments: tuple[Experiment, ...], errors: list[FloatArray]) -> OwnColour:
+    """The colour of errors where no parameter can follow and no clock jitters."""
+    used, held = ([getattr(e, name) for e in experiments] for name in ("used", "held_out"))
+    none = np.zeros((sum(int(u.sum()) for u in used), 0))
+    return own_colour(errors, used, held, none, np.zeros(0), [np.zeros(len(e)) for e in errors])
+
+
 def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> float:
     """What is said of an error (n,) [m] of that model."""
     found, voltage, clean = fitted
     experiments = (split(Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),)
     used = error[experiments[0].used]
     seen = replace(found, residuals=used)
-    colour = colour_of(used, [len(used)])
+    colour = _own(experiments, [error])
     noise = noise_floor([experiments[0].record], [error])
     return held_out_excess(seen, experiments, (clean,), colour, noise, LIMITS).factor
 
@@ -99,7 +106,7 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
         predicted = (clean, clean[:samples] + offset)
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)
-        colour = colour_of(seen.residuals, [SAMPLES, 0])
+        colour = _own(experiments, left)
         told.append(held_out_excess(seen, experiments, predicted, colour, noise, LIMITS).factor)
     assert told == [1.0] * 25
 

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.colour import Colour, colour_of, left_correlation, omnibus
+from psa_casadi.diagnosis.colour import (
+    Colour,
+    OwnColour,
+    colour_of,
+    left_correlation,
+    omnibus,
+    own_colour,
+)
 from psa_casadi.records.noise import first_order_noise, uncertain
 from psa_casadi.units import FloatArray
 from tests.studies.plants.noise import coloured
@@ -61,7 +68,15 @@ def _size_test(
 ) -> float:
     colour = Colour(tuple(np.zeros(0) for _ in lengths), 1.0, lengths)
     return omnibus(
-        residual, VOLTAGE, TIME, colour, 1.0, knowable=0.0, even=even, alarms_below=1e-3
+        residual,
+        VOLTAGE,
+        TIME,
+        colour,
+        1.0,
+        lengths=lengths,
+        knowable=0.0,
+        even=even,
+        alarms_below=1e-3,
     ).p_value
 
 
@@ -72,3 +87,46 @@ def test_noise_of_one_size_is_no_misfit_and_noise_after_reversals_only_is() -> N
     after = 1.0 + np.exp(-((TIME % 0.5) / 0.05))
     assert _size_test(after * noise(0.0)) < 1e-6
     assert _size_test(after * noise(0.0), even=False) > 1e-3
+
+
+def _own(error: FloatArray, columns: FloatArray, rate: FloatArray) -> OwnColour:
+    """The colour of an error with a gap, of which the last fifth is held out."""
+    used, held = np.arange(N) < 0.8 * N, np.arange(N) >= 0.8 * N
+    used[1000:1010] = False
+    prior = np.full(columns.shape[1], np.inf)
+    return own_colour([error], [used], [held], columns[used], prior, [rate])
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.95])
+def test_a_residual_has_the_colour_that_made_it(correlation: float) -> None:
+    found = _own(noise(correlation), np.zeros((N, 0)), np.zeros(N))
+    assert found.runs == (1000, 3790)
+    assert found.level == pytest.approx(np.sqrt(1.0 - correlation**2), rel=0.04)
+    assert np.std(found.ahead) == pytest.approx(found.level, rel=0.06)
+    assert float(np.sum(found.autoregression)) == pytest.approx(correlation, abs=0.05)
+    assert found.colour.whiten(found.residuals).std() == pytest.approx(found.level, rel=0.02)
+
+
+def test_slow_waves_are_no_evidence_beside_a_random_walk() -> None:
+    """White noise would speak for them with hundreds of nats."""
+    walk = np.cumsum(np.random.default_rng(3).standard_normal(N))
+    waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, N), np.arange(8)))
+    left = [walk - w @ np.linalg.lstsq(w, walk, rcond=None)[0] for w in (waves[:, :4], waves)]
+    few, more = (_own(e, w, np.zeros(N)) for e, w in zip(left, (waves[:, :4], waves), strict=True))
+    assert few.level == pytest.approx(1.0, rel=0.03)
+    assert more.nats() - few.nats() < 12.0
+    assert 0.5 * N * np.log(np.var(left[0]) / np.var(left[1])) > 250.0
+
+
+def test_the_noise_of_a_clock_that_jitters_grows_with_the_rate() -> None:
+    rng, rate = np.random.default_rng(5), np.abs(np.gradient(VOLTAGE))
+    rate = rate / np.sqrt(np.mean(rate**2))
+    error = rng.standard_normal(N) + 3.0 * rate * rng.standard_normal(N)
+    found = _own(error, np.zeros((N, 0)), rate)
+    assert found.spread is not None
+    assert found.nats() > _own(error, np.zeros((N, 0)), np.ones(N)).nats() + 300.0
+    white = found.colour.whiten(found.residuals)
+    fast = rate[np.r_[0:1000, 1010 : int(0.8 * N)]] > 1.0
+    assert white[fast].std() == pytest.approx(white[~fast].std(), rel=0.08)
+    even = [_own(noise(0.0, k), np.zeros((N, 0)), rate).spread for k in range(20)]
+    assert even == [None] * 20

@@ -168,7 +168,7 @@ def test_a_coarse_sensor_is_named(given: Record) -> None:
     y = np.asarray(given.displacement)
     quantum = np.ptp(y) / 9.0
     found = diagnose([replace(given, displacement=quantum * np.round(y / quantum))], effects=TABLE)
-    assert "r: the sensor resolves 9 steps over the whole range." in found.notes[-1]
+    assert found.notes[-1].startswith("What is left of r is rounding to steps of 3.2 µm;")
 
 
 def test_hardly_a_reading_left_is_refused_with_the_reason(given: Record) -> None:

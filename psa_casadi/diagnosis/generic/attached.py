@@ -4,7 +4,15 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from psa_casadi.component import Component, Equations, Expression, OnDemand, Remedy, Symbols
+from psa_casadi.component import (
+    Component,
+    Equations,
+    Expression,
+    Kind,
+    OnDemand,
+    Remedy,
+    Symbols,
+)
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, with_ports
@@ -16,6 +24,12 @@ ORDINARY, LARGEST = 0.03, 10.0
 
 #: What ends the kind of an effect in its name; the kind is the code of its remedy, too.
 _KIND = re.compile("_(?:of|in)_")
+#: What these do (`Component.kind`).
+_DOES: dict[str, Kind] = {
+    "lag": "lag", "delay": "lag", "bend": "curve", "saturation": "curve", "dead_zone": "curve",
+    "zero": "time", "drift": "time", "constant": "time", "loss": "damping", "friction": "damping",
+    "drag": "damping", "curve": "curve", "stop": "curve", "hysteresis": "hysteresis",
+}  # fmt: skip
 #: Returns a parameter or a state of an effect by its short name.
 Own = Callable[[str], Expression]
 #: The derivatives of an effect's own states, by short name, and its term.
@@ -74,6 +88,7 @@ def at_port(
         )
 
     description, source, text, looks = words
+    what = _KIND.split(name)[0]
     component = Component(
         name=name,
         description=f"{port.words}: {description}",
@@ -86,8 +101,9 @@ def at_port(
         finite_step=finite_step,
         equation_text=text.replace("Q", port.balance).replace("q", signal),
         looks_like=looks,
+        kind=_DOES[what],
         belongs_to=belongs_to,
-        remedy=Remedy(_KIND.split(name)[0], "record"),
+        remedy=Remedy(what, "record"),
     )
     return Attached(component, port, reads)
 

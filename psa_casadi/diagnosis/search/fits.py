@@ -328,6 +328,24 @@ def without(
     return None
 
 
+def as_led(
+    whole: Hypothesis, cause: Component, experiments: Sequence[Experiment]
+) -> Hypothesis | None:
+    """Return the model without a cause where the whole has led it, not fitted again.
+
+    None where that cannot be simulated.
+    """
+    model = whole.fit.model.without([cause.name])
+    names = [n for n in whole.fit.unknowns.names if n in model.values]
+    start, parts = replace(whole.fit, model=model), weighted(whole.fit, experiments)
+    try:
+        found = refit(start, parts, names, sigma=whole.fit.sigma, evaluations=1)
+    except PsaError:
+        return None
+    causes = [c for c in whole.causes if c is not cause]
+    return hypothesis(causes, found, experiments)
+
+
 def together(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
     """Fit all parameters once more, weighted by the noise that the residuals now suggest."""
     try:

@@ -15,17 +15,24 @@ are held out whole judge alone: of these the score has no L. The price is the pr
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.colour import Colour, Omnibus, residual_colour, rms
+from psa_casadi.diagnosis.colour import (
+    Colour,
+    Omnibus,
+    OwnColour,
+    own_colour,
+    residual_colour,
+    rms,
+)
 from psa_casadi.diagnosis.held_out import held_out_gain
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
-from psa_casadi.diagnosis.screening import Score, Screening, estimated, evidence, screen
+from psa_casadi.diagnosis.screening import Score, Screening, estimated, evidence, occam, screen
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -43,7 +50,8 @@ class Hypothesis:
     `causes` are in the order in which the search found them; `shown` (n, channels) are the
     predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
     held-out, in fitted and in all samples, over the records' shares of the noise, in its unit;
-    `final` says that the fit went on to its end.
+    `own` is the colour that every channel's residual has by itself; `final` says that the fit went
+    on to its end.
     """
 
     causes: tuple[Component, ...]
@@ -52,12 +60,29 @@ class Hypothesis:
     held: tuple[float, ...]
     train: tuple[float, ...]
     whole: tuple[float, ...]
+    own: tuple[OwnColour, ...]
     final: bool = False
 
     @property
     def predicted(self) -> tuple[FloatArray, ...]:
         """The predictions (n,) of the first channel."""
         return tuple(y[:, 0] for y in self.shown)
+
+    @property
+    def colour(self) -> Colour:
+        """The colour of its own residual, in every channel's fitted samples."""
+        first, *beside = (own.colour for own in self.own)
+        return replace(first, further=tuple(beside))
+
+    def beyond_noise(self, before: "Hypothesis") -> float:
+        """Return its evidence over another one where either's residual may be noise of its colour.
+
+        Less than 0 where noise of another colour explains the data as well [nats].
+        """
+        rows = list(zip(self.fit.channels, before.own, self.own, strict=True))
+        gained = sum(new.nats(f.straight) - old.nats(f.straight) for f, old, new in rows)
+        levels = [float(np.hypot(new.level, f.straight)) for f, _, new in rows]
+        return gained - occam(before.fit, self.fit, self.colour, levels)
 
     @property
     def holdout_rms(self) -> float:
@@ -114,18 +139,26 @@ def hypothesis(
         shown = tuple(fit.shown(experiments))
     except PsaError:
         return None
-    rows = []
+    rows, colours = [], []
     for k, f in enumerate(fit.channels):
-        held, train, every = [], [], []
+        held, train, every, rests = [], [], [], []
         for e, y in zip(experiments, shown, strict=True):
             left = e.errors(f.number, y[:, k])
             held.append(left[e.at(f.number, e.held_out)])
             train.append(left[e.at(f.number)])
             every.append(left[np.isfinite(left)])
+            rests.append(left)
         own = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
         rows.append((own[0] or (f.rms if k else 0.0), *own[1:]))
+        fitted = [e.at(f.number) for e in experiments]
+        judged = [e.at(f.number, e.held_out) for e in experiments]
+        rates = [np.gradient(y[:, k]) for y in shown]
+        # the parameters of several channels do not follow the colour of one of them
+        free = slice(0 if fit.further else None)
+        follow = f.jacobian[:, free], fit.unknowns.prior[free]
+        colours.append(own_colour(rests, fitted, judged, *follow, rates))
     held_rms, train_rms, whole = zip(*rows, strict=True)
-    return Hypothesis(tuple(causes), fit, shown, held_rms, train_rms, whole, final)
+    return Hypothesis(tuple(causes), fit, shown, held_rms, train_rms, whole, tuple(colours), final)
 
 
 def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
@@ -290,8 +323,11 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     finite = "finite steps" not in task.method.without
     kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
+    residuals, colour = [f.residuals for f in fit.channels], screening.colour
+    if not of.causes:  # is there anything but noise of some colour?
+        residuals, colour = [own.residuals for own in of.own], of.colour
     even = bool(of.causes)
-    test = task.pack.tested(fit, experiments, screening.colour, task.limits, even=even)
+    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, even=even)
     return View(of, tuple(kept), screening, test, task.pack)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.search.fits import begun_again, cost_beside, to_end
+from psa_casadi.diagnosis.search.fits import as_led, begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
     View,
@@ -61,6 +61,7 @@ class Known:
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
         self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
+        self.noises: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.tell(root, "finished")
 
     @property
@@ -217,25 +218,39 @@ class Known:
 
         And whether it removes more than the `form` of the others may miss.
         """
+        return all(self._worth(h, c, confirmed=confirmed, form=form) for c in h.causes)
+
+    def _worth(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
         experiments, out, pack = self.task.experiments, self.task.method.without, self.task.pack
-        knowable = self.views[NONE].test.knowable
-        for cause in h.causes:
-            if not pack.in_character(h.fit, cause, experiments):
-                return False
-            before = self.found.get(h.names - {cause.name})
-            if before is None:
-                continue
-            if not pack.told(h.fit, before.fit, h.removes(before), knowable):
-                return False
-            if form and "form" not in out and self.little(h, before):
-                return False
-            if not self.remembers(h, before, cause):
-                return False
-            if "held out" in out or not confirmed:
-                continue
-            if not held_out_confirms(h, before, experiments, self.scale):
-                return False
-        return True
+        if not pack.in_character(h.fit, cause, experiments):
+            return False
+        before = self.found.get(h.names - {cause.name})
+        return before is None or (
+            pack.told(h.fit, before.fit, h.removes(before), self.views[NONE].test.knowable)
+            and not (form and "form" not in out and self.little(h, before))
+            and self.remembers(h, before, cause)
+            and ("noise" in out or self.beyond_noise(h, before, cause))
+            and (
+                not confirmed
+                or "held out" in out
+                or held_out_confirms(h, before, experiments, self.scale)
+            )
+        )
+
+    def beyond_noise(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
+        """Whether a cause adds more than noise of another colour would, with the base as it is.
+
+        Or as the cause has led it: least squares bend a base to slow noise, and the cause takes
+        that back.
+        """
+        if (h, before) not in self.noises:
+            least = self.task.limits.noise
+            found = h.beyond_noise(before) > least
+            if found and before.own[0].autoregression.size:
+                led = as_led(h, cause, self.task.experiments)
+                found = led is None or h.beyond_noise(led) > least
+            self.noises[h, before] = found
+        return self.noises[h, before]
 
     def little(self, h: Hypothesis, before: Hypothesis) -> bool:
         """Whether a further cause removes no more than the form of the others may miss."""

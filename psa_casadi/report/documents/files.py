@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.result import (
     ANY_MODEL,
@@ -28,6 +29,7 @@ from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.posterior.sample import Posterior
+from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.report.words.fit_words import Degree, grade
 from psa_casadi.shown import Lined
 from psa_casadi.strict_json import decode, read_json, shown
@@ -284,7 +286,9 @@ class AnyDiagnosisFile(Told):
     missed: Remaining | None = None
     remaining: Remaining
     unnamed: str = ""
+    families: tuple[Family, ...] = ()
     notes: tuple[str, ...]
+    noise_kinds: tuple[NoiseFound, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
     records: tuple[RecordUsed, ...]
 
@@ -404,6 +408,7 @@ class IdentificationFile:
     profiles: Mapping[str, ProfileInterval]
     #: By how many times its noise the model misses a record or an output, None where it does not.
     missed: float | None = None
+    noise_kinds: tuple[NoiseFound, ...] = ()
 
 
 #: The doubts that tell it, and the name of the figure in each.
@@ -461,6 +466,7 @@ def identification_file(found: Identification, profiles: Iterable[Profile] = ())
         ),
         profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
         missed=max(missed, default=None),
+        noise_kinds=found.noise_kinds,
     )
     return asdict(content)
 

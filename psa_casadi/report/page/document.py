@@ -25,7 +25,7 @@ from plotly.offline import get_plotlyjs
 from psa_casadi.characters import plain
 from psa_casadi.command_line import typed
 from psa_casadi.report.plots.panel import Panel, plotly_figure
-from psa_casadi.report.words import colours, phrases
+from psa_casadi.report.words import colours, phrases, verdict_words
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
 
@@ -131,6 +131,7 @@ def environment() -> Environment:
     )  # fmt: skip
     made.globals.update(column_styles=_column_styles, still_picture=_still_picture)
     made.filters.update(plain=phrases.plain, percent=phrases.percent, either=phrases.either)
+    made.filters.update(family=verdict_words.family_sentence)
     return made
 
 

@@ -420,7 +420,8 @@ def _budget(d: Diagnosis) -> dict[str, Any]:
         coordinate, plot = findings.correction_plot(d, d.patch)
         caption = f"Unnamed correction: {d.patch.name}, over {coordinate}"
         patch = {"text": verdict_words.patch_text(d.patch), "picture": Picture(caption, plot)}
-    return {"budget": verdict_words.budget_table(d), "excess": excess, "patch": patch}
+    rest = {"patch": patch, "families": d.families}
+    return {"budget": verdict_words.budget_table(d), "excess": excess, **rest}
 
 
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:

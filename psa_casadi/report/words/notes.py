@@ -10,6 +10,7 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
+from psa_casadi.report.words.noise_words import NOISE
 from psa_casadi.report.words.phrases import (
     are,
     listing,
@@ -54,6 +55,22 @@ _LACKING = {
     "amplitudes": "the loop at three amplitudes, which separate asymmetry and memory",
     "repeats": "a voltage that repeats, which shows the noise",
 }
+
+
+def _known_from(places: int) -> str:
+    if not places:
+        return "predicted from the voltage"
+    often = "once" if places == 1 else f"{places} times"
+    return f"as it was where this voltage was played before, {often}"
+
+
+def _not_shown(shown: float) -> str:
+    if shown > 0.995:
+        return ""
+    return (
+        f" The voltage of {100.0 * (1.0 - shown):.0f} % of the samples is not in the reference:"
+        " they are left out."
+    )
 
 
 def correction(kind: str, port: str) -> str:
@@ -146,10 +163,6 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         f"The search for causes ended at its budget of work ({work:.2g} steps of simulations): the"
         f" answer is the best so far. Not tried: {', '.join(_LEFT[name] for name in left)}."
     ),
-    "coarse": (
-        "{record}: the sensor resolves {steps:.0f} steps over the whole range. They make up the"
-        " model's error: nothing smaller can be distinguished from them."
-    ),
     "stuck": (
         "{count} readings repeat the last one far from the model, as a stuck sensor does; masked."
     ),
@@ -159,9 +172,18 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " is driven by the curve, and a simulation of such a record needs more samples for each"
         " period."
     ),
-    "noise": lambda record, level, how, samples, coloured, quantum, rounding: (
-        f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples), and"
-        f" {'correlated from sample to sample' if coloured else 'white'}."
+    "since": lambda removed, places, open, shown: (
+        f"What the base model leaves of the reference is taken off the displacement,"
+        f" {quantity(*removed)} rms, {_known_from(places)}.{_not_shown(shown)} A sound device may"
+        f" differ by {quantity(*open)} rms: less is no change."
+    ),
+    "since_moved": lambda name, values, unit, alone: (
+        f"{name} of the base model has changed from {with_its_unit(values[0], unit)} to"
+        f" {with_its_unit(values[1], unit)} since the reference: that alone explains"
+        f" {'more than any effect of the table' if alone else 'as much as the named causes'}."
+    ),
+    "noise": lambda record, level, how, samples, quantum, rounding: (
+        f"The noise of {record} is {quantity(*level)} rms, {how} ({samples} samples)."
         f"{_steps(quantum, rounding) if quantum is not None else ''}"
     ),
     "noise_fast": "from the fast part of what the model leaves",
@@ -370,6 +392,7 @@ SENTENCES: Mapping[str, Sentence] = {
     **DIAGNOSIS,
     **IDENTIFICATION,
     **MISFIT,
+    **NOISE,
     **OWN_MODELS,
 }
 

@@ -85,6 +85,7 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     for c in d.causes:
         sure = f"{place_of(c)}, {percent(c.confidence)}"
         lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
+        lines += [("kind", said)] if (said := verdict_words.family_sentence(c.families)) else []
         lines.append(("rivals", _rivals(d, c)))
     if stack:
         columns = [verdict_words.column_sentence(stack, c) for c in stack.columns]
@@ -92,6 +93,8 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
         lines += [("column", text) for text in columns] + [("export", f"{t}.") for t in others]
     if d.verdict not in ("adequate", "not_driven"):
         lines.append(("budget", f"{verdict_words.budget_sentence(d)}."))
+    if d.families:
+        lines.append(("unnamed", f"most like {verdict_words.family_sentence(d.families)}"))
     lines += [] if stack else [("moved", m) for m in d.moved]
     lines.append(("remains", rest_sentence(d)))
     if stack:

@@ -1,8 +1,11 @@
 """The verdict of a diagnosis and its error budget in sentences."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from psa_casadi.diagnosis.corrections import Correction, Patch
+from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
 from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis, StackDiagnosis
 from psa_casadi.identification.start.doubts import doubtful_sign
@@ -152,6 +155,38 @@ def named_cause(cause: Cause) -> str:
     if cause.cannot_be_told_from:
         sure += f"; or {phrases.either(cause.cannot_be_told_from)}"
     return f"{phrases.plain(cause.effect)} ({sure})"
+
+
+#: What effects of a kind do, and the places of a rig.
+_DOES = {
+    "curve": "a bent static curve",
+    "hysteresis": "a dependence on past reversals",
+    "relaxation": "a relaxation",
+    "resonance": "a resonance",
+    "lag": "a lag or a delay",
+    "damping": "a loss",
+    "time": "a change with time alone",
+    "changing gain": "a gain that changes",
+    "": "an effect of its own kind",
+}
+_PLACES = {
+    "plant": "the stack or its load",
+    "drive": "the drive",
+    "sensor": "the sensor",
+    "environment": "the surroundings",
+}
+
+
+def family_sentence(families: Sequence[Family]) -> str:
+    """Say what a cause does and where it sits, and how far it may be none of the listed effects."""
+    parts = []
+    for f in families:
+        place = _PLACES.get(f.place, f.place)
+        part = f"{_DOES[f.kind]} in {place} ({phrases.probability_text(f.probability)})"
+        if not f.effects and any(other.effects for other in families):
+            part += ", none of the listed effects"
+        parts.append(part)
+    return phrases.listing(parts, "or")
 
 
 def alternative_sentence(d: StackDiagnosis, a: Alternative) -> str:

@@ -1,0 +1,90 @@
+"""What data say of a cause first: its family, the place where it sits and what it does.
+
+Which effect of a family it is comes second, and it may be none that is listed: unnamed corrections
+of other families compete with the listed effects on the scale of evidence.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psa_casadi.component import Kind
+from psa_casadi.diagnosis.corrections import Correction, Patch
+from psa_casadi.diagnosis.screening import temperature
+from psa_casadi.diagnosis.task import Thresholds
+
+#: What a correction of a kind does, where it has another name, and the places of its ports.
+_DOES: dict[str, Kind] = {
+    "curve": "curve", "direction": "hysteresis", "memory": "hysteresis", "relaxation": "relaxation",
+    "modes": "resonance", "time": "time", "gain in time": "changing gain",
+}  # fmt: skip
+_PLACES = {"drive voltage": "drive", "force": "plant", "reading": "sensor"}
+#: Families less probable than this are not told.
+_LEAST = 0.01
+
+
+@dataclass(frozen=True)
+class Family:
+    """A place (plant, drive, sensor, environment, or a port of any model) and a kind.
+
+    `probability` is that the cause belongs to it; `effects` are those of the listed effects in it,
+    `not_listed` that it is none of them.
+    """
+
+    place: str
+    kind: str
+    probability: float
+    effects: Mapping[str, float]
+    not_listed: float
+
+
+def place_and_kind(c: Correction) -> tuple[str, str]:
+    """Return the family of an unnamed correction; a free function is a curve at its port."""
+    if isinstance(c, Patch):
+        return _PLACES[c.port], _DOES[c.kind]
+    return c.port, "curve"
+
+
+def families(
+    probability: Mapping[str, float],
+    places: Mapping[str, tuple[str, str]],
+    evidence: float,
+    corrections: Sequence[Correction],
+    limits: Thresholds,
+) -> tuple[Family, ...]:
+    """Return the families that a cause may belong to, the most probable first.
+
+    `probability` is that of each effect, given that it is a listed one, `places` has their
+    families; `evidence` is that of the best of them over the model without the cause, beside which
+    the `corrections` stand. With the evidence F_k of a correction whose family no likely effect
+    has, and that E of the cause, the odds that the cause is not listed are
+
+        sum_k exp((F_k - E) / T),   T = max(temperature, form_of_evidence E)
+
+    Without any effect the corrections share all.
+    """
+    scale = max(temperature(evidence, limits), limits.form_of_evidence * evidence)
+    own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
+    others: dict[tuple[str, str], float] = {}
+    for c in corrections:
+        family = place_and_kind(c)
+        if family[1] not in own and c.evidence > limits.price:
+            odds = float(np.exp(min((c.evidence - evidence) / scale, 50.0)))
+            others[family] = max(others.get(family, 0.0), odds)
+    listed = 1.0 / (bool(probability) + sum(others.values())) if probability or others else 0.0
+    found: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
+    for name, p in probability.items():
+        if name in places:
+            found.setdefault(places[name], {})[name] = p * listed
+    each = (
+        Family(
+            *family,
+            probability=sum(effects.values()) + others.get(family, 0.0) * listed,
+            effects={n: p for n, p in effects.items() if p > _LEAST},
+            not_listed=others.get(family, 0.0) * listed,
+        )
+        for family, effects in found.items()
+    )
+    told = (f for f in each if f.probability > _LEAST)
+    return tuple(sorted(told, key=lambda f: -f.probability))
