@@ -63,7 +63,7 @@ def test_hidden_forms_move_the_reading_as_said() -> None:
     sag = play("r_foreign_brownout", 3)
     step = 1 / TABLE["r_foreign_brownout"]["rate"]
     _, well = simulate(sag.plant, sag.voltage, step, np.random.default_rng(0))
-    assert set(np.round(sag.clean / well[::SUB], 9).tolist()) == {0.985, 1.0}
+    assert set(np.round(sag.clean[1:] / well[SUB::SUB], 9).tolist()) == {0.985, 1.0}
     jump = play("r_single_jump", 3)
     steps = np.abs(np.diff(jump.clean))
     assert np.max(steps) == pytest.approx(0.22, rel=0.3)

@@ -79,13 +79,13 @@ class Sat:
             f"{c.effect} {c.probability:.2f}" + f" ({c.family} {c.of_family:.2f})" * bool(c.family)
             for c in self.answer.causes
         )
-        return ", ".join(each) or "-"
+        a = self.answer
+        left = [f"left: {a.left} {a.of_left:.2f}"] if a.left else []
+        return ", ".join([*each, *left]) or "-"
 
 
 #: The family of each effect: its place and its kind.
-FAMILIES = {
-    n: f"{e.belongs_to} {kind}" for n, e in psa.EFFECTS.items() if (kind := getattr(e, "kind", ""))
-}
+FAMILIES = {name: f"{e.belongs_to} {e.kind}" for name, e in psa.EFFECTS.items()}
 
 
 def _second(name: str, folder: Path, draw: int) -> tuple[Question, Path]:
@@ -139,7 +139,8 @@ def tables(found: Sequence[Sat]) -> list[TitledTable]:
         TitledTable(
             "Names that can be believed", rows,
             "In the set, alone, family right: of all hidden causes, with no wrong name beside them."
-            " Wrong: of the names with 90 % or more. Honest: not `adequate`, and no name or the"
+            " A family may be that of what is left without a name. Wrong: of the names with 90 % or"
+            " more. Honest: not `adequate`, and no name or the"
             " right family. Processor time: median, 95th percentile, largest.",
         ),
         _reliability(found),
@@ -162,7 +163,7 @@ def _row(group: str, source: str, own: Sequence[Sat]) -> Row:
         "records": source,
         "name in the set": count(lambda s: s.in_set, hidden),
         "alone": count(lambda s: s.alone, hidden),
-        "family right": count(lambda s: s.family, hidden),
+        "family right": count(lambda s: s.family, kinds <= {"one", "two", "three", "foreign"}),
         "causes found": f"{sum(s.found for s in scores)}/{sum(all_hidden)}" if hidden else "-",
         "wrong at 90 %": f"{sum(not right for right in sure)}/{len(sure)}",
         "honest": count(lambda s: s.honest, kinds == {"foreign"}),
@@ -214,7 +215,8 @@ def _reliability(found: Sequence[Sat]) -> TitledTable:
         for level, own in levels.items()
     )
     note = (
-        f"Every cause that counts, by its name and by its likeliest family: {scores}. Bands are"
+        "Every named cause that counts, by its name and its likeliest family, and the likeliest"
+        f" family of what has no name where there is none: {scores}. Bands are"
         " Wilson's. Where several names are accepted, each is right."
     )
     return TitledTable("Probability against frequency", rows, note)

@@ -72,10 +72,12 @@ class Named:
 
 @dataclass(frozen=True)
 class Answer:
-    """The verdict of a diagnosis and the causes that it names."""
+    """The verdict, the causes that are named, and the likeliest family of what is left."""
 
     verdict: str
     causes: tuple[Named, ...] = ()
+    left: str = ""
+    of_left: float = 0.0
 
 
 def mark(asked: Question, answer: Answer) -> str:
@@ -157,9 +159,10 @@ class Score:
     """What an answer adds to the figures of many.
 
     How many hidden causes are hit; whether all are and no name is wrong: in a set, alone, or by
-    their families; whether a foreign cause is answered honestly (no name, or the right one or
-    family), and a clean record with an alarm. `names` and `families` are what is stated: a
-    probability and whether it is right, of every name that counts.
+    their families, of which one may be that of what is left without a name; whether a foreign cause
+    is answered honestly (no name, or the right one or family), and a clean record with an alarm.
+    `names` and `families` are what is stated: a probability and whether it is right, of every name
+    that counts, or of what is left where there is no name.
     """
 
     found: int
@@ -176,25 +179,29 @@ def score(asked: Question, answer: Answer, families: Mapping[str, str]) -> Score
     """Return what an answer adds to the figures; `families` has that of each name."""
     said, sets = mark(asked, answer), asked.accepted
     wide = [names | {families[n] for n in names if n in families} for names in sets]
-    hits = {c: _hit_of(c, sets) for c in answer.causes}
-    by_family = {
-        c: next((k for k, known in enumerate(wide) if c.family in known), None)
-        if hits[c] is None
-        else hits[c]
-        for c in answer.causes
-    }
+
+    def of_family(family: str) -> int | None:
+        return next((k for k, known in enumerate(wide) if family in known), None)
+
     neutral = HYSTERESIS if asked.other_hysteresis else frozenset()
-    counted = [c for c in answer.causes if by_family[c] is not None or c.effect not in neutral]
-    right = all(by_family[c] is not None for c in counted)
+    found, covered, counted = set[int](), {of_family(answer.left)}, []
+    for cause in answer.causes:
+        hit = _hit_of(cause, sets)
+        place = of_family(cause.family) if hit is None else hit
+        if hit is not None:
+            found.add(hit)
+        if place is not None or cause.effect not in neutral:
+            counted.append((cause, place))
+            covered.add(place)
+    right = all(place is not None for _, place in counted)
+    stated = [(c.of_family, c.family) for c, _ in counted] or [(answer.of_left, answer.left)]
     return Score(
-        found=len({k for k in hits.values() if k is not None}),
+        found=len(found),
         in_set=said in (ALONE, IN_SET),
         alone=said == ALONE,
-        family=right and {by_family[c] for c in counted} == set(range(len(sets))),
+        family=right and bool(sets) and covered >= set(range(len(sets))),
         honest=said != MISSED and right,
         alarm=said not in (ADEQUATE, HYSTERESIS_FOUND, HONEST, NEAREST),
-        names=tuple((c.probability, any(_hits(c.effect, s) for s in sets)) for c in counted),
-        families=tuple(
-            (c.of_family, any(c.family in s for s in wide)) for c in counted if c.family
-        ),
+        names=tuple((c.probability, any(_hits(c.effect, s) for s in sets)) for c, _ in counted),
+        families=tuple((p, of_family(family) is not None) for p, family in stated if family),
     )

@@ -46,16 +46,17 @@ def answered(*given: Any, **words: Any) -> tuple[dict[str, Any], Answer, float]:
     begin = time.process_time()
     told = psa.diagnose(*given, **words).to_dict()
     seconds = time.process_time() - begin
-    return told, Answer(told["verdict"], tuple(map(_cause, told["causes"]))), seconds
+    causes = (
+        Named(c["effect"], c["confidence"], tuple(c["cannot_be_told_from"]), *_family(c))
+        for c in told["causes"]
+    )
+    return told, Answer(told["verdict"], tuple(causes), *_family(told)), seconds
 
 
-def _cause(c: dict[str, Any]) -> Named:
-    family = next(iter(c.get("families", ())), None)
-    return Named(
-        c["effect"], c["confidence"], tuple(c["cannot_be_told_from"]),
-        f"{family['place']} {family['kind']}" if family else "",
-        family["probability"] if family else 0.0,
-    )  # fmt: skip
+def _family(of: dict[str, Any]) -> tuple[str, float]:
+    """Return the likeliest family, place and kind, and its probability."""
+    first = next(iter(of.get("families", ())), None)
+    return (f"{first['place']} {first['kind']}", first["probability"]) if first else ("", 0.0)
 
 
 def diagnosed(asked: Question | None, *given: Any, **words: Any) -> Row:
