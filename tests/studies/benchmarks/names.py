@@ -139,9 +139,9 @@ def tables(found: Sequence[Sat]) -> list[TitledTable]:
         TitledTable(
             "Names that can be believed", rows,
             "In the set, alone, family right: of all hidden causes, with no wrong name beside them."
-            " A family may be that of what is left without a name. Wrong: of names, of families with 90 % or"
-            " more. Honest: not `adequate`, and no name or the"
-            " right family. Processor time: median, 95th percentile, largest.",
+            " A family may be that of what is left without a name. Wrong: of names, of families"
+            " with 90 % or more. Honest: not `adequate`, and no name or the right family."
+            " Processor time: median, 95th percentile, largest.",
         ),
         _reliability(found),
         TitledTable("What was said of each", each),
