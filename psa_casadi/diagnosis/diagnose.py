@@ -54,7 +54,6 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.progress import Progress, silent
-from psa_casadi.records.noise_kinds import notes_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
@@ -384,8 +383,7 @@ def _with_noise(
     """Return a diagnosis with what else is `said`, and the noise that its extended model leaves."""
     driven = found.verdict != "not_driven"
     noise = noise_found(found.extended_fit, found.experiments, given) if driven else ()
-    remarks = *found.remarks, *said, *notes_of(noise)
-    return replace(found, remarks=remarks, noise_kinds=noise)
+    return found.with_noise(noise, said)
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:

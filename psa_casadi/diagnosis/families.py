@@ -1,7 +1,7 @@
 """What data say of a cause first: its family, the place where it sits and what it does.
 
 Which effect of a family it is comes second, and it may be none that is listed: unnamed corrections
-of other families compete with the listed effects on the scale of evidence.
+of other kinds compete with the listed effects on the scale of evidence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,6 @@ import numpy as np
 
 from psa_casadi.component import Kind
 from psa_casadi.diagnosis.corrections import Correction, Patch
-from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.task import Thresholds
 
 #: What a correction of a kind does, where it has another name, and the places of its ports.
@@ -57,14 +56,14 @@ def families(
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
     families; `evidence` is that of the best of them over the model without the cause, beside which
-    the `corrections` stand. With the evidence F_k of a correction whose family no likely effect
-    has, and that E of the cause, the odds that the cause is not listed are
+    the `corrections` stand. With the evidence F_k, above the price of a cause, of a correction
+    whose kind no likely effect has, and that E of the cause, the odds that it is not listed are
 
-        sum_k exp((F_k - E) / T),   T = max(temperature, form_of_evidence E)
+        sum_k exp((F_k - E) / T),   T = max(temperature 2, form_of_evidence E)
 
     Without any effect the corrections share all.
     """
-    scale = max(temperature(evidence, limits), limits.form_of_evidence * evidence)
+    scale = max(limits.temperature, limits.form_of_evidence * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
     others: dict[tuple[str, str], float] = {}
     for c in corrections:

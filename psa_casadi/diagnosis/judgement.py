@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
-from psa_casadi.diagnosis.families import Family, families
+from psa_casadi.diagnosis.families import Family, families, place_and_kind
 from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
@@ -209,9 +209,36 @@ class Judge:
 
     @cached_property
     def vague(self) -> dict[str, Correction]:
-        """Those of several causes that an unnamed correction describes better, by name."""
-        better = {n: w.beaten_by() for n, w in self.each.items() if len(self.steps) > 2}
-        return {n: by[0] for n, by in better.items() if by is not None}
+        """Causes that an unnamed correction describes better, by name.
+
+        One of several that it beats, and any that is rather none of the listed effects.
+        """
+        better: dict[str, Correction] = {}
+        for name, weighed in self.each.items():
+            beaten = weighed.beaten_by() if len(self.steps) > 2 else None
+            unlisted = [f for f in self.families[name] if not f.effects]
+            if beaten is not None:
+                better[name] = beaten[0]
+            elif sum(f.not_listed for f in unlisted) > 0.5:
+                others = {(f.place, f.kind) for f in unlisted}
+                found = [c for c in weighed.corrections if place_and_kind(c) in others]
+                better[name] = max(found, key=lambda c: c.evidence)
+        return better
+
+    @cached_property
+    def families(self) -> dict[str, tuple[Family, ...]]:
+        """The places and kinds that every cause may be of, by its name."""
+        return {
+            s.cause.name: families(
+                s.probability,
+                {e.name: self.family(e) for e in (*self.task.table, s.cause)},
+                self.each[s.cause.name].evidence,
+                self.each[s.cause.name].corrections,
+                self.limits,
+            )
+            for s in self.steps
+            if s.chosen is not None and s.cause.name in self.each
+        }
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -296,11 +323,7 @@ class Judge:
     def cause(self, step: Step, sizes: Sequence[Size], port: str = "") -> Cause:
         """Return a cause: its probability, the share of the error that it removes."""
         name, shares = step.cause.name, {c.what: c for c in self.budget.causes}
-        own, weighed = shares.get(name), self.each.get(name)
-        places = {e.name: self.family(e) for e in (*self.task.table, step.cause)}
-        of = () if weighed is None else families(
-            step.probability, places, weighed.evidence, weighed.corrections, self.limits
-        )  # fmt: skip
+        own, of = shares.get(name), self.families.get(name, ())
         sure = step.probability[name] * (1.0 - sum(f.not_listed for f in of))
         return Cause(
             effect=name,

@@ -24,7 +24,6 @@ from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
-from psa_casadi.records.noise_kinds import notes_of
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized, sizes_of
@@ -105,8 +104,7 @@ def diagnose_ode(
         whole = model_of(base.model, best, attached, runs, interrupted=True)
         raise DiagnosisInterrupted(whole) from None
     noise = noise_found(found.extended_fit, found.experiments, (*given, *held))
-    said = *known.remarks, *told_of_columns(model, runs), *notes_of(noise)
-    return replace(found, remarks=(*found.remarks, *said), noise_kinds=noise)
+    return found.with_noise(noise, (*known.remarks, *told_of_columns(model, runs)))
 
 
 def _table(

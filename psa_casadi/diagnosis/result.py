@@ -2,8 +2,8 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
-from psa_casadi.records.noise_kinds import NoiseFound
+from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame, made, with_units
 
@@ -247,6 +247,19 @@ class Diagnosis(Reported):
     patch: Correction | None = None
     families: tuple[Family, ...] = ()
     noise_kinds: tuple[NoiseFound, ...] = ()
+
+    def with_noise(self, noise: Sequence[NoiseFound], said: Sequence[Note | str]) -> Self:
+        """Return it with the noise that its extended model leaves, and what is `said` beside.
+
+        A reading that jumps a few times and stays there is no noise: nothing is `adequate` then.
+        """
+        told = notes_of(noise)
+        jumps = [t for t in told if t.values["kind"] == "steps"]
+        found = replace(self, remarks=(*self.remarks, *said, *told), noise_kinds=tuple(noise))
+        if not jumps or self.verdict != "adequate":
+            return found
+        left = Remaining(False, self.missed.p_value, jumps[0])
+        return replace(found, verdict="unexplained", missed=left, remaining=left)
 
     @property
     def doubt(self) -> str:

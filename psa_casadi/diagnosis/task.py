@@ -43,7 +43,7 @@ class Thresholds:
       91 to 94 %.
     * `form`: share of the excess that a form may cost: where structure remains, a further cause
       that removes less, and less than `enough` of what the largest does, is in the model and not
-      named; a free function takes names away only where it removes so much more than they do.
+      named; causes that are not named stay in the model where they remove more together.
     * `held_out`: gain in log-likelihood that held-out samples must show, and all samples together.
     * `most_causes`: of one hypothesis.
     * `ringing`: a resonance near the band is tried where its ringing explains this share of what
@@ -56,10 +56,10 @@ class Thresholds:
       largest, before it becomes a probability. From the reliability table of the benchmark
       `diagnose`: the effects are not the true equations.
     * `form_of_evidence`: share of a cause's evidence by which an unnamed correction of another
-      family may differ and be as likely. The listed effects' forms are not the true ones.
+      kind may differ and be as likely. The listed effects' forms are not the true ones.
     * `credible`: probability that the set of effects that cannot be told apart holds the cause.
-    * `clearly`: tempered odds [nats] below which another correction is as likely as the best one,
-      and at which a free function takes names away: 20 to 1.
+    * `clearly`: tempered odds [nats] below which another correction, or another effect in a
+      cause's place, is as likely as the best one: 20 to 1.
     * `enough`: share of the held-out excess that causes must remove to be named where structure
       remains; and of what an unnamed correction removes, which has more freedom.
       Of the names that were told although structure remained (study, sets of causes, exam) all 16
@@ -77,7 +77,7 @@ class Thresholds:
     form_of_range: float = 2e-5
     dithered: float = 1.2
     price: float = 8.0
-    noise: float = 20.0
+    noise: float = 15.0
     further: float = 0.02
     static: float = 0.9
     form: float = 0.05

@@ -310,7 +310,9 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     """Screen the effects that a hypothesis does not hold yet, and test its residual.
 
     Directions that are `known` from the base are used again: what an effect adds hardly changes
-    with another effect beside it, and a full fit judges.
+    with another effect beside it, and a full fit judges. Without causes the test has the colour of
+    the residual itself, which slow noise of any kind may have; beside causes that of the screening,
+    and it asks whether the residual is as large everywhere.
     """
     task.progress("screening effects")
     fit, experiments = of.fit, task.experiments

@@ -214,9 +214,11 @@ class Known:
         return hypothesis(ended.causes, levelled, experiments, final=True) or ended
 
     def worth(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
-        """Whether every cause removes what can be told, and held-out data confirm it.
+        """Whether every cause may be part of the answer.
 
-        And whether it removes more than the `form` of the others may miss.
+        Each has its parameters inside their ranges and removes what can be told, more than the
+        `form` of the others may miss. A memory adds more than a static curve, each more than noise
+        of another colour, and held-out samples have `confirmed` it.
         """
         return all(self._worth(h, c, confirmed=confirmed, form=form) for c in h.causes)
 

@@ -1,0 +1,69 @@
+"""Place and kind of a cause before its name, and how far it is none of the listed effects."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import psa_casadi as psa
+from psa_casadi.diagnosis.corrections import KINDS, Patch
+from psa_casadi.diagnosis.families import families, place_and_kind
+from psa_casadi.diagnosis.task import LIMITS
+from psa_casadi.effects import EFFECTS
+from tests.studies.plants.make import make_record
+from tests.tiers import slow
+
+CREEP, DRIFT = ("plant", "relaxation"), ("sensor", "time")
+PLACES = {"slow_creep": CREEP, "charge_leakage": ("drive", "relaxation"), "offset_drift": DRIFT}
+
+
+def _patch(kind: str, port: str, evidence: float) -> Patch:
+    none = np.zeros(0)
+    return Patch(
+        port=port, kind=kind, evidence=evidence, held=(0.0,), predicted=(), weights=none, added=(),
+        moved=none,
+    )  # fmt: skip
+
+
+def test_every_effect_and_every_unnamed_correction_has_a_family() -> None:
+    assert all(e.kind for e in EFFECTS.values())
+    known = {e.kind for e in EFFECTS.values()}
+    assert all(place_and_kind(_patch(k.name, k.port, 0.0))[1] in known for k in KINDS)
+
+
+def test_effects_of_one_place_and_kind_are_one_family() -> None:
+    chances = {"slow_creep": 0.6, "charge_leakage": 0.3, "offset_drift": 0.1}
+    creep, leak, drift = families(chances, PLACES, 1000.0, [], LIMITS)
+    assert (creep.place, creep.kind, creep.effects) == (*CREEP, {"slow_creep": 0.6})
+    assert [f.probability for f in (creep, leak, drift)] == pytest.approx([0.6, 0.3, 0.1])
+    assert not any(f.not_listed for f in (creep, leak, drift))
+
+
+def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_none() -> None:
+    """With 2 % of 1000 nats as the form, 20 nats less are odds of 1/e."""
+    same = _patch("relaxation", "force", 1100.0)
+    other = _patch("curve", "drive voltage", 980.0)
+    weak = _patch("time", "reading", 5.0)
+    found = families({"slow_creep": 1.0}, PLACES, 1000.0, [same, other, weak], LIMITS)
+    shares = {(f.place, f.kind): (f.probability, f.not_listed) for f in found}
+    odds = float(np.exp(-1.0))
+    assert shares[CREEP] == pytest.approx((1.0 / (1.0 + odds), 0.0))
+    assert shares["drive", "curve"] == pytest.approx((odds / (1.0 + odds),) * 2)
+    assert len(shares) == 2
+
+
+def test_what_has_no_name_is_shared_by_corrections_alone() -> None:
+    rows = [_patch("memory", "force", 500.0), _patch("curve", "reading", 490.0)]
+    found = families({}, {}, 500.0, rows, LIMITS)
+    assert [(f.place, f.kind) for f in found] == [("plant", "hysteresis"), ("sensor", "curve")]
+    assert sum(f.not_listed for f in found) == pytest.approx(1.0)
+
+
+@slow
+def test_a_foreign_effect_has_a_place_and_a_kind_or_no_name(tmp_path: Path) -> None:
+    """The gauge changes its range at one displacement: no effect of the table does that alone."""
+    make_record("range_switch", 990030, tmp_path / "r.csv", visible=(0.3, 3.0))
+    found = psa.diagnose(tmp_path / "r.csv")
+    assert all(c.confidence < 0.9 or c.families[0].kind == "curve" for c in found.causes)
+    if not found.causes:
+        assert found.families[0].place == "sensor"
