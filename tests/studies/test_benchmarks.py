@@ -76,12 +76,12 @@ def test_names_families_and_probabilities_are_counted() -> None:
         ("foreign cause", "tune"), ("clean, odd noise", "tune"), ("all", "all"),
     }  # fmt: skip
     causes = rows["one cause", "all"]
-    asked = ("name in the set", "alone", "family right")
+    asked = ("in set", "alone", "family")
     assert [causes[k] for k in asked] == ["1/3", "1/3", "2/3"]
-    assert (causes["causes found"], causes["wrong at 90 %"]) == ("1/3", "1/2, 1/2")
+    assert (causes["found"], causes["wrong"]) == ("1/3", "1/2, 1/2")
     assert rows["foreign cause", "tune"]["honest"] == "1/3"
     assert rows["clean, odd noise", "tune"]["alarms"] == "1/2"
-    assert rows["all", "all"]["wrong at 90 %"] == "2/3, 1/2"
+    assert rows["all", "all"]["wrong"] == "2/3, 1/2"
     assert [row["names: right"] for row in reliability.rows] == ["-", "0/2", "0/1", "0/1", "1/1"]
     assert [row["families: right"] for row in reliability.rows] == ["-", "2/3", "-", "0/1", "1/1"]
     assert len(each.rows) == len(found)

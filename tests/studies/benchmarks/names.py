@@ -30,7 +30,7 @@ NEAREST = 1e-3
 QUICK = 12
 GROUPS = {
     "one": "one cause", "two": "two causes", "three": "three causes", "foreign": "foreign cause",
-    "clean": "clean, white noise", "odd": "clean, odd noise",
+    "clean": "clean, white", "odd": "clean, odd noise",
 }  # fmt: skip
 #: A probability that is stated, and whether what it is stated of is right.
 Stated = tuple[float, bool]
@@ -138,10 +138,11 @@ def tables(found: Sequence[Sat]) -> list[TitledTable]:
     return [
         TitledTable(
             "Names that can be believed", rows,
-            "In the set, alone, family right: of all hidden causes, with no wrong name beside them."
-            " A family may be that of what is left without a name. Wrong: of names, of families"
-            " with 90 % or more. Honest: not `adequate`, and no name or the right family."
-            " Processor time: median, 95th percentile, largest.",
+            "In set, alone, family: all that is hidden is named in sets, alone, or by the right"
+            " family, which may be that of what is left without a name, and no name is wrong."
+            " Found: hidden causes that are named. Wrong: of names, of families with 90 % or more."
+            " Honest: not `adequate`, and no name or the right family. s: processor time, median,"
+            " 95th percentile, largest.",
         ),
         _reliability(found),
         TitledTable("What was said of each", each),
@@ -161,14 +162,14 @@ def _row(group: str, source: str, own: Sequence[Sat]) -> Row:
     return {
         "hidden": group,
         "records": source,
-        "name in the set": count(lambda s: s.in_set, hidden),
+        "in set": count(lambda s: s.in_set, hidden),
         "alone": count(lambda s: s.alone, hidden),
-        "family right": count(lambda s: s.family, kinds <= {"one", "two", "three", "foreign"}),
-        "causes found": f"{sum(s.found for s in scores)}/{sum(all_hidden)}" if hidden else "-",
-        "wrong at 90 %": ", ".join(f"{len(every) - sum(every)}/{len(every)}" for every in sure),
+        "family": count(lambda s: s.family, kinds <= {"one", "two", "three", "foreign"}),
+        "found": f"{sum(s.found for s in scores)}/{sum(all_hidden)}" if hidden else "-",
+        "wrong": ", ".join(f"{len(every) - sum(every)}/{len(every)}" for every in sure),
         "honest": count(lambda s: s.honest, kinds == {"foreign"}),
         "alarms": count(lambda s: s.alarm, kinds == {"clean"}),
-        "processor time [s]": ", ".join(f"{t:.1f}" for t in times),
+        "s": " ".join(f"{t:.2g}" for t in times),
     }
 
 
