@@ -65,18 +65,19 @@ def families(
     """
     scale = max(limits.temperature, limits.form_of_evidence * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
+    apart = [(place_and_kind(c), c.evidence) for c in corrections if c.evidence > limits.price]
+    most = max([evidence, *(e for family, e in apart if family[1] in own)])
     others: dict[tuple[str, str], float] = {}
-    for c in corrections:
-        family = place_and_kind(c)
-        if family[1] not in own and c.evidence > limits.price:
-            odds = float(np.exp(min((c.evidence - evidence) / scale, 50.0)))
+    for family, each in apart:
+        if family[1] not in own:
+            odds = float(np.exp(min((each - most) / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     listed = 1.0 / (bool(probability) + sum(others.values())) if probability or others else 0.0
     found: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
     for name, p in probability.items():
         if name in places:
             found.setdefault(places[name], {})[name] = p * listed
-    each = (
+    rows = (
         Family(
             *family,
             probability=sum(effects.values()) + others.get(family, 0.0) * listed,
@@ -85,5 +86,5 @@ def families(
         )
         for family, effects in found.items()
     )
-    told = (f for f in each if f.probability > _LEAST)
+    told = (f for f in rows if f.probability > _LEAST)
     return tuple(sorted(told, key=lambda f: -f.probability))

@@ -40,9 +40,12 @@ def test_effects_of_one_place_and_kind_are_one_family() -> None:
 
 
 def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_none() -> None:
-    """With 2 % of 1000 nats as the form, 20 nats less are odds of 1/e."""
+    """With 2 % of 1000 nats as the form, 20 nats less are odds of 1/e.
+
+    Less than the best of the cause's kind, that is, whether listed or not.
+    """
     same = _patch("relaxation", "force", 1100.0)
-    other = _patch("curve", "drive voltage", 980.0)
+    other = _patch("curve", "drive voltage", 1080.0)
     weak = _patch("time", "reading", 5.0)
     found = families({"slow_creep": 1.0}, PLACES, 1000.0, [same, other, weak], LIMITS)
     shares = {(f.place, f.kind): (f.probability, f.not_listed) for f in found}
