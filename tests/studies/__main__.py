@@ -17,6 +17,7 @@ from tests.studies.benchmarks.table import BENCHES, bench
 
 def study(
     name: Annotated[str | None, typer.Argument(help="Name of one benchmark.")] = None,
+    *,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer and smaller cases.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Picture to write, PNG.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="The tables as JSON.")] = None,
@@ -25,6 +26,12 @@ def study(
     ] = None,
     size: Annotated[
         int | None, typer.Option(min=8, help="Number of cases, where a benchmark can vary it.")
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option(help="Pattern of the cases, where a benchmark has named ones.")
+    ] = None,
+    seed: Annotated[
+        list[int] | None, typer.Option(min=0, help="Draw of fresh seeds; several may be given.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -35,7 +42,8 @@ def study(
     if name not in BENCHES:
         raise InputError(f"There is no benchmark '{name}'; there are {', '.join(BENCHES)}.")
     run = bench(name)
-    asked = {k: v for k, v in {"folder": folder, "size": size}.items() if v is not None}
+    options = {"folder": folder, "size": size, "only": only, "seed": seed}
+    asked = {k: v for k, v in options.items() if v is not None}
     for option in asked:
         if option not in signature(run).parameters:
             raise InputError(f"--{option}: '{name}' takes none; the list of benchmarks says which.")

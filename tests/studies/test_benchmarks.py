@@ -20,12 +20,13 @@ from psa_casadi.simulation import device
 from psa_casadi.simulation.simulate import EXACT, STEPPER
 from tests.datasets.test_datasets_one_axis import N as PERIOD
 from tests.studies.__main__ import app
-from tests.studies.benchmarks import changed, fits, floors, mirror, peers, sampling
+from tests.studies.benchmarks import changed, fits, floors, mirror, names, peers, sampling
 from tests.studies.benchmarks import diagnose as study
 from tests.studies.benchmarks import verification as paper
 from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
 from tests.studies.benchmarks.hidden_cases import Case, Found, Kind
 from tests.studies.benchmarks.table import BENCHES, FloatArray, bench
+from tests.studies.exam.marks import Answer, Named, Question
 from tests.tiers import slow
 from tests.voltages import steps
 
@@ -45,6 +46,56 @@ def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
     assert "--folder: 'identify' takes none" in said.stderr.replace("\n", " ")
     with pytest.raises(psa.InputError, match="holds no CSV file"):
         floors.run(silent, False, folder=tmp_path)
+
+
+# ---- names
+
+
+def _sat(case: str, asked: Question, *causes: Named, left: str = "") -> names.Sat:
+    verdict = "cause_named" if causes else "unexplained" if left else "adequate"
+    return names.Sat(case, 0, asked, Answer(verdict, causes, left, 0.6 if left else 0.0), 2.0)
+
+
+def test_names_families_and_probabilities_are_counted() -> None:
+    one = Question("one", (frozenset({"slow_creep"}),))
+    foreign = Question("foreign", (frozenset({"sensor time"}),))
+    found = [
+        _sat("exam/a", one, Named("slow_creep", 0.99, (), "plant relaxation", 0.99)),
+        _sat("tune/b", one, Named("charge_leakage", 0.95, (), "drive relaxation", 0.97)),
+        _sat("tune/c", one, left="plant relaxation"),
+        _sat("tune/d", foreign, Named("backlash", 0.6, (), "plant hysteresis", 0.6)),
+        _sat("tune/e", foreign, Named("offset_drift", 0.6, (), "sensor time", 0.7)),
+        _sat("tune/f", foreign),
+        _sat("tune/g", Question("clean", noise="pink")),
+        _sat("tune/h", Question("clean", noise="pink"), Named("mains_hum", 0.9)),
+    ]
+    figures, reliability, each = names.tables(found)
+    rows = {(row["hidden"], row["records"]): row for row in figures.rows}
+    assert set(rows) == {
+        *(("one cause", source) for source in ("exam", "tune", "all")),
+        ("foreign cause", "tune"), ("clean, odd noise", "tune"), ("all", "all"),
+    }  # fmt: skip
+    causes = rows["one cause", "all"]
+    asked = ("in set", "alone", "family")
+    assert [causes[k] for k in asked] == ["1/3", "1/3", "2/3"]
+    assert (causes["found"], causes["wrong"]) == ("1/3", "1/2, 1/2")
+    assert rows["foreign cause", "tune"]["honest"] == "1/3"
+    assert rows["clean, odd noise", "tune"]["alarms"] == "1/2"
+    assert rows["all", "all"]["wrong"] == "2/3, 1/2"
+    assert [row["names: right"] for row in reliability.rows] == ["-", "0/2", "0/1", "0/1", "1/1"]
+    assert [row["families: right"] for row in reliability.rows] == ["-", "2/3", "-", "0/1", "1/1"]
+    assert len(each.rows) == len(found)
+    own = names.stated(found)["names"]
+    squares = [0.01**2, 0.95**2, 0.6**2, 0.6**2, 0.9**2]
+    assert names.brier_score(own) == pytest.approx(np.mean(squares))
+    logs = [np.log(p) for p in (0.99, 0.05, 0.4, 0.4, 0.1)]
+    assert names.log_score(own) == pytest.approx(-np.mean(logs))
+    assert len(names.picture(found).axes[0].containers) == 7
+
+
+def test_a_pattern_of_names_that_no_case_has_is_told() -> None:
+    with pytest.raises(psa.InputError, match="no case has 'exma/'"):
+        names.run(silent, False, only="exma/")
 
 
 # ---- ensembles

@@ -233,7 +233,7 @@ def _pairs(quick: bool) -> list[tuple[str, psa.Record, psa.Record]]:
     found = [(f"{a.name} against {b.name}", a, b) for a, b in itertools.permutations(cuts, 2)]
     found += [(f"{a.name} against {b.name}", a, b) for a, b in ((sine, loops), (loops, sine))]
     for record in RECORDS:
-        if record.group == "clean":
+        if record.question.group == "clean":
             (whole,) = _records(record)[1]
             first, second = whole.slice(0, whole.n // 2), whole.slice(whole.n // 2, whole.n)
             found.append((f"{record.name}, first half", first, second))

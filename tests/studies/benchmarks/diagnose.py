@@ -275,28 +275,33 @@ def _draw_reliability(axes: Axes, found: Sequence[Found]) -> None:
     """
     axes.plot([0.0, 100.0], [0.0, 100.0], color="0.7", linewidth=0.8, label="right as stated")
     labels = ("the cause is in the table", "with the cases whose own entry was left out")
-    for side, kinds, label, fmt in zip((-1, 1), RELIABILITY, labels, "os", strict=True):
-        colour = f"C{(side + 1) // 2}"
-        for low, high in itertools.pairwise(BINS):
-            own = in_class(found, kinds, low, high)
-            if not own:
-                continue
-            stated, right = 100.0 * np.mean(own, axis=0)
-            ends = binomtest(sum(t for _, t in own), len(own)).proportion_ci(method="wilson")
-            reach = [[right - 100.0 * ends.low], [100.0 * ends.high - right]]
-            place = (float(stated) + 0.4 * side, float(right))
-            axes.errorbar(*place, reach, fmt=fmt, color=colour, capsize=3.0)
-            axes.annotate(
-                f"{sum(t for _, t in own)} of {len(own)}", place, fontsize=8, color=colour,
-                xytext=(8.0 * side, -4.0), textcoords="offset points",
-                ha="left" if side > 0 else "right",
-            )  # fmt: skip
-        axes.plot([], [], marker=fmt, color=colour, linestyle="", label=label)
+    for side, kinds, label in zip((-1, 1), RELIABILITY, labels, strict=True):
+        classes = [in_class(found, kinds, *ends) for ends in itertools.pairwise(BINS)]
+        draw_classes(axes, classes, side, label)
     axes.set(xlim=(-6.0, 112.0), ylim=(-8.0, 108.0))
     axes.set_xlabel("stated probability of an effect, mean of its class, %")
     axes.set_ylabel("it is the cause, % (95 % interval)")
     axes.set_title("How often a stated probability is right")
     axes.legend(loc="upper left", fontsize=8)
+
+
+def draw_classes(
+    axes: Axes, classes: Sequence[Sequence[tuple[float, bool]]], side: int, label: str
+) -> None:
+    """Draw for each class of stated probabilities how many are right [%], with 95 % intervals."""
+    colour, fmt = f"C{(side + 1) // 2}", "os"[(side + 1) // 2]
+    for own in filter(None, classes):
+        stated, right = 100.0 * np.mean(own, axis=0)
+        ends = binomtest(sum(t for _, t in own), len(own)).proportion_ci(method="wilson")
+        reach = [[right - 100.0 * ends.low], [100.0 * ends.high - right]]
+        place = (float(stated) + 0.4 * side, float(right))
+        axes.errorbar(*place, reach, fmt=fmt, color=colour, capsize=3.0)
+        axes.annotate(
+            f"{sum(t for _, t in own)} of {len(own)}", place, fontsize=8, color=colour,
+            xytext=(8.0 * side, -4.0), textcoords="offset points",
+            ha="left" if side > 0 else "right",
+        )  # fmt: skip
+    axes.plot([], [], marker=fmt, color=colour, linestyle="", label=label)
 
 
 #: Further records of a device, and how many of them are held out together.

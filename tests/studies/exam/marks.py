@@ -3,24 +3,28 @@
 A record has one set of accepted names for each hidden cause. A name is a hit if it is in such a
 set, `modal_series` of any order also where `structural_mode` is.
 
-* Clean: `adequate` is right, of a stack that is not Bouc-Wen's also a name of HYSTERESIS, whose
-  form differs from the base model's. A further name beside it, or another alone, is wrong. No name
-  is an alarm, of other hysteresis an honest one.
-* One or two causes: right alone if all are hit and no name has a rival; right in a set if one has,
-  or if a hit is itself the rival of a name; half if one of two is hit. Names of HYSTERESIS count
+* Clean: `adequate` is right, and so is an accepted name (a hum as small as the noise), of a stack
+  that is not Bouc-Wen's also one of HYSTERESIS, whose form differs from the base model's. A further
+  name beside it, or another alone, is wrong. No name is an alarm, of other hysteresis an honest
+  one.
+* One cause or several: right alone if all are hit and no name has a rival; right in a set if one
+  has, or if a hit is itself the rival of a name; half if not all are hit. Names of HYSTERESIS count
   neither way on a stack that is not Bouc-Wen's; any other name is a wrong extra. `adequate` and no
   name at all are marks of their own.
 * Foreign: no name is right, and so is what comes nearest. `adequate` is a miss.
+
+A set may hold families too, "place kind" as in "plant relaxation": what `score` counts beside the
+marks. A family is right if it is in a set, or that of a name in it, or if the name is right.
 
 Where a wrong name has 90 % or more and nothing is right, the mark says so; of a clean record also
 where it is beside a right one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
-from tests.studies.exam.record import Record
-
+Group = Literal["clean", "one", "two", "three", "foreign"]
 #: What the package has for hysteresis of another form than its base model's.
 HYSTERESIS = frozenset(
     {
@@ -42,57 +46,76 @@ WRONG, SURELY = "wrong name", ", 90 % or more"
 
 
 @dataclass(frozen=True)
+class Question:
+    """What is right to say of a record.
+
+    Its group; the accepted names of each hidden cause, of a foreign or clean record what comes
+    nearest; whether its hysteresis is not Bouc-Wen's; its noise where that is not white.
+    """
+
+    group: Group
+    accepted: tuple[frozenset[str], ...] = ()
+    other_hysteresis: bool = False
+    noise: str = ""
+
+
+@dataclass(frozen=True)
 class Named:
-    """A named cause, its probability, and what it cannot be told from."""
+    """A named cause, its probability, what it cannot be told from, and its likeliest family."""
 
     effect: str
     probability: float
     rivals: tuple[str, ...] = ()
+    family: str = ""
+    of_family: float = 0.0
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The verdict of a diagnosis and the causes that it names."""
+    """The verdict, the causes that are named, and the likeliest family of what is left."""
 
     verdict: str
     causes: tuple[Named, ...] = ()
+    left: str = ""
+    of_left: float = 0.0
 
 
-def mark(record: Record, answer: Answer) -> str:
+def mark(asked: Question, answer: Answer) -> str:
     """Return the mark of an answer."""
-    match record.group:
+    match asked.group:
         case "clean":
-            return _clean(record, answer)
+            return _clean(asked, answer)
         case "foreign":
-            return _foreign(record, answer)
+            return _foreign(asked, answer)
         case _:
-            return _hidden(record, answer)
+            return _hidden(asked, answer)
 
 
-def _clean(record: Record, answer: Answer) -> str:
+def _clean(asked: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
         return ADEQUATE
-    other = _other_hysteresis(record)
+    other = asked.other_hysteresis
     if not answer.causes:
         return HONEST if other else ALARM
-    wrong = [c for c in answer.causes if c.effect not in HYSTERESIS]
-    if other and not wrong:
-        return HYSTERESIS_FOUND
-    right = any(c.effect in HYSTERESIS for c in answer.causes)
+    hits = [c for c in answer.causes if _hit_of(c, asked.accepted) is not None]
+    wrong = [c for c in answer.causes if not (c in hits or (other and c.effect in HYSTERESIS))]
+    if not wrong:
+        return NEAREST if hits else HYSTERESIS_FOUND
+    right = len(wrong) < len(answer.causes)
     return (WITH_EXTRA if right else WRONG) + _surely(wrong)
 
 
-def _foreign(record: Record, answer: Answer) -> str:
+def _foreign(asked: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
         return MISSED
     if not answer.causes:
         return RIGHTLY_UNEXPLAINED
-    nearest = frozenset[str]().union(*record.accepted)
+    nearest = frozenset[str]().union(*asked.accepted)
     wrong = [c for c in answer.causes if not _hits(c.effect, nearest)]
     return WRONG + _surely(wrong) if wrong else NEAREST
 
 
-def _hidden(record: Record, answer: Answer) -> str:
+def _hidden(asked: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
         return MISSED
     if not answer.causes:
@@ -100,12 +123,12 @@ def _hidden(record: Record, answer: Answer) -> str:
     found: set[int] = set()
     extra = []
     for cause in answer.causes:
-        hit = _hit_of(cause, record.accepted)
+        hit = _hit_of(cause, asked.accepted)
         if hit is not None:
             found.add(hit)
-        elif not (_other_hysteresis(record) and cause.effect in HYSTERESIS):
+        elif not (asked.other_hysteresis and cause.effect in HYSTERESIS):
             extra.append(cause)
-    if len(found) == len(record.accepted):
+    if len(found) == len(asked.accepted):
         if extra:
             return WITH_EXTRA
         return IN_SET if any(c.rivals for c in answer.causes) else ALONE
@@ -127,9 +150,58 @@ def _hits(name: str, accepted: frozenset[str]) -> bool:
     return name in accepted or (name.startswith("modal_series") and "structural_mode" in accepted)
 
 
-def _other_hysteresis(record: Record) -> bool:
-    return record.stack.hysteresis != "Bouc-Wen"
-
-
 def _surely(wrong: Sequence[Named]) -> str:
     return SURELY if any(c.probability >= SURE for c in wrong) else ""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What an answer adds to the figures of many.
+
+    How many hidden causes are hit; whether all are and no name is wrong: in a set, alone, or by
+    their families, of which one may be that of what is left without a name; whether a foreign cause
+    is answered honestly (no name, or the right one or family), and a clean record with an alarm.
+    `names` and `families` are what is stated: a probability and whether it is right, of every name
+    that counts, or of what is left where there is no name.
+    """
+
+    found: int
+    in_set: bool
+    alone: bool
+    family: bool
+    honest: bool
+    alarm: bool
+    names: tuple[tuple[float, bool], ...]
+    families: tuple[tuple[float, bool], ...]
+
+
+def score(asked: Question, answer: Answer, families: Mapping[str, str]) -> Score:
+    """Return what an answer adds to the figures; `families` has that of each name."""
+    said, sets = mark(asked, answer), asked.accepted
+    wide = [names | {families[n] for n in names if n in families} for names in sets]
+
+    def of_family(family: str) -> int | None:
+        return next((k for k, known in enumerate(wide) if family in known), None)
+
+    neutral = HYSTERESIS if asked.other_hysteresis else frozenset()
+    found, covered, counted = set[int](), {of_family(answer.left)}, []
+    for cause in answer.causes:
+        hit = _hit_of(cause, sets)
+        place = of_family(cause.family) if hit is None else hit
+        if hit is not None:
+            found.add(hit)
+        if place is not None or cause.effect not in neutral:
+            counted.append((cause, place))
+            covered.add(place)
+    right = all(place is not None for _, place in counted)
+    stated = [(c.of_family, c.family) for c, _ in counted] or [(answer.of_left, answer.left)]
+    return Score(
+        found=len(found),
+        in_set=said in (ALONE, IN_SET),
+        alone=said == ALONE,
+        family=right and bool(sets) and covered >= set(range(len(sets))),
+        honest=said != MISSED and right,
+        alarm=said not in (ADEQUATE, HYSTERESIS_FOUND, HONEST, NEAREST),
+        names=tuple((c.probability, any(_hits(c.effect, s) for s in sets)) for c, _ in counted),
+        families=tuple((p, of_family(family) is not None) for p, family in stated if family),
+    )

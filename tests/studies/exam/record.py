@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
+from tests.studies.exam.marks import Group, Question
+
 Floats = NDArray[np.float64]
 Values = tuple[float, ...]
 #: Changes a signal: (signal, further signals, the run, the values of the cause).
@@ -16,7 +18,6 @@ Cause = Callable[..., Floats]
 HysteresisKind = Literal[
     "Bouc-Wen", "Preisach", "relays", "Prandtl-Ishlinskii", "Coleman-Hodgdon", "Duhem"
 ]
-Group = Literal["clean", "one", "two", "foreign"]
 
 #: Two resonances of a stack, unless the record has its own: f_1 [Hz], zeta_1, f_2 [Hz], zeta_2.
 MECHANICS = (6e3, 0.02, 21e3, 0.03)
@@ -85,10 +86,12 @@ class Record:
     accepted: tuple[frozenset[str], ...] = ()
 
     @property
-    def group(self) -> Group:
-        """What kind of question it is."""
+    def question(self) -> Question:
+        """What is right to say of it."""
         groups: dict[str, Group] = {"c": "clean", "k": "one", "t": "two", "f": "foreign"}
-        return groups[self.name[0]]
+        other = self.stack.hysteresis != "Bouc-Wen"
+        colour = "autoregressive" if self.test.colour else ""
+        return Question(groups[self.name[0]], self.accepted, other, colour)
 
     def draws(self, number: int) -> np.random.Generator:
         """Return the random numbers of one part of the simulation."""

@@ -4,7 +4,8 @@ A record is its name and what it says to hide, its stack, its test, the hidden c
 values, and the names that are right for each of them. Stack: hysteresis, stroke, and what is not
 usual. Test: voltage, frequency, rate, samples, lowest and highest voltage, noise, and what is not
 usual. Names: `c` clean stacks of six kinds of hysteresis, `k` what the package lists, in other
-forms, `t` two causes, `f` what the package does not list, with the names of what comes nearest.
+forms, `t` two causes, `f` what the package does not list, with names and families of what comes
+nearest.
 """
 
 from typing import Any
@@ -100,18 +101,21 @@ t05 structural mode + delay | Bouc-Wen 15 lag=0.00015 mechanics=3400,0.03,9000,0
 t06 log creep + preload | Bouc-Wen 32 | staircase 1 200 5000 0 100 0.12
     | log creep 0.012 0.05; contact 0.05 0.5 0.01 | slow_creep; preload_loss
 f01 amplitude-dependent damping | Bouc-Wen 15 lag=0.0001 mechanics=1600,0.01,9000,0.05
-    | steps 80 30000 6000 0 100 0.2 | amplitude damping 0.8
+    | steps 80 30000 6000 0 100 0.2 | amplitude damping 0.8 | plant damping, plant resonance
 f02 stick-slip bursts | Bouc-Wen 40 | triangles 3 600 5000 0 120 0.1 | stick slip 0.004 14
+    | plant hysteresis
 f03 sensor gain drifts | Bouc-Wen 45 | decaying sine 2 300 4500 -100 100 0.12
-    | gain drift 0.07 | ageing
+    | gain drift 0.07 | ageing, sensor changing gain
 f04 bursts of interference | Bouc-Wen 20 | triangle 4 1000 5000 0 100 0.1 | interference 0.012 25
+    | environment time, sensor time
 f05 second device coupled in | Bouc-Wen 38 | decaying sine 3 600 4500 0 120 0.12
-    | second device 0.006 0.61
+    | second device 0.006 0.61 | environment time, plant time, sensor time
 f06 mistuned controller, reference recorded | Bouc-Wen 20 lag=0.0004
     | triangle 12 4000 6000 10 90 0.12 steps=10 | controller 0.15 380 0.0016 | drive_lag
 f07 sample clock drift | Bouc-Wen 38 | multisine 2 800 5000 0 120 0.12 | clock 0.00012
+    | sensor lag, recorder lag
 f08 floor vibration (narrow band) | Bouc-Wen 38 | random reversals 3 300 5000 0 120 0.15
-    | floor vibration 17 0.01 0.0025 | mains_hum
+    | floor vibration 17 0.01 0.0025 | mains_hum, sensor time
 f09 sensor offset steps at an instant | Bouc-Wen 50 | decaying sine 2 400 4000 -100 100 0.12
     | offset step 0.008 0.57 | offset_drift
 """

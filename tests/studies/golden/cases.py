@@ -4,7 +4,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ import psa_casadi as psa
 from tests.any_model import own_models as models
 from tests.any_model import own_plants as plants
 from tests.contract.helpers import done
-from tests.studies.exam.marks import Answer, Named, mark
+from tests.studies.exam.marks import Answer, Group, Named, Question, mark
 from tests.studies.exam.play import write
-from tests.studies.exam.record import Record, Stack, Test
+from tests.studies.exam.record import Record
 from tests.studies.exam.records import RECORDS
 from tests.studies.golden.exports import EXPORTS
 from tests.studies.plants.make import make_record
@@ -41,20 +41,33 @@ class Case:
 # --- what a diagnosis says ---------------------------------------------------------------------
 
 
-def diagnosed(asked: Record | None, *given: Any, **words: Any) -> Row:
-    """Return a diagnosis as text, with its mark where the truth is known (`exam.marks`)."""
+def answered(*given: Any, **words: Any) -> tuple[dict[str, Any], Answer, float]:
+    """Return a diagnosis as it is written, what it names, and its processor time [s]."""
     begin = time.process_time()
     told = psa.diagnose(*given, **words).to_dict()
     seconds = time.process_time() - begin
-    causes = [
-        Named(c["effect"], c["confidence"], tuple(c["cannot_be_told_from"])) for c in told["causes"]
-    ]
+    causes = (
+        Named(c["effect"], c["confidence"], tuple(c["cannot_be_told_from"]), *_family(c))
+        for c in told["causes"]
+    )
+    return told, Answer(told["verdict"], tuple(causes), *_family(told)), seconds
+
+
+def _family(of: dict[str, Any]) -> tuple[str, float]:
+    """Return the likeliest family, place and kind, and its probability."""
+    first = next(iter(of.get("families", ())), None)
+    return (f"{first['place']} {first['kind']}", first["probability"]) if first else ("", 0.0)
+
+
+def diagnosed(asked: Question | None, *given: Any, **words: Any) -> Row:
+    """Return a diagnosis as text, with its mark where the truth is known (`exam.marks`)."""
+    told, answer, seconds = answered(*given, **words)
     base, extended = _errors(told["errors"])
     budget, patch = told["budget"], told.get("patch") or told.get("correction") or {}
     return {
-        "mark": "-" if asked is None else mark(asked, Answer(told["verdict"], tuple(causes))),
+        "mark": "-" if asked is None else mark(asked, answer),
         "verdict": told["verdict"],
-        "causes": " + ".join(_named(c) for c in causes) or "-",
+        "causes": " + ".join(_named(c) for c in answer.causes) or "-",
         "unnamed": patch.get("name") or patch.get("port") or "-",
         "removed": "-" if budget is None else f"{budget['together']['share']:.4f}",
         "base": _numbers(base),
@@ -79,22 +92,21 @@ def _numbers(values: list[float]) -> str:
     return " ".join(f"{v:.6g}" for v in values)
 
 
-def _asked(letter: str, *accepted: str) -> Record:
-    """Return what the marks are given for: of a clean, known, twofold or foreign record."""
-    names = tuple(frozenset({name}) for name in accepted)
-    test = Test("any", 1.0, 1.0, 1, (0.0, 1.0), 0.0)
-    return Record(letter, 0, "", Stack("Bouc-Wen", 1.0), test, accepted=names)
-
-
 # --- exam and study ----------------------------------------------------------------------------
 
+#: What writes a record into a folder, of a draw other than 0 with fresh seeds: what is right to say
+#: of it, and its file.
+Ask = Callable[[Path, int], tuple[Question, Path]]
 
-def _sat(record: Record, folder: Path) -> Row:
+
+def _sat(record: Record, folder: Path, draw: int) -> tuple[Question, Path]:
     path = folder / f"{record.name}.csv"
-    write(record, path)
-    return diagnosed(record, path)
+    write(replace(record, seed=record.seed + _DRAW * draw), path)
+    return record.question, path
 
 
+#: Seeds of one draw are so far from those of the next.
+_DRAW = 10007
 #: Range of the effects' rms over the noise's, after the base's parameters are projected out.
 _RANGES = {"strong": (1.0, 3.0), "weak": (0.1, 0.3), "foreign": (0.3, 3.0)}
 _FIRST_SEED = 990001
@@ -143,12 +155,26 @@ three preload_loss+drive_lag+offset_drift
 """
 
 
-def _studied(kind: str, hidden: tuple[str, ...], how: str, seed: int, folder: Path) -> Row:
+#: Families of the plants' foreign effects, place and kind, that a displacement lets be told.
+_FAMILIES = {
+    "dry_friction": ("plant hysteresis",),
+    "floor_vibration": ("environment time", "sensor time"),
+    "guide_stiffness": ("plant curve",),
+    "dead_zone_hysteresis": ("plant hysteresis",),
+    "cross_axis": ("environment time", "sensor time"),
+    "range_switch": ("sensor curve", "sensor hysteresis"),
+    "source_power": ("sensor changing gain", "environment changing gain"),
+}
+
+
+def _studied(
+    kind: str, hidden: tuple[str, ...], how: str, seed: int, folder: Path, draw: int
+) -> tuple[Question, Path]:
     path = folder / "record.csv"
     wanted = _RANGES.get(kind, _RANGES["strong"])
     make_record(
         hidden[0] if hidden else None,
-        seed,
+        seed + _DRAW * draw,
         path,
         noise="white" if how == "loops" else how,  # type: ignore[arg-type]
         excitation="loops" if how == "loops" else "rich",
@@ -156,17 +182,28 @@ def _studied(kind: str, hidden: tuple[str, ...], how: str, seed: int, folder: Pa
         more=hidden[1:],
         more_visible=wanted if hidden[1:] else None,
     )
-    letter = {"clean": "c", "foreign": "f", "two": "t", "three": "t"}.get(kind, "k")
-    accepted = () if kind == "foreign" else tuple(called(name) for name in hidden)
-    return diagnosed(_asked(letter, *accepted), path)
+    group: Group = "one" if kind in ("strong", "weak") else kind  # type: ignore[assignment]
+    right = (_FAMILIES.get(name, (called(name),)) for name in hidden)
+    noise = "" if how in ("white", "loops") else how
+    return Question(group, tuple(map(frozenset, right)), noise=noise), path
 
 
-def _study() -> Iterator[Case]:
+def _asks() -> Iterator[tuple[str, str, str, Ask]]:
+    """Kind, name, what is hidden, and what writes it."""
+    for record in RECORDS:
+        yield "exam", record.name, record.says, partial(_sat, record)
     for k, line in enumerate(_STUDY.strip().splitlines()):
         kind, causes, how = (*line.split(), "white")[:3]
         hidden = () if causes == "-" else tuple(causes.split("+"))
         work = partial(_studied, kind, hidden, how, _FIRST_SEED + k)
-        yield Case("study", f"{k + 1:02}-{kind}", f"{causes} {how}", work)
+        yield "study", f"{k + 1:02}-{kind}", f"{causes} {how}", work
+
+
+ASKS = {f"{kind}/{name}": ask for kind, name, _, ask in _asks()}
+
+
+def _asked(ask: Ask, folder: Path) -> Row:
+    return diagnosed(*ask(folder, 0))
 
 
 # --- measured records, models of one's own -----------------------------------------------------
@@ -211,9 +248,10 @@ def _own(name: str, folder: Path) -> Row:
     if isinstance(records, list):
         *records, last = records
         words = {**words, "holdout": [last]}
-    letter = {"": "c", "foreign": "f"}.get(hidden, "k")
-    accepted = (hidden,) if letter == "k" else ()
-    return diagnosed(_asked(letter, *accepted), model(), records, **words)
+    groups: dict[str, Group] = {"": "clean", "foreign": "foreign"}
+    group = groups.get(hidden, "one")
+    asked = Question(group, (frozenset({hidden}),) if group == "one" else ())
+    return diagnosed(asked, model(), records, **words)
 
 
 def _identified(folder: Path) -> Row:
@@ -234,9 +272,8 @@ def _identified(folder: Path) -> Row:
 
 
 def _all() -> Iterator[Case]:
-    for record in RECORDS:
-        yield Case("exam", record.name, record.says, partial(_sat, record))
-    yield from _study()
+    for kind, name, hidden, ask in _asks():
+        yield Case(kind, name, hidden, partial(_asked, ask))
     for name, (fitted, held) in _MEASURED.items():
         yield Case("measured", name, "-", partial(_measured, fitted, held))
     for name, (hidden, *_) in _OWN.items():
