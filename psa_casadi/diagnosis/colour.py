@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.identification.fitting.fit import Fit
@@ -15,10 +14,7 @@ from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import filtered, first_order_noise, uncertain
 from psa_casadi.records.repeats import autoregression_of
 from psa_casadi.records.split import Experiment, noise_share
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IndexArray = npt.NDArray[np.int64]
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
 _WHITE = 0.05

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.noise import NoiseFloor
@@ -24,9 +23,7 @@ from psa_casadi.records.drive import drive_frequency
 from psa_casadi.records.noise import lines_in
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import repetitions
-
-FloatArray = npt.NDArray[np.float64]
-IndexArray = npt.NDArray[np.int64]
+from psa_casadi.units import BoolArray, FloatArray
 
 #: Points of the spectrum that are kept; lines that are listed.
 _POINTS, LINES = 300, 6
@@ -158,8 +155,6 @@ def _condensed(frequency: FloatArray, power: FloatArray) -> tuple[FloatArray, Fl
     means = np.add.reduceat(power, starts) / size
     return np.add.reduceat(frequency, starts) / size, np.sqrt(means)
 
-
-BoolArray = npt.NDArray[np.bool_]
 
 #: Fewest periods that are split.
 PERIODS = 3

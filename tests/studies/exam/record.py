@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
-Floats = NDArray[np.float64]
+from psa_casadi.units import FloatArray
+
+Floats = FloatArray
 Values = tuple[float, ...]
 #: Changes a signal: (signal, further signals, the run, the values of the cause).
 Cause = Callable[..., Floats]
