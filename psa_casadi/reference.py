@@ -24,11 +24,10 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from psa_casadi.errors import Problems
+from psa_casadi.units import FloatArray
 
-FloatArray = NDArray[np.float64]
 Signal = Callable[[float], float]
 Mechanics = Literal["cascade", "single_mass"]
 

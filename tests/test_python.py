@@ -16,13 +16,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import psa_casadi as psa
 from psa_casadi.component import OnDemand
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.identification.multistart import identify_ode
 from psa_casadi.records.read.reading import records_given
+from psa_casadi.units import FloatArray
 from tests.any_model.own_models import oscillator
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
@@ -187,7 +187,6 @@ def test_what_is_no_diagnosis_is_not_loaded(tmp_path: Path) -> None:
         psa.load_diagnosis(tmp_path / "none.json")
 
 
-FloatArray = NDArray[np.float64]
 TIMES = np.linspace(0.0, 0.0199, 200)
 WAVE = 40.0 - 40.0 * np.cos(400.0 * TIMES)
 PERIOD = 1e-4

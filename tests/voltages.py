@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 def steps(time: FloatArray, levels: ArrayLike) -> FloatArray:

@@ -21,7 +21,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import residual_colour
@@ -43,8 +42,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray, IndexArray
 
 #: Tones and decay rates that are tried, over the sampling rate.
 _TONES, _DECAYS = np.arange(0.04, 0.501, 0.02), (0.03, 0.06, 0.12, 0.25)
@@ -147,10 +145,10 @@ def _force(fit: Fit, number: int, experiment: Experiment, interval: float) -> Fl
     return change
 
 
-def _places(experiment: Experiment, interval: float) -> npt.NDArray[np.int64]:
+def _places(experiment: Experiment, interval: float) -> IndexArray:
     """Return which of the even samples each sample of a record is, or is next to."""
     time = experiment.record.time
-    found: npt.NDArray[np.int64] = np.rint((time - time[0]) / interval).astype(np.int64)
+    found: IndexArray = np.rint((time - time[0]) / interval).astype(np.int64)
     return found
 
 

@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.identification.fitting.fit import Fit
@@ -15,10 +14,7 @@ from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import filtered, first_order_noise, uncertain
 from psa_casadi.records.repeats import autoregression_of
 from psa_casadi.records.split import Experiment, noise_share
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IndexArray = npt.NDArray[np.int64]
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
 _WHITE = 0.05
@@ -503,9 +499,9 @@ def omnibus(
     Fisher's g for a line in its spectrum; an F test on general features of the voltage and time;
     and is its size the same everywhere? A sensor's noise is, what a colour may have swallowed of a
     misfit is not. Where the colour is the residual's `own`, correlation and size are what it and
-    its jitter are for: the two others remain. `excess` is the share of the residual's power above the noise
-    `floor` [m]; what is seen must be larger than what is `knowable` [m]; `lengths` are the records'
-    numbers of samples.
+    its jitter are for: the two others remain. `excess` is the share of the residual's power above
+    the noise `floor` [m]; what is seen must be larger than what is `knowable` [m]; `lengths` are
+    the records' numbers of samples.
     """
     white = colour.whiten(residual)
     tests: dict[Seen, tuple[float, float]] = {

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.colour import OwnColour, rms
@@ -16,6 +15,7 @@ from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_v
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment, Kind, counts
+from psa_casadi.units import FloatArray
 
 #: Gain [%] of an error that doubles.
 _DOUBLED = -100.0
@@ -65,8 +65,6 @@ def unconfirmed(
         return note("other_quantity")
     return None
 
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Largest held-out errors that do not count (stray readings), the fewest that are tested, and those
 #: of a whole record: fewer do not tell the colour of its noise.

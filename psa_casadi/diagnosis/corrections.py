@@ -24,7 +24,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.held_out import held_out_rms
@@ -40,8 +39,7 @@ from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.start import linear_part
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Relaxations per decade, modes.
 _PER_DECADE, MODES = 2, 24

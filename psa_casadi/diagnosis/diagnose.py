@@ -5,7 +5,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
@@ -60,8 +59,7 @@ from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order
 from psa_casadi.records.suspects import cleaned, masked, suspects
 from psa_casadi.simulation.side_by_side import compiled_ahead, one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: A voltage with less of its variance about a parabola over time is not told from a drift.
 _TREND = 0.05

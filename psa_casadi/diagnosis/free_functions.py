@@ -14,7 +14,6 @@ from math import prod
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.diagnosis.corrections import FreeFunction
@@ -37,9 +36,8 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, true_output
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import Sizes, sizes_of, states_of
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Parameter
-
-FloatArray = npt.NDArray[np.float64]
 
 _OF_SIGNAL, _OF_STATES, _VARIABLES = 5, 3, 3
 #: So many ports are fitted, and with so many evaluations.

@@ -19,21 +19,18 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import Experiment, counted
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Held-out records from which on they are the parts; else so many blocks of each are.
 FEWEST_RECORDS, _BLOCKS = 4, 8
 
 
-def parts_of(*errors: Sequence[FloatArray]) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def parts_of(*errors: Sequence[FloatArray]) -> tuple[FloatArray, IndexArray]:
     """Return sums of squares (parts, models, outputs) and sample counts (parts, outputs).
 
     `errors` holds of every model the held-out errors (n, outputs) of every record, nan where an
@@ -157,7 +154,7 @@ def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
 
 def held_out_parts(
     experiments: Sequence[Experiment], *predicted: Sequence[FloatArray]
-) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+) -> tuple[FloatArray, IndexArray]:
     """Return sums of squares (parts, models) [m^2] and sample counts (parts,) of held-out parts.
 
     The parts are those of `psa_casadi.diagnosis.held_out`.
@@ -298,7 +295,7 @@ class Removed:
         return of, len(counts)
 
 
-def _powers(sums: FloatArray, counts: npt.NDArray[np.int64]) -> FloatArray:
+def _powers(sums: FloatArray, counts: IndexArray) -> FloatArray:
     """Return the mean squares (models, outputs) over parts, 0 for an output without a sample."""
     found: FloatArray = np.sum(sums, axis=0) / np.maximum(np.sum(counts, axis=0), 1)
     return found

@@ -1,10 +1,8 @@
 """What a simulation gets wrong: views, lines and harmonics of one record's residual."""
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.diagnosis.noise import NoiseFloor
@@ -22,18 +20,13 @@ from psa_casadi.diagnosis.views import (
 from psa_casadi.errors import InputError
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.drive import drive_frequency
+from psa_casadi.records.noise import lines_in
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import repetitions
-
-FloatArray = npt.NDArray[np.float64]
-IndexArray = npt.NDArray[np.int64]
+from psa_casadi.units import BoolArray, FloatArray
 
 #: Points of the spectrum that are kept; lines that are listed.
 _POINTS, LINES = 300, 6
-#: A line is one that noise would show in one of so many records.
-_CHANCE = 1e-4
-#: The lowest frequency [1/duration] at which a line can be told from drift; widest surroundings.
-_LOWEST, _WIDEST = 8, 64
 _MAINS = (50.0, 60.0)
 _HARMONICS = 40
 #: The drive moves at a frequency where it has this share of its range.
@@ -109,7 +102,7 @@ def _lines(
     v, _ = _even(record.time, record.voltage)
     moved = 2.0 * np.abs(np.fft.rfft(v * window)) / float(np.sum(window))
     loud = moved > _LOUD * float(np.ptp(record.voltage))
-    peaks, around = _peaks(power)
+    peaks, around = lines_in(power)
     rows = []
     for k in peaks.tolist():
         near = slice(k - 2, k + 3)
@@ -137,28 +130,6 @@ def _even(time: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
     return even, step
 
 
-def _peaks(power: FloatArray) -> tuple[IndexArray, FloatArray]:
-    """Return where a line stands out of its surroundings, and the mean power of those (n,).
-
-    Powers of noise are exponentially distributed, their median ln 2 times their mean.
-    """
-    edges = [_LOWEST]
-    while edges[-1] < power.size:
-        edges.append(edges[-1] + int(np.clip(edges[-1], _LOWEST, _WIDEST)))
-    if len(edges) < 3:
-        return np.zeros(0, dtype=np.int64), np.zeros_like(power)
-    edges = [*edges[:-2], power.size]
-    level = np.array([np.median(power[a:b]) for a, b in pairwise(edges)])
-    centres = 0.5 * (np.array(edges[:-1]) + np.array(edges[1:]))
-    around = np.interp(np.arange(power.size), centres, level / np.log(2.0))
-    # neighbouring powers of a window share noise, and a median of few is uncertain
-    limit = 1.4 * around * (np.log(power.size) - np.log(_CHANCE))
-    inner = np.arange(max(_LOWEST, 3), power.size - 3)
-    highest = np.max([power[inner + d] for d in (-3, -2, -1, 1, 2, 3)], axis=0)
-    found = inner[(power[inner] > limit[inner]) & (power[inner] > highest)]
-    return found[np.argsort(-power[found])[: 4 * LINES]], around
-
-
 def _named(f: float, amplitude: float, drive: float | None, step: float, width: float) -> Line:
     """Return a line with what may have made it: the drive, the mains or its alias, or unknown."""
     near = 1.5 * width
@@ -184,8 +155,6 @@ def _condensed(frequency: FloatArray, power: FloatArray) -> tuple[FloatArray, Fl
     means = np.add.reduceat(power, starts) / size
     return np.add.reduceat(frequency, starts) / size, np.sqrt(means)
 
-
-BoolArray = npt.NDArray[np.bool_]
 
 #: Fewest periods that are split.
 PERIODS = 3

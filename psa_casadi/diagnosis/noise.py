@@ -6,7 +6,6 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour, noise_rms, rms
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
@@ -17,8 +16,8 @@ from psa_casadi.records.noise import first_order_noise, last_place_of, quantum_o
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import MeasuredNoise, holds, repeats
 from psa_casadi.records.split import Experiment
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Source = Literal["repeats", "holds", "fast part"]
 
 #: Fewer samples than this give no level to a few per cent.

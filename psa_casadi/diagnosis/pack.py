@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
@@ -19,8 +18,7 @@ from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import linear_part
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Terms of a static curve.
 _CURVE = 8

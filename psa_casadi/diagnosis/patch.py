@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.diagnosis.corrections import Patch, time_constants
 from psa_casadi.effects.patches import GAIN, PATCHES, RELAXATIONS, weight
@@ -13,8 +12,7 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import POLISH
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 def with_patch(

@@ -18,7 +18,6 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.component import (
@@ -50,8 +49,7 @@ from psa_casadi.simulation.tangent import (
     law_of,
     opened,
 )
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
 _PEAKS, _FINER = 4, 8

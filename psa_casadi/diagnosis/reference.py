@@ -37,7 +37,7 @@ from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 #: Forms that follow the voltage, at their ports. Others go with the time of a record.
 _FORMS = (
@@ -133,7 +133,7 @@ class Healthy:
             found.append([(p - p.mean(axis=0)) * scale for p in parts])
         return found
 
-    def shows(self, record: Record) -> npt.NDArray[np.bool_]:
+    def shows(self, record: Record) -> BoolArray:
         """Return where a record's voltage is as it was in the healthy ones before (n,).
 
         In value, rate and the two last reversals: what a stack remembers of a voltage at least.
@@ -220,7 +220,7 @@ class Since:
     healthy: Healthy
     records: tuple[Record, ...]
     added: tuple[FloatArray, ...]
-    shown: tuple[npt.NDArray[np.bool_], ...]
+    shown: tuple[BoolArray, ...]
     places: int
 
     def taken_off(self, first: int) -> tuple[tuple[Record, ...], tuple[Record, ...]]:

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.signature import STACK, standard_voltage
@@ -32,8 +31,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import accurate, input_samples, output_of, record_inputs
 from psa_casadi.simulation.start import linear_part, start_on
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: When a hold is looked at [s] after its step, and how long the step takes [s].
 _HELD, _STEP = (10.0, 600.0), 0.02

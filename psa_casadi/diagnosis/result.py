@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
@@ -22,8 +21,8 @@ from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.split import Experiment
 from psa_casadi.shown import Reported, frame, made, with_units
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Verdict = Literal[
     "adequate", "cause_named", "partly_explained", "ambiguous", "unexplained", "not_driven"
 ]

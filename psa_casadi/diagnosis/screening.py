@@ -22,15 +22,13 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray, IndexArray
 
 _DRAWS = 4000
 _SEED = 20150810  # of the threshold's simulation: the same data give the same verdict
@@ -309,7 +307,7 @@ class Together:
 
 def _ways(
     trials: Sequence[Direction], gram: FloatArray, sizes: FloatArray, limits: Thresholds
-) -> tuple[dict[str, npt.NDArray[np.int64]], FloatArray, FloatArray]:
+) -> tuple[dict[str, IndexArray], FloatArray, FloatArray]:
     """Return the directions (ways, m) of each effect, what priors add to the gram, and costs.
 
     `gram` is that of unit directions, `sizes` are theirs over the noise level, 0 where the fitted
@@ -333,8 +331,8 @@ def _ways(
 
 def _together(
     trials: Sequence[Direction],
-    own: Sequence[npt.NDArray[np.int64]],
-    places: npt.NDArray[np.int64],
+    own: Sequence[IndexArray],
+    places: IndexArray,
     multiples: FloatArray,
     promise: float,
 ) -> Together:

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component
 from psa_casadi.diagnosis.views import (
@@ -27,8 +26,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.simulate import simulate
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 STACK = "P-885.51"
 #: Period [s] of the slow loops of the standard voltage, for the slow play and the quick one.

@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
@@ -60,6 +59,7 @@ from psa_casadi.records.split import Experiment, counts, loop_sizes
 from psa_casadi.simulation.simulate import simulate_record
 from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
+from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import Interval
 
 
@@ -197,9 +197,6 @@ def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tupl
     return most, 100.0 * most / span
 
 
-FloatArray = npt.NDArray[np.float64]
-
-
 def diagnosed_model(
     fit: Fit,
     experiments: Sequence[Experiment],
@@ -234,7 +231,7 @@ def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
         return None
     errors = errors_of(experiments, predicted)
 
-    def of(kept: npt.NDArray[np.bool_]) -> float:
+    def of(kept: BoolArray) -> float:
         power = float(np.sum(sums[kept])) / max(int(np.sum(counts[kept])), 1)
         return 0.5 * float(np.log(max(power, 1e-300)))
 

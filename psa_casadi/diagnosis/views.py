@@ -3,16 +3,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import correlation_inflation, fast_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import held
-
-FloatArray = npt.NDArray[np.float64]
-IndexArray = npt.NDArray[np.int64]
+from psa_casadi.units import FloatArray, IndexArray
 
 #: Most bins of a view, bins of a decade on a logarithmic axis, fewest samples of a bin.
 BINS, PER_DECADE, FEWEST = 24, 5, 8

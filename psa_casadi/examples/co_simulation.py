@@ -15,11 +15,9 @@ import numpy as np
 from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import psa_casadi as psa
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: The voltage rises by 0.2 V per microsecond; the coupled parts are run for 0.4 ms.
 END, RATE = 4e-4, 2e5

@@ -12,7 +12,6 @@ from pathlib import Path
 import matplotlib.ticker
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import psa_casadi as psa
 from psa_casadi.design.mechanism.loop import Mounting, step_response
@@ -25,8 +24,7 @@ from psa_casadi.design.mechanism.mechanism import (
 )
 from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.examples.co_simulation import Slave
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 END, STEP = 5e-4, 1e-7
 _MOTION = ("displacement", "tip_velocity", "tip_acceleration")

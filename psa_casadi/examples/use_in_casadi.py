@@ -12,11 +12,9 @@ import casadi as ca
 import numpy as np
 from fmpy import extract
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import psa_casadi as psa
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: The path to follow: a smooth rise of 8 um in 0.4 ms, in 20 steps.
 STEPS, SIZE = 20, 2e-5

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.fitting.prediction import predict_record
@@ -18,7 +17,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import autocovariance, convolved
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import Interval
 
 #: A parameter with a standard error above this, in ordinary changes or ln units, is undetermined.
@@ -207,7 +206,7 @@ def record_information(
     *,
     start: Mapping[str, float] | None = None,
     sizes: Mapping[str, float] | None = None,
-    used: npt.NDArray[np.bool_] | None = None,
+    used: BoolArray | None = None,
 ) -> FloatArray:
     """Return J^T (1 - Q Q^T) J / sigma^2 (k, k) for parameter changes in units of `sizes_of`.
 

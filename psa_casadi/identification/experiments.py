@@ -6,7 +6,6 @@ from difflib import get_close_matches
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.model.compose import Model
@@ -16,10 +15,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Hold, Signals, stairs
 from psa_casadi.records.split import Channel, Experiment, divided, whole, without_gaps
 from psa_casadi.records.suspects import suspects_of
-from psa_casadi.units import convert, parse_unit, si_unit
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
+from psa_casadi.units import FloatArray, convert, parse_unit, si_unit
 
 #: Share of an output's range below which no difference between a device and a model is told.
 STRAIGHT = 2e-5

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.noise import runs_of
@@ -12,7 +11,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment
 from psa_casadi.records.suspects import SPIKE
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 
 def noise_found(
@@ -52,7 +51,7 @@ def _holds(record: Record | Signals, e: Experiment) -> bool:
     return bool(record.sha256 == e.record.sha256 and within)
 
 
-def _used(e: Experiment, channel: int) -> npt.NDArray[np.bool_]:
+def _used(e: Experiment, channel: int) -> BoolArray:
     """Return the samples (n,) that are fitted or judged, and outliers that are masked there."""
     used = e.at(channel, e.used | e.held_out)
     for start, stop in runs_of(~used):

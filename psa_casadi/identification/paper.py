@@ -15,7 +15,6 @@ from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.errors import InputError, PsaError
@@ -32,9 +31,7 @@ from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
-from psa_casadi.units import FloatArray
-
-BoolArray = npt.NDArray[np.bool_]
+from psa_casadi.units import BoolArray, ComplexArray, FloatArray, IndexArray
 
 #: How far the voltage may stray from its two levels, and how long the rise may take of the hold.
 _LEVEL, _RISE = 0.05, 0.05
@@ -74,7 +71,7 @@ class Loop:
     sample_time: float
     voltage: FloatArray
     displacement: FloatArray
-    turns: npt.NDArray[np.int64]
+    turns: IndexArray
     frequency: float
     first_volts: float
     missing: int
@@ -277,7 +274,7 @@ def mechanics_of(
     return best, (note("other_zero", b_1=b_1, nearest=zero, ratio=k_P / k_B),)
 
 
-def readings(roots: npt.NDArray[np.complex128]) -> Iterator[tuple[float, ...]]:
+def readings(roots: ComplexArray) -> Iterator[tuple[float, ...]]:
     """Yield tau, m_P/k_P, c_P/k_P, m_B/k_B, c_B/k_B for every way to split five stable roots.
 
     Into a real one and two pairs with real factors; of five roots of a real polynomial one is real,
@@ -292,7 +289,7 @@ def readings(roots: npt.NDArray[np.complex128]) -> Iterator[tuple[float, ...]]:
                 yield float(-1.0 / roots[alone].real), *one, *two
 
 
-def _pair(roots: npt.NDArray[np.complex128]) -> tuple[float, float] | None:
+def _pair(roots: ComplexArray) -> tuple[float, float] | None:
     """Return (m/k, c/k) of (s - s_1)(s - s_2) = 0, None where that is no real polynomial."""
     product, total = roots[0] * roots[1], roots[0] + roots[1]
     size = float(np.max(np.abs(roots)))

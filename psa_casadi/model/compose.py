@@ -5,13 +5,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component, Expression
 from psa_casadi.errors import InputError, quoted
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.structure import Structure, structure_of
 from psa_casadi.shown import Celled
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import (
     Input,
     Parameter,
@@ -116,19 +116,19 @@ class Model(Celled):
         x, u, z = ([v.start for v in group] for group in (s.states, s.inputs, s.sampled))
         return [0.0, x, u, self.parameter_vector(), *([z] if s.sampled else [])]
 
-    def parameter_vector(self) -> npt.NDArray[np.float64]:
+    def parameter_vector(self) -> FloatArray:
         """Return the values as a vector, shape (np,)."""
         return np.array([self.values[n] for n in self.parameter_names])
 
-    def state_nominals(self) -> npt.NDArray[np.float64]:
+    def state_nominals(self) -> FloatArray:
         """Return the usual size of every state, shape (nx,)."""
         return np.array([nominal_value(s.nominal, self.values) for s in self.structure.states])
 
-    def error_sizes(self) -> npt.NDArray[np.float64]:
+    def error_sizes(self) -> FloatArray:
         """Return the size against which an error of every state counts, shape (nx,)."""
         return np.array([nominal_value(s.errs_over, self.values) for s in self.structure.states])
 
-    def output_nominals(self) -> npt.NDArray[np.float64]:
+    def output_nominals(self) -> FloatArray:
         """Return the usual size of every output, shape (ny,)."""
         return np.array([nominal_value(o.nominal, self.values) for o in self.structure.outputs])
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.errors import InputError, Problems, quoted
@@ -12,9 +11,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.parts import compensator_for, part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.model.system import System
-from psa_casadi.units import FloatArray
-
-ComplexArray = npt.NDArray[np.complex128]
+from psa_casadi.units import ComplexArray, FloatArray
 
 #: A mode that is better damped needs no notch.
 _DAMPED = 0.5

@@ -21,14 +21,25 @@ def drive_frequency(record: Record) -> float | None:
     even = np.linspace(record.time[0], record.time[-1], record.n)
     v = np.interp(even, record.time, record.voltage)
     power = np.abs(np.fft.rfft((v - np.mean(v)) * np.hanning(record.n))) ** 2
-    power[0] = 0.0
-    total = float(np.sum(power))
-    if total <= 0:
-        return None
-    peak = int(np.argmax(power))
-    low, high = max(1, peak - _SIDE_LINES), peak + _SIDE_LINES + 1
-    share = float(np.sum(power[low:high])) / total
-    return peak / record.duration if share > _DOMINANT and peak > _SIDE_LINES else None
+    peak = dominant_line(power)
+    return None if peak is None or peak <= _SIDE_LINES else peak / record.duration
+
+
+def dominant_line(power: FloatArray) -> int | None:
+    """Return the line that holds half of a periodogram's power but the mean's, None without any.
+
+    Five neighbours on each side count with it, for modulation.
+    """
+    total = float(np.sum(power[1:]))
+    peak = 1 + int(np.argmax(power[1:]))
+    held = float(np.sum(power[max(1, peak - _SIDE_LINES) : peak + _SIDE_LINES + 1]))
+    return peak if held > _DOMINANT * total else None
+
+
+def is_mains(frequency: float) -> bool:
+    """Whether a frequency [Hz] is that of a mains, or a harmonic of it."""
+    orders = [(round(frequency / mains), mains) for mains in _MAINS]
+    return any(k and abs(frequency - k * mains) < _OFF * frequency for k, mains in orders)
 
 
 def tells_tone(frequency: float, record: Record, *, hum: bool) -> bool:

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import filtered, lag_products
 from psa_casadi.records.noise_spectra import Colour, straightened
-from psa_casadi.units import FloatArray
-
-IntArray = npt.NDArray[np.int64]
+from psa_casadi.units import FloatArray, IndexArray
 
 #: Widths of play operators and of the way after a reversal, over the input's range.
 _PLAYS, _WAYS = (0.05, 0.1, 0.2, 0.4), (0.05, 0.25)
@@ -159,15 +156,11 @@ def period_of(drive: FloatArray) -> float | None:
     return lag + (0.5 * float(low - high) / bend if bend > 0.0 else 0.0)
 
 
-def returning(signal: FloatArray, index: IntArray, period: float) -> FloatArray:
-    """Return what of a signal (m,) at the samples `index` returns with a period [samples]."""
+def returning(signal: FloatArray, index: IndexArray, period: float) -> tuple[FloatArray, float]:
+    """Return what of a signal (m,) at samples `index` returns with a period, and its price."""
     phase = (index / period % 1.0) * _PHASES
     cell = phase.astype(np.int64) % _PHASES
     count = np.bincount(cell, minlength=_PHASES)
     mean = np.bincount(cell, weights=signal, minlength=_PHASES) / np.maximum(count, 1)
-    return np.asarray(np.interp(phase, np.arange(_PHASES) + 0.5, mean, period=_PHASES))
-
-
-def price_of_return(n: int) -> float:
-    """Return the price of what returns with a period in n samples [nats]."""
-    return 0.5 * _PHASES * float(np.log(n))
+    found = np.asarray(np.interp(phase, np.arange(_PHASES) + 0.5, mean, period=_PHASES))
+    return found, 0.5 * _PHASES * float(np.log(signal.size))

@@ -1,6 +1,7 @@
 """The noise floor of a signal, the quantum of its sensor, and small filters."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -66,6 +67,54 @@ def peaks(values: FloatArray, apart: int, most: int) -> IndexArray:
         if all(abs(k - other) >= apart for other in chosen):
             chosen.append(k)
     return np.array(chosen, dtype=np.int64)
+
+
+#: A line is one that noise would show in one of so many records; so many are sought at most.
+_CHANCE, _LINES = 1e-4, 24
+#: The lowest frequency [1/duration] at which a line can be told from drift; widest surroundings.
+_LOWEST, _WIDEST = 8, 64
+
+
+def lines_in(power: FloatArray) -> tuple[IndexArray, FloatArray]:
+    """Return where a line stands out of its surroundings, and the mean power of those (n,).
+
+    `power` (n,) is a periodogram under Hann's window; the strongest line is the first one. Powers
+    of noise are exponentially distributed, their median ln 2 times their mean.
+    """
+    edges = [_LOWEST]
+    while edges[-1] < power.size:
+        edges.append(edges[-1] + int(np.clip(edges[-1], _LOWEST, _WIDEST)))
+    if len(edges) < 3:
+        return np.zeros(0, dtype=np.int64), np.zeros_like(power)
+    edges = [*edges[:-2], power.size]
+    level = np.array([np.median(power[a:b]) for a, b in pairwise(edges)])
+    centres = 0.5 * (np.array(edges[:-1]) + np.array(edges[1:]))
+    around = np.interp(np.arange(power.size), centres, level / np.log(2.0))
+    # neighbouring powers of a window share noise, and a median of few is uncertain
+    limit = 1.4 * around * (np.log(power.size) - np.log(_CHANCE))
+    inner = np.arange(max(_LOWEST, 3), power.size - 3)
+    highest = np.max([power[inner + d] for d in (-3, -2, -1, 1, 2, 3)], axis=0)
+    found = inner[(power[inner] > limit[inner]) & (power[inner] > highest)]
+    return found[np.argsort(-power[found])[:_LINES]], around
+
+
+def growth(squares: FloatArray, sizes: FloatArray) -> tuple[float, float]:
+    """Return the ratio c of a variance s^2 (1 + c x), and by how many nats it is likelier than s^2.
+
+    `squares` (n,) are those of the noise, `sizes` (n,) the x; c is 0 where none gains.
+    """
+    mean = float(np.log(max(float(np.mean(squares)), 1e-300)))
+    best = (0.0, 0.0)
+    for c in _RATIOS:
+        grown = 1.0 + c * sizes
+        level = float(np.log(max(float(np.mean(squares / grown)), 1e-300)))
+        gain = 0.5 * squares.size * (mean - level) - 0.5 * float(np.sum(np.log(grown)))
+        best = max(best, (gain, float(c)))
+    return best[1], best[0]
+
+
+#: Ratios of variances that are tried.
+_RATIOS = np.geomspace(0.02, 2e3, 51)
 
 
 #: Fewer samples of each level than this, on average, show no levels.
@@ -263,3 +312,12 @@ def lag_products(d: FloatArray, lags: int) -> FloatArray:
     found = scipy.fft.irfft(np.abs(scipy.fft.rfft(d, size)) ** 2, size)[: min(lags, d.size)]
     result[: found.size] = found
     return result
+
+
+def forgets(correlation: FloatArray) -> float:
+    """Return the lag from which on correlations (n,) stay below 1/e of the first in size."""
+    size = np.abs(correlation) / max(float(correlation[0]), 1e-300)
+    above = np.flatnonzero(size[:-1] > np.exp(-1.0))
+    last = int(above[-1]) if above.size else 0
+    high, low = size[last : last + 2]
+    return last + float((high - np.exp(-1.0)) / max(high - low, 1e-300))

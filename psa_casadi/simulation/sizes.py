@@ -6,7 +6,6 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.errors import PsaError
@@ -16,8 +15,7 @@ from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import begun
 from psa_casadi.simulation.stepper import run
 from psa_casadi.symbolic import in_turn
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Steps between two samples, and mean ones of a record, beyond which a model is given up.
 _STEPS, _MEAN_STEPS = 3000, 200

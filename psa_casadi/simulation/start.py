@@ -11,15 +11,12 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Expression
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.symbolic import in_turn
-from psa_casadi.units import FloatArray
-
-ComplexArray = npt.NDArray[np.complex128]
+from psa_casadi.units import BoolArray, ComplexArray, FloatArray
 
 _NEWTON_STEPS, _FILTER_STEPS = 30, 8
 #: Sets that one call of a function takes.
@@ -258,9 +255,7 @@ class _Call:
         return self._results
 
 
-def _to_rest(
-    newton: _Call, x: FloatArray, nominal: FloatArray, moves: npt.NDArray[np.bool_]
-) -> None:
+def _to_rest(newton: _Call, x: FloatArray, nominal: FloatArray, moves: BoolArray) -> None:
     """Follow Newton's method from each column of x that moves, in place, to where it ends."""
     moves = moves.copy()
     change = np.where(moves, np.inf, 0.0)

@@ -8,13 +8,12 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from psa_casadi.records.signals import Signals
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 Rates = Callable[[float, Any], list[float]]
 
 

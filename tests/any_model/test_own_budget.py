@@ -5,15 +5,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.stats import binom
 
 from psa_casadi.diagnosis.held_out import Share, removed_from
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Channel, Experiment
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Noise of two outputs in units of their own, and what each of two causes adds to them.
 NOISE = np.array([2e-6, 0.3])

@@ -14,13 +14,13 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 
 import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.cli import main
+from psa_casadi.units import FloatArray
 
-Floats = NDArray[np.float64]
+Floats = FloatArray
 DATA = Path(psa.__file__).parent / "data"
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
@@ -14,8 +13,8 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 FINER, STEP, COUNT = 20, 2e-4, 4000
 NOISE = 4e-9
 FREE = ["k_L", "A", "beta", "gamma", "c_P", "m_P"]

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.components import BASE
@@ -21,11 +20,11 @@ from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, split
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
 from tests.studies.plants.again import play_again
 from tests.studies.plants.make import make_record
 from tests.tiers import slow, slow_but
 
-FloatArray = NDArray[np.float64]
 SAMPLES, LEVEL = 2000, 2e-8
 TIME = np.linspace(0.0, 1e-3 * (SAMPLES - 1), SAMPLES)
 

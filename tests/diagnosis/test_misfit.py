@@ -2,16 +2,14 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.errors import InputError
 from psa_casadi.records import Record, excitation
+from psa_casadi.units import FloatArray
 from tests.voltages import steps
-
-FloatArray = NDArray[np.float64]
 
 NOISE = 1e-8
 STEP = 1e-3

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.diagnosis.result import Cause
 from psa_casadi.diagnosis.verdict import next_experiment, useful_records
 from psa_casadi.records.record import Record
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 def _record(knots: list[tuple[float, float]]) -> Record:

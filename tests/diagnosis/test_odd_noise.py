@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 import psa_casadi as psa
+from psa_casadi.units import FloatArray
 from tests.studies.plants.make import make_record
 from tests.tiers import slow_but
-
-FloatArray = NDArray[np.float64]
 
 
 def _pink(y: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.polynomial import Legendre
-from numpy.typing import NDArray
 
 import psa_casadi as psa
 from psa_casadi.component import Component
@@ -38,14 +37,13 @@ from psa_casadi.simulation.compiler import functions_of
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import Steps, run
+from psa_casadi.units import FloatArray
 from tests.export.modelica_runs import right_side_error
 from tests.model.random_models import random_model, random_point
 from tests.model.stack_models import LINEAR, stack
 from tests.studies.plants.ceramic import play
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 #: The stack without its lags, so that slow drives are quasi-static to 1e-3.
 QUICK = {"tau": 1e-6, "R_s": 0.1, "delta": 0.0}

@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import rumoca
-from numpy.typing import NDArray
 
 import psa_casadi as psa
 from psa_casadi.export.modelica.package import modelica_text
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 _SAMPLES = 200
 #: The connectors and parts of Modelica's library that the wired example names, in our own words.

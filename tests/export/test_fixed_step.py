@@ -42,10 +42,11 @@ from psa_casadi.simulation.compiler import (
     shared_library,
     zig_command,
 )
+from psa_casadi.units import FloatArray
 from tests.export.c_host.build import HEADERS, HERE
 from tests.export.fmu_models import files_inside, rewritten
 from tests.model.stack_models import stack
-from tests.simulation.exact_cases import FEEDBACK, JUMP, KINK, FloatArray, error, with_effect
+from tests.simulation.exact_cases import FEEDBACK, JUMP, KINK, error, with_effect
 from tests.tiers import slow, slow_but
 
 STEP = 1e-5

@@ -17,7 +17,6 @@ from xml.etree import ElementTree as ET
 import casadi as ca
 import matplotlib.image
 import numpy as np
-import numpy.typing as npt
 import pytest
 from lxml import etree  # type: ignore[import-untyped]
 
@@ -48,6 +47,7 @@ from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.model_file import save_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
 from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Publication
 from tests.contract.helpers import done, refused
 from tests.export.fmu_models import assert_valid, entries, exported, model_named, rewritten
@@ -299,7 +299,7 @@ def test_kinds_of_dependence() -> None:
     assert found["output", 1] == {state: "constant"}
 
 
-Table = Mapping[str, npt.NDArray[np.float64]]
+Table = Mapping[str, FloatArray]
 
 
 def table(content: bytes) -> Table:

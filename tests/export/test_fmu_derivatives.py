@@ -14,7 +14,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from psa_casadi.export.common.variable_table import variable_table
@@ -26,12 +25,11 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.model.compose import Model
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.fmi3_instances import Instance3, Update, loaded
 from tests.export.fmu_models import exported, model_named
 from tests.tiers import slow_but
-
-FloatArray = npt.NDArray[np.float64]
 
 MODELS = ["P-885.51", "PTBS200", "manipulator", "slow_creep"]
 #: Central differences of eighth order: f'(x) h is the sum of c_k (f(x + k h) - f(x - k h))

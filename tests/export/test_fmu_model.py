@@ -11,7 +11,6 @@ from pathlib import Path
 import casadi as ca
 import fmpy
 import numpy as np
-import numpy.typing as npt
 import pytest
 from fmpy.fmi2 import FMU2Model
 from scipy.integrate import solve_ivp
@@ -21,6 +20,7 @@ from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import start_state
+from psa_casadi.units import FloatArray
 
 _FOLDER = tempfile.TemporaryDirectory()
 _SOURCES = Path(__file__).parent / "pendulum"
@@ -57,7 +57,6 @@ def _binary() -> Path:
     return library
 
 
-FloatArray = npt.NDArray[np.float64]
 FREE = {"length": (0.1, 5.0), "damping": (1e-3, 1.0)}
 TRUE = {"length": 0.62, "damping": 0.11}
 AT = (0.3, -0.7)

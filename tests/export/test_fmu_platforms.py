@@ -24,6 +24,7 @@ from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.platforms import PLATFORMS
 from psa_casadi.export.fmu.sources import exported_texts
 from psa_casadi.simulation.compiler import OPTIMISE, zig_command
+from psa_casadi.units import FloatArray
 from tests.export.c_host.build import (
     EMULATED,
     HEADERS,
@@ -31,7 +32,6 @@ from tests.export.c_host.build import (
     STACK,
     STEPS,
     VERSIONS,
-    FloatArray,
     Runner,
     binary,
     emulated,

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, reject, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi.export.modelica.expression import Graph, Printer
 from psa_casadi.export.modelica.package import modelica_text, reciprocal
+from psa_casadi.units import FloatArray
 from tests.contract.helpers import done
 from tests.export.modelica_runs import (
     STUB,
@@ -123,8 +123,6 @@ def test_the_text_says_whether_the_states_rest_at_the_start(start: float, rests:
     assert ("states start at rest." in text) == rests
     assert ("states start at their start values" in text) != rests
 
-
-FloatArray = NDArray[np.float64]
 
 _WIRED = "PiezoStack.Examples.Wired"
 

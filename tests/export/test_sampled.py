@@ -23,6 +23,7 @@ from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Input, Output, Parameter, State
 from tests.export.fmu_models import exported
 from tests.export.modelica_runs import load
@@ -31,7 +32,6 @@ from tests.model.sampled_models import (
     CONTROLLER,
     PERIOD,
     PLANT,
-    FloatArray,
     controller,
     expected,
     grid,

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.components import BASE
 from psa_casadi.identification.fitting.fit import fit
@@ -17,10 +16,9 @@ from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.split import whole
+from psa_casadi.units import FloatArray
 from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.stack import Stack, loop_width
-
-FloatArray = NDArray[np.float64]
 
 
 @cache

@@ -3,7 +3,6 @@
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -11,10 +10,9 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.simulate import simulate
+from psa_casadi.units import FloatArray
 from tests.model.stack_models import stack
 from tests.studies.benchmarks.records import LOOP_FREQUENCIES, loop_voltage
-
-FloatArray = NDArray[np.float64]
 
 NOISE = 1e-3  # of the stroke
 LOOP = ("k_L", "A", "beta", "gamma", "delta", "n")

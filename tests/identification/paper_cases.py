@@ -4,14 +4,12 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi import reference
 from psa_casadi.identification.start.linear_response import mechanics_poles, numerator_time
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, sine, time_grid
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import ComplexArray, FloatArray
 
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}
 #: A loop that leads, for which the paper's own condition gamma > beta holds (over k_L).
@@ -26,12 +24,12 @@ def compliance(p: dict[str, float]) -> float:
     return 1.0 / p["k_P"] + 1.0 / p["k_B"]
 
 
-def poles(p: dict[str, float]) -> NDArray[np.complex128]:
+def poles(p: dict[str, float]) -> ComplexArray:
     parts = [np.roots([p[f"m_{q}"], p[f"c_{q}"], p[f"k_{q}"]]) for q in "PB"]
     return np.concatenate([[-1.0 / p["tau"]], *parts]).astype(np.complex128)
 
 
-def residues(p: dict[str, float]) -> NDArray[np.complex128]:
+def residues(p: dict[str, float]) -> ComplexArray:
     """Return r_i of the step response 1 + sum r_i e^(p_i t), by the limit (s - p_i) G(s)/s."""
     found = []
     for k, pole in enumerate(poles(p)):
@@ -118,11 +116,11 @@ def noisy(record: Record, share: float) -> Record:
     return changed(record, x + share * record.range_m * draw)
 
 
-def transfer(theta: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+def transfer(theta: FloatArray, frequency: FloatArray) -> ComplexArray:
     """Return X/U at the frequencies [Hz], shape (k,), gain 1 at rest."""
     s = 2j * np.pi * frequency
     whole = np.append(mechanics_poles(theta), -np.exp(-theta[0]))
-    found: NDArray[np.complex128] = (1.0 + numerator_time(theta) * s) / np.prod(
+    found: ComplexArray = (1.0 + numerator_time(theta) * s) / np.prod(
         1.0 - s[:, None] / whole, axis=1
     )
     return found

@@ -9,7 +9,8 @@ from psa_casadi.identification.combinations import Combination, free_combination
 from psa_casadi.identification.determinacy import Determinacy, covariance_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import simulate
-from tests.identification.loop_fits import FREE, LOOP, FloatArray, loops
+from psa_casadi.units import FloatArray
+from tests.identification.loop_fits import FREE, LOOP, loops
 from tests.model.stack_models import stack
 
 UNITS_OF_FORCE = ("N/V", "N/(V.s)", "N", "kg", "N.s/m", "N/m")

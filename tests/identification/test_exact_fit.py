@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
@@ -18,10 +17,9 @@ from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.simulate import EXACT, STEPPER, Way, simulate
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from tests.identification.test_fit import model_with
 from tests.simulation.exact_cases import OUTPUT, composite, inputs, times, with_effect
-
-FloatArray = NDArray[np.float64]
 
 SIGMA, SAMPLES, STEP = 2e-8, 300, 2e-3
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
@@ -21,9 +20,8 @@ from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, divided, whole
 from psa_casadi.simulation.simulate import Way, simulate
 from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.units import FloatArray
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 SIGMA = 2e-8
 

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
+from psa_casadi.units import FloatArray
 
-FloatArray = NDArray[np.float64]
 Pair = tuple[FloatArray, FloatArray]
 
 OPEN = (np.full(2, -np.inf), np.full(2, np.inf))

@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from psa_casadi.effects import EFFECTS
@@ -20,8 +19,7 @@ from psa_casadi.records.split import Experiment, whole
 from psa_casadi.report.plots.findings import profile_plot
 from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.simulation.simulate import simulate
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 SIGMA = 2e-8
 #: The lags of wafers and bonding layers are far below the sampling: a tenth and less of it.

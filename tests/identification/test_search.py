@@ -7,18 +7,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.coverage import one_run
 from tests.studies.benchmarks.records import clean_loops, with_noise
 from tests.tiers import slow
-
-FloatArray = NDArray[np.float64]
 
 pytestmark = pytest.mark.xdist_group("search")
 

@@ -4,12 +4,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 import psa_casadi as psa
-
-FloatArray = NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 PERIOD, LAG, GAIN, PROPORTIONAL, INTEGRAL = 1e-3, 4e-3, 2.0, 0.6, 150.0
 

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 import psa_casadi as psa
@@ -17,7 +16,7 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.nanopositioner import (
     positioner_plant,
 )
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.modelica_runs import simulated
 from tests.studies.benchmarks.nonlinearity import Controller, simulate_positioner
@@ -48,7 +47,7 @@ def _line_deviation(x: FloatArray, y: FloatArray) -> float:
     return float(np.abs(left).max() / np.ptp(y))
 
 
-def _two_periods(frequency: float) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+def _two_periods(frequency: float) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return times, a sine from 0 to 1 that starts at rest, and which samples are the second."""
     t = np.linspace(0.0, 2.0 / frequency, 801)
     return t, 0.5 * (1.0 - np.cos(2.0 * np.pi * frequency * t)), t >= 1.0 / frequency

@@ -18,6 +18,7 @@ from psa_casadi.report.words.fit_words import residual_sentence
 from psa_casadi.report.words.phrases import Scale, number, probability_text
 from psa_casadi.report.words.tables import check_table
 from psa_casadi.report.words.text import check_sentence
+from psa_casadi.units import FloatArray
 from tests.report.html_page import Page, figures, numbers, written
 from tests.report.report_cases import NOISE, diagnosis, long_fit
 from tests.tiers import slow, slow_but
@@ -160,11 +161,11 @@ def test_single_precision_is_used_only_where_nobody_can_see_it() -> None:
     assert series.compact(np.full(3, np.nan)).shape == (3,)
 
 
-def white(samples: int, seed: int = 0) -> series.FloatArray:
+def white(samples: int, seed: int = 0) -> FloatArray:
     return np.random.default_rng(seed).standard_normal(samples)
 
 
-def figures_of(residual: series.FloatArray) -> series.ResidualFigures:
+def figures_of(residual: FloatArray) -> series.ResidualFigures:
     time = np.arange(len(residual)) / 1000.0
     model, none = np.sin(time) * 1e-5, np.zeros(len(time), dtype=bool)
     curve = series.Curve("model", "#0072b2", model)
@@ -207,7 +208,7 @@ _SKEWED, _HEAVY = _RNG.exponential(size=20_000) - 1.0, _RNG.laplace(size=20_000)
     ],
 )
 def test_a_residual_is_called_what_it_is(
-    residual: series.FloatArray, figure: str, wanted: tuple[float, float], said: str
+    residual: FloatArray, figure: str, wanted: tuple[float, float], said: str
 ) -> None:
     found = figures_of(residual)
     assert getattr(found, figure) == pytest.approx(wanted[0], abs=wanted[1])

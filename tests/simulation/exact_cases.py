@@ -4,17 +4,15 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from psa_casadi.component import Component, Equations
 from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Parameter, State
 from tests.model.stack_models import at_ordinary_size, stack
-
-FloatArray = NDArray[np.float64]
 
 OUTPUT = "measured_displacement"
 #: Five voltages over rated voltage, as functions of the share of the record.

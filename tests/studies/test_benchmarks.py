@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
@@ -18,6 +17,7 @@ from psa_casadi.records import time_grid
 from psa_casadi.records.split import split
 from psa_casadi.simulation import device
 from psa_casadi.simulation.simulate import EXACT, STEPPER
+from psa_casadi.units import ComplexArray, FloatArray
 from tests.datasets.test_datasets_one_axis import N as PERIOD
 from tests.studies.__main__ import app
 from tests.studies.benchmarks import changed, fits, floors, mirror, names, peers, sampling
@@ -25,7 +25,7 @@ from tests.studies.benchmarks import diagnose as study
 from tests.studies.benchmarks import verification as paper
 from tests.studies.benchmarks.floor_fit import HISTORIES, Part, floor_of, play, ridge
 from tests.studies.benchmarks.hidden_cases import Case, Found, Kind
-from tests.studies.benchmarks.table import BENCHES, FloatArray, bench
+from tests.studies.benchmarks.table import BENCHES, bench
 from tests.studies.exam.marks import Answer, Named, Question
 from tests.tiers import slow
 from tests.voltages import steps
@@ -321,9 +321,7 @@ def structure(softer: float = -0.03) -> mirror.Modes:
     return mirror.Modes(tuple(modes), rng.normal(size=(3, 3)), 5e-5, 0.2)
 
 
-def response_of(
-    found: mirror.Modes, frequency: FloatArray, amplitude: float
-) -> npt.NDArray[np.complex128]:
+def response_of(found: mirror.Modes, frequency: FloatArray, amplitude: float) -> ComplexArray:
     """Return displacement over voltage (lines, 3, 3) [m/V] of voltages held between samples."""
     above, whole = amplitude - mirror.MIDDLE, np.zeros((len(frequency), 3, 3), dtype=np.complex128)
     for n in range(-20, 21):  # what steps drive beside the line itself, and samples show as it

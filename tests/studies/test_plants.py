@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from psa_casadi.cli.demo import HIDDEN
+from psa_casadi.units import FloatArray
 from tests.studies.plants.base import (
     SUB_INTERVALS,
     Run,
@@ -17,7 +18,7 @@ from tests.studies.plants.effect import HiddenEffect
 from tests.studies.plants.excitations import draw_voltage
 from tests.studies.plants.hide import RATIO
 from tests.studies.plants.make import HEADER, make_demo, make_record
-from tests.studies.plants.stack import FloatArray, Stack, draw_stack
+from tests.studies.plants.stack import Stack, draw_stack
 from tests.studies.plants.table import HIDDEN_EFFECTS
 from tests.tiers import slow_but
 

@@ -13,13 +13,10 @@ and Zhu 2015, eqs. 10, 44, 45; eqs. 39 to 43 print m_P/4 for two different masse
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.units import FloatArray
-
-ComplexArray = npt.NDArray[np.complex128]
+from psa_casadi.units import ComplexArray, FloatArray
 
 #: Where a mechanism acts.
 ACTS_ON = ("wafers", "tip")

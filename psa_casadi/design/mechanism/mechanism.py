@@ -8,7 +8,6 @@ import numpy as np
 
 from psa_casadi.components.surroundings import PRESTRESS_MECHANISM, PRESTRESS_MOUNTS, PRESTRESS_PORT
 from psa_casadi.design.mechanism.loop import (
-    ComplexArray,
     Mechanics,
     Mounting,
     bandwidth,
@@ -22,7 +21,7 @@ from psa_casadi.design.mechanism.loop import (
 from psa_casadi.design.mechanism.search import Limits, Wish, search
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.units import FloatArray
+from psa_casadi.units import ComplexArray, FloatArray
 from psa_casadi.variables import Provenance
 
 

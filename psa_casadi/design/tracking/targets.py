@@ -6,7 +6,6 @@ from math import inf
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
@@ -16,7 +15,7 @@ from psa_casadi.records.read.samples import Request
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import linear_part, start_state
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray, parse_unit, to_si
+from psa_casadi.units import BoolArray, FloatArray, parse_unit, to_si
 
 #: Fewest samples of a path.
 _FEWEST = 10
@@ -313,8 +312,6 @@ def move_ends(
     problems.raise_if_any()
     return float(np.clip(rest, limits.min_voltage, limits.max_voltage)), start
 
-
-BoolArray = npt.NDArray[np.bool_]
 
 #: Share of the largest current that a held voltage aims at: the lag's own part needs the rest.
 _CURRENT = 0.98

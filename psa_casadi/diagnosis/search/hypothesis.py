@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import (
@@ -39,8 +38,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.timings import stage
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.pack import Task
@@ -36,8 +35,7 @@ from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import accurate, record_inputs
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.timings import stage
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 #: Samples of all records from which modes are read off; evaluations of the fit.
 _ENOUGH, _EVALUATIONS = 20_000, 20

@@ -3,9 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-import numpy.typing as npt
-
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Omnibus
 from psa_casadi.diagnosis.pack import STACK, Task
@@ -37,8 +34,7 @@ from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
-
-FloatArray = npt.NDArray[np.float64]
+from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,12 @@ from xml.etree import ElementTree as ET
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.characters import check_text
 from psa_casadi.component import Expression
 from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model
-from psa_casadi.units import Unit
+from psa_casadi.units import FloatArray, Unit
 from psa_casadi.version import __version__
 
 _FORCE_SCALE = {
@@ -60,7 +59,7 @@ def time_scale(model: Model) -> float:
     return max(float(4.0 / ordinary.min()) if ordinary.size else 1.0, sampled)
 
 
-def at_rest(model: Model, expression: Expression) -> npt.NDArray[np.float64]:
+def at_rest(model: Model, expression: Expression) -> FloatArray:
     """Return the value of an expression of the model where time, states and inputs are 0."""
     s = model.structure
     zeros = [np.zeros(len(part)) for part in (s.states, s.inputs)]

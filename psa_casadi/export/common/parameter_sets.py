@@ -15,11 +15,10 @@ from collections.abc import Mapping, Sequence
 from statistics import NormalDist
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.export.common.markup import base_unit, generation_tool, number, xml_text
 from psa_casadi.model.compose import Model
-from psa_casadi.units import parse_unit
+from psa_casadi.units import FloatArray, parse_unit
 
 #: Name, meaning, value and unit of a parameter.
 Row = tuple[str, str, float, str]
@@ -69,7 +68,6 @@ def set_text(name: str, rows: Sequence[Row]) -> str:
     )
 
 
-FloatArray = npt.NDArray[np.float64]
 Sets = Mapping[str, Mapping[str, float]]
 
 #: Random samples unless told otherwise, and the most.

@@ -22,13 +22,14 @@ from psa_casadi.export.common.publication import code_license, refuse_foreign
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fixed_step import code
 from psa_casadi.export.fixed_step.code import PRECISIONS, CodePlan, Precision, probe_code
-from psa_casadi.export.fixed_step.step import FloatArray, step_of
+from psa_casadi.export.fixed_step.step import step_of
 from psa_casadi.files import atomic_write, make_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.simulate import output_of
 from psa_casadi.simulation.stepper import SimulationError, run
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 
 #: Steps of a reference voltage.

@@ -22,13 +22,13 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from psa_casadi.component import Expression
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
 from psa_casadi.simulation.exact.split import Split, closure, jumping, split_of
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Input
 
 #: Shortest leg over a step: below it a rate has no meaning, and nothing happens.
@@ -191,9 +191,6 @@ def solved(a: Expression, b: Expression) -> Expression:
         known = sum((rows[k][j] * x[j] for j in range(k + 1, n)), ca.SX(0))
         x[k] = (rows[k][n] - known) / rows[k][k]
     return ca.vertcat(*x)
-
-
-FloatArray = npt.NDArray[np.float64]
 
 
 def _responses(

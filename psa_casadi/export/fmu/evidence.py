@@ -10,7 +10,6 @@ from dataclasses import replace
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.characters import check_text
 from psa_casadi.components.outputs import OUTPUT, VALIDITY, VALIDITY_WITH_TEMPERATURE
@@ -35,6 +34,7 @@ from psa_casadi.model.evidence import (
     ReferenceRun,
 )
 from psa_casadi.simulation.stepper import run
+from psa_casadi.units import FloatArray
 
 
 def with_validity(model: Model) -> Model:
@@ -76,8 +76,6 @@ def seen_inputs(model: Model) -> list[tuple[float, float, float]]:
         rows.append((low, high, seen.rate if seen and name == "voltage" else math.inf))
     return rows
 
-
-FloatArray = npt.NDArray[np.float64]
 
 PAGE = "documentation/evidence.html"
 META_DATA = "extra/org.ssp-standard.ssp-traceability.srmd/resourceMetaData.srmd"

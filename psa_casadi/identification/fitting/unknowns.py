@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import State, nominal_value
 
 #: Standard deviations of the weak priors: in natural logarithms, and in ordinary changes.
@@ -50,7 +49,7 @@ class Unknowns:
     started: tuple[tuple[str, ...], ...]
     reference: FloatArray
     scale: FloatArray
-    log: npt.NDArray[np.bool_]
+    log: BoolArray
     low: FloatArray
     high: FloatArray
     start_scale: tuple[FloatArray, ...]

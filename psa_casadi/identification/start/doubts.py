@@ -10,7 +10,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 #: Numbers whose squares would overflow.
 _LARGEST = 1e30
@@ -249,7 +249,7 @@ def doubtful_quantity(records: Sequence[Record]) -> str:
 
 
 def _readings(record: Record) -> tuple[FloatArray, FloatArray]:
-    mask: NDArray[np.bool_] = record.mask
+    mask: BoolArray = record.mask
     return measured(record)[mask], record.voltage[mask]
 
 

@@ -36,9 +36,7 @@ import numpy.typing as npt
 import scipy
 
 from psa_casadi.records.noise import filtered
-from psa_casadi.units import FloatArray
-
-ComplexArray = npt.NDArray[np.complex128]
+from psa_casadi.units import BoolArray, ComplexArray, FloatArray
 
 #: Least relative distance of two poles.
 _APART = 3e-3
@@ -195,7 +193,7 @@ class Response:
     h: float
     w: FloatArray
     y: FloatArray
-    valid: npt.NDArray[np.bool_]
+    valid: BoolArray
     sigma: float
 
 
@@ -305,7 +303,7 @@ class Shaken:
 
     drive: FloatArray
     residual: FloatArray
-    used: npt.NDArray[np.bool_]
+    used: BoolArray
     sample_time: float
 
 

@@ -24,13 +24,11 @@ from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.components import BASE
 from psa_casadi.identification.fitting.levenberg_marquardt import minimise
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.start.linear_response import (
-    ComplexArray,
     Response,
     contributions,
     first_order,
@@ -46,9 +44,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
-
-BoolArray = npt.NDArray[np.bool_]
+from psa_casadi.units import BoolArray, ComplexArray, FloatArray, IndexArray
 
 #: Samples that all excerpts together may have, and that one may.
 SAMPLES, MOST = 8_000, 4_000
@@ -260,8 +256,6 @@ def fastest_part(v: FloatArray, length: int) -> int:
     best = int(np.flatnonzero(inside >= (1.0 - 1e-9) * inside.max())[-1])
     return max(best - length // 50, 0)
 
-
-IndexArray = npt.NDArray[np.intp]
 
 #: Names of the coordinates: natural logarithms of times T, tau, a, of squares of times q, and of
 #: r = k_P/k_B, as in `linear_response`.

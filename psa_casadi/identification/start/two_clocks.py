@@ -22,12 +22,11 @@ from dataclasses import dataclass, replace
 from math import ceil, floor
 
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.identification.start.linear_response import first_order, orthonormal, plays
 from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
+from psa_casadi.units import BoolArray, FloatArray
 
 #: Beats that a record may hold; phases that are tried, and how much finer than 1/T the rates.
 FEWEST, MOST = 2.0, 24.0
@@ -140,7 +139,7 @@ class Delays:
         return best[1]
 
     def _fitted(
-        self, columns: FloatArray, part: slice | npt.NDArray[np.bool_] = slice(None)
+        self, columns: FloatArray, part: slice | BoolArray = slice(None)
     ) -> tuple[float, float, float]:
         """Return the first column's weight, its variance per scatter, and the squares left."""
         root = np.sqrt(self.weight[part])
@@ -267,7 +266,7 @@ def two_clocks(record: Record) -> TwoClocks | None:
 
 
 def _delays(
-    along: FloatArray, rate: FloatArray, left: FloatArray, valid: npt.NDArray[np.bool_]
+    along: FloatArray, rate: FloatArray, left: FloatArray, valid: BoolArray
 ) -> tuple[Delays | None, Delays]:
     """Return the delays of intervals, and those of single readings, weighted as their intervals.
 

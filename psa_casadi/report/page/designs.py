@@ -28,7 +28,7 @@ from psa_casadi.report.words.phrases import (
     plain,
     prefixed_scale,
 )
-from psa_casadi.report.words.series import FloatArray
+from psa_casadi.units import FloatArray
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
 _HEIGHT, _MOST_POINTS = 360, 4000

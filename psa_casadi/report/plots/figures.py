@@ -28,7 +28,6 @@ from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
 from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.series import (
-    FloatArray,
     Series,
     most_telling,
     series_of,
@@ -38,7 +37,7 @@ from psa_casadi.report.words.series import (
 )
 from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
-from psa_casadi.units import convert
+from psa_casadi.units import FloatArray, convert
 
 Compared = Diagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals

@@ -16,8 +16,8 @@ from psa_casadi.report.plots.panel import Panel, logarithmic
 from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
 from psa_casadi.report.words.misfit_words import AXES
-from psa_casadi.report.words.series import FloatArray, bar_colour
-from psa_casadi.units import convert
+from psa_casadi.report.words.series import bar_colour
+from psa_casadi.units import FloatArray, convert
 
 _DEGREE_COLOURS: dict[Degree, str] = {
     "determined": colours.EXTENDED,

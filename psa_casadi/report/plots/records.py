@@ -5,9 +5,9 @@ import numpy as np
 from psa_casadi.report.plots.panel import Panel, logarithmic, stacked
 from psa_casadi.report.words import colours, series
 from psa_casadi.report.words.phrases import in_brackets
-from psa_casadi.units import FloatArray
+from psa_casadi.units import FloatArray, IndexArray
 
-Samples = slice | series.IndexArray
+Samples = slice | IndexArray
 
 #: Points of a part of a record, measured samples shown one by one, and of a spectrum.
 _ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
@@ -16,7 +16,7 @@ _FULL = 500
 _FAR = 6.0
 
 
-def samples(s: series.Series, limit: int) -> series.IndexArray:
+def samples(s: series.Series, limit: int) -> IndexArray:
     """Return the samples of a record that plots over all of it show.
 
     They are the same in all of them: so the page holds each curve once.

@@ -16,10 +16,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, phrases
-
-FloatArray = npt.NDArray[np.float64]
-IndexArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Expression
 from psa_casadi.simulation.exact.printing import Printer
 from psa_casadi.simulation.exact.split import Split, closure, dependence
+from psa_casadi.units import BoolArray
 
 _GIVEN = "real t, const real *x, const real *v, real w, const real *k, real *out"
 _OF_COLUMNS = "const real *d, const column *x, column w, const column *p, column *out"
@@ -66,9 +66,7 @@ def sensitive(text: str) -> str:
     return f"#if PSA_SENSITIVE\n{text}#endif\n"
 
 
-def of_linear_part(
-    reach: npt.NDArray[np.bool_], needed: Sequence[int], linear: Sequence[int]
-) -> str:
+def of_linear_part(reach: BoolArray, needed: Sequence[int], linear: Sequence[int]) -> str:
     """Return what the linear part does to columns x, and its matrices' own derivatives, as C.
 
     Rows are those of the whole step and then those `needed` inside it; `reach` says which entries

@@ -18,13 +18,11 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from psa_casadi.component import Expression
 from psa_casadi.model.structure import Structure
 from psa_casadi.symbolic import in_turn
-
-BoolArray = npt.NDArray[np.bool_]
+from psa_casadi.units import BoolArray
 
 
 def dependence(of: Expression, on: Expression) -> BoolArray:

@@ -18,16 +18,14 @@ from typing import NoReturn
 
 import fmpy
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.platforms import PLATFORMS, RUNTIME, Platform, runtime, windows_alone
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.simulation.compiler import OPTIMISE, run_compiler, zig_command
+from psa_casadi.units import FloatArray
 from tests.export.fmu_models import model_named
-
-FloatArray = npt.NDArray[np.float64]
 
 HERE = Path(__file__).parent
 HEADERS = Path(fmpy.__file__).parent / "c-code"

@@ -22,7 +22,8 @@ import psa_casadi as psa
 from psa_casadi.devices.executors import LOCAL, dask_client
 from psa_casadi.population.population import Population, population
 from psa_casadi.report.words.phrases import number
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, share
+from psa_casadi.units import FloatArray
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.make import write_csv
 from tests.studies.plants.stack import Stack, draw_stack

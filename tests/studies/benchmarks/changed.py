@@ -14,16 +14,10 @@ import numpy as np
 import psa_casadi as psa
 from psa_casadi import datasets
 from psa_casadi.records.drive import reversals
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.hidden_cases import Case, names_of, records_of, study
 from tests.studies.benchmarks.records import noisy
-from tests.studies.benchmarks.table import (
-    FloatArray,
-    Outcome,
-    Progress,
-    TitledTable,
-    on_all_cores,
-    share,
-)
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
 from tests.studies.exam.play import write
 from tests.studies.exam.record import Record as ExamRecord
 from tests.studies.exam.records import RECORDS

@@ -19,8 +19,9 @@ from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.records.split import whole
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import Values, clean_set, with_noise
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, on_all_cores
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
 
 NOISE, SEEDS, QUICK_SEEDS = 1e-3, 50, 2
 QUICK_STACKS = ("P-885.51", "PTBS200")

@@ -21,7 +21,8 @@ from psa_casadi.design.tracking.targets import (
 from psa_casadi.design.tracking.tracking import track
 from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation.start import linear_part
-from tests.studies.benchmarks.table import FloatArray, Progress, TitledTable
+from psa_casadi.units import FloatArray
+from tests.studies.benchmarks.table import Progress, TitledTable
 
 _RATIOS = (1.0, 10.0, 100.0)
 

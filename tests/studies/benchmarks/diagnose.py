@@ -12,16 +12,10 @@ from scipy.stats import binomtest
 import psa_casadi as psa
 from psa_casadi.diagnosis.held_out import Gain, gain_of
 from psa_casadi.records.split import Experiment, judging
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.hidden_cases import ORDINARY, Found, diagnosed, study
 from tests.studies.benchmarks.records import hidden_record, played_again
-from tests.studies.benchmarks.table import (
-    FloatArray,
-    Outcome,
-    Progress,
-    TitledTable,
-    on_all_cores,
-    share,
-)
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
 from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
 
 #: Seeds for each effect, and the first of them.

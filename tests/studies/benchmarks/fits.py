@@ -28,9 +28,10 @@ from psa_casadi.simulation import simulate as simulate_module
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_exact, run_sets
 from psa_casadi.simulation.simulate import EXACT, STEPPER
 from psa_casadi.simulation.start import start_on
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks import table
 from tests.studies.benchmarks.records import hidden_record, noisy, played_again
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 from tests.voltages import concatenate, steps
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P", "m_B")

@@ -12,16 +12,14 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
-from tests.studies.benchmarks.table import FloatArray
+from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.int64]
+IntArray = IndexArray
 #: Columns (samples, count) by kind; weights of a kind have one prior size between them.
 Columns = dict[str, FloatArray]
 

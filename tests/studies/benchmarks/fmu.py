@@ -33,7 +33,8 @@ from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.records import multisine, time_grid
 from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, least_times
+from psa_casadi.units import FloatArray
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, least_times
 
 #: The share of the importer's tolerance that the FMU's solver gives each step (instance.c).
 STEP_SHARE, TIGHTEST_STEP = 0.003, 1e-11

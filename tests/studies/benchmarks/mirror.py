@@ -17,15 +17,13 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
 import psa_casadi as psa
 from psa_casadi import datasets
 from psa_casadi.datasets.devices import LEVELS, linear_response
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
-
-ComplexArray = npt.NDArray[np.complex128]
+from psa_casadi.units import ComplexArray, FloatArray
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 #: Sampling rate [Hz]; samples that the score leaves out; axes.
 RATE, SKIPPED, AXES = 6400.0, 100, range(3)

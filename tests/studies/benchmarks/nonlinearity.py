@@ -21,7 +21,8 @@ from matplotlib.patches import Patch
 from scipy.integrate import odeint
 
 import psa_casadi as psa
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, styled
+from psa_casadi.units import FloatArray
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled
 
 Values = Mapping[str, float]
 

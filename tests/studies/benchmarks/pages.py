@@ -20,12 +20,13 @@ from psa_casadi.report.page.playground import playground
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.series import Curve, Series
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import Interval, Provenance
 from tests.report.browser import DARK, Browser, find_browser, without_policy
 from tests.report.live_pages import case, run_in_browser
 from tests.report.report_cases import NOISE
 from tests.report.steered_browser import Steered, steered
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 #: What a redraw of so many samples may take [ms].
 SAMPLES, ALLOWED = 5000, 100.0

@@ -19,9 +19,10 @@ from psa_casadi.identification.paper import COEFFICIENTS, find_steps, moment_coe
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.phrases import number
+from psa_casadi.units import FloatArray
 from tests.identification.paper_cases import coefficients_of_values
 from tests.studies.benchmarks.records import Values, noisy, slowest
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, styled
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled
 
 STACK_NAMES = ("PTBS200", "WYDS0808020", "P-885.51")
 NOISES, WINDOW, SEEDS = (0.0, 1e-5, 1e-4, 1e-3), 40.0, 3

@@ -30,8 +30,9 @@ from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation import device
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.start import start_on
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import noisy
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, least_times
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, least_times
 
 
 def rates(p: Mapping[str, Any], v: Any, state: Sequence[Any], m: Any) -> tuple[Any, ...]:

@@ -16,8 +16,9 @@ import psa_casadi as psa
 from psa_casadi.posterior.chains import chains_of, prior_draws
 from psa_casadi.posterior.task import Block, Density, Task, task_of
 from psa_casadi.simulation.side_by_side import one_thread
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import noisy
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 #: Effects that are tried, and gains in ordinary changes that the record has.
 CASES = (

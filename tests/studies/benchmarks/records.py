@@ -18,7 +18,7 @@ import numpy as np
 import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.records import multisine, sine, time_grid
-from tests.studies.benchmarks.table import FloatArray
+from psa_casadi.units import FloatArray
 from tests.studies.plants.again import play_again
 from tests.studies.plants.make import Truth, make_record
 

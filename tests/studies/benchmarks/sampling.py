@@ -19,9 +19,10 @@ from psa_casadi.posterior.chains import chains_of, sampler_and_arviz
 from psa_casadi.posterior.task import Task
 from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation.side_by_side import one_thread
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.posterior import task_for
 from tests.studies.benchmarks.records import noisy
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 STACK, NOISE, SAMPLES = "P-885.51", 3e-3, 200
 #: Parameters that are sampled, with the widths of their priors.

@@ -26,8 +26,9 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import time_grid
 from psa_casadi.records.split import Experiment, split, whole
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import Values, noisy, played, slowest, step_voltage
-from tests.studies.benchmarks.table import FloatArray, Outcome, Progress, TitledTable, styled
+from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled
 
 #: White noise of the synthetic records, as a share of the range of each.
 NOISE = 1e-3

@@ -14,6 +14,7 @@ import pandas as pd
 from jinja2 import Template
 
 import psa_casadi as psa
+from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.hidden_cases import (
     NOISES,
     REACHED,
@@ -22,7 +23,7 @@ from tests.studies.benchmarks.hidden_cases import (
     Case,
     how_made,
 )
-from tests.studies.benchmarks.table import FloatArray, on_all_cores
+from tests.studies.benchmarks.table import on_all_cores
 from tests.studies.plants.again import play_again
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import draw_excitation
