@@ -126,21 +126,20 @@ def noise_kinds(
         return ()
     dt = float(np.median(np.diff(time)))
     found = _dropped(time, dt)
-    noise = high_frequency_noise((reading - predicted)[there])
-    quantum = quantum_of(reading[there])
-    again = _held(reading, predicted, there, noise, quantum)
+    quantum = quantum_of(reading[there]) or 0.0
+    again = _held(reading, predicted, there, quantum)
+    there = there & ~again
     if again.any():
-        found.append(_of_runs(again, there))
-        there = there & ~again
+        share = again.sum() / (again.sum() + there.sum())
+        ends = np.diff(np.flatnonzero(there), prepend=-1, append=there.size)
+        found.append(NoiseKind("held", {"share": float(share), "run": float(np.median(ends))}))
     index = np.flatnonzero(there)
     if index.size < FEWEST:
         return tuple(found)
     residual = (reading - predicted)[there]
-    rounding = (quantum or 0.0) / float(np.sqrt(12.0))
     rms = float(np.std(residual))
-    if rms <= _ROUNDED * rounding:
-        figures = {"step": quantum or 0.0, "rms": rms}
-        return (*found, NoiseKind("quantised", figures))
+    if rms <= _ROUNDED * quantum / np.sqrt(12.0):
+        return (*found, NoiseKind("quantised", {"step": quantum, "rms": rms}))
     seen = _Seen(time, predicted, tuple(inputs), index, dt, residual)
     return (*found, *seen.kinds())
 
@@ -160,27 +159,18 @@ _REPEATED, _BY_CHANCE, _OFTEN, _QUIET = 0.02, 3.0, 0.1, 1e-6
 
 
 def _held(
-    reading: FloatArray,
-    predicted: FloatArray,
-    there: BoolArray,
-    noise: float,
-    quantum: float | None,
+    reading: FloatArray, predicted: FloatArray, there: BoolArray, quantum: float
 ) -> BoolArray:
     """Return which readings repeat the one before though noise or motion should change it."""
     same = np.r_[False, np.diff(reading) == 0.0] & there
     moved = np.abs(np.diff(predicted, prepend=predicted[0]))
+    noise = high_frequency_noise((reading - predicted)[there])
     if noise < _QUIET * float(np.ptp(predicted)):
         same &= moved > _QUIET * float(np.ptp(predicted))  # what rests repeats by itself
-    chance = (quantum or 0.0) / (2.0 * np.sqrt(np.pi) * max(noise, float(np.median(moved)), 1e-300))
+    chance = quantum / (2.0 * np.sqrt(np.pi) * max(noise, float(np.median(moved)), 1e-300))
     share = int(np.count_nonzero(same)) / max(1, int(np.count_nonzero(there)))
     held = chance < _OFTEN and share > _REPEATED + _BY_CHANCE * chance
     return same if held else np.zeros_like(same)
-
-
-def _of_runs(again: BoolArray, there: BoolArray) -> NoiseKind:
-    starts = np.flatnonzero(there & ~again)
-    run = float(np.median(np.diff(starts))) if starts.size > 1 else 1.0
-    return NoiseKind("held", {"share": float(again.sum() / there.sum()), "run": run})
 
 
 @dataclass(frozen=True, eq=False)
