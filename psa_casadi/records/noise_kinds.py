@@ -17,7 +17,7 @@ import scipy
 
 from psa_casadi.notes import Note, note
 from psa_casadi.records.drive import dominant_line, is_mains, reversals
-from psa_casadi.records.driven import Columns, columns_of, followed, period_of, returning
+from psa_casadi.records.driven import columns_of, followed, period_of, returning
 from psa_casadi.records.jumps import Jumps, jumps_in
 from psa_casadi.records.noise import (
     forgets,
@@ -239,18 +239,16 @@ class _Seen:
     def _misfit(self, robust: FloatArray) -> tuple[FloatArray, float, Colour]:
         """Return what of the residual follows the drive, its price, and the colour of the rest."""
         colour = colour_of(robust)
-        best = np.zeros_like(robust), 0.0, colour
-        highest, weights = score(robust, colour), [colour, *([] if colour is WHITE else [WHITE])]
-        while weights:
-            misfit, price = followed(robust, self.columns, weights.pop())
-            own = colour_of(robust - misfit) if price else colour
+        best, highest = (np.zeros_like(robust), 0.0, colour), score(robust, colour)
+        for weight in (WHITE, colour):
+            misfit, price = followed(robust, self.columns, weight)
+            own = colour_of(robust - misfit)
             value = score(robust - misfit, own) - price
             share = 1.0 - float(np.var(robust - misfit)) / float(np.var(robust))
-            if share > _MUCH and highest - LEAST < value <= highest + LEAST:
-                best = best[0], best[1], replace(best[2], told=False)
             if value > highest + LEAST and share > 0.0:
                 best, highest = (misfit, price, own), value
-                weights += [own] if len(weights) < 1 and own is not WHITE else []
+            elif share > _MUCH and value > highest - LEAST:
+                best = *best[:2], replace(best[2], told=False)
         if self.period is not None and best[2] is not WHITE:
             again, cost = returning(robust - best[0], self.index, self.period)
             own = colour_of(robust - best[0] - again)
@@ -294,7 +292,7 @@ class _Seen:
         return order <= _HARMONICS and abs(place / own - order) < wide
 
     @cached_property
-    def columns(self) -> Columns:
+    def columns(self) -> FloatArray:
         """What a misfit may follow."""
         return columns_of([u[self.index] for u in self.inputs], self.predicted[self.index])
 
