@@ -11,7 +11,7 @@ import scipy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import with_noise
 from psa_casadi.notes import Note, note
-from psa_casadi.records.noise import filtered, first_order_noise, uncertain
+from psa_casadi.records.noise import filtered, first_order_noise, growth, uncertain
 from psa_casadi.records.repeats import autoregression_of
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.units import BoolArray, FloatArray, IndexArray
@@ -255,8 +255,8 @@ _ORDERS, _EACH = (0, 1, 2, 4, 8, 16), 20
 _TURNS = 4
 #: Poles beyond this radius whose damping ratio is below this ring.
 _SHARP, _DAMPED = 0.95, 0.1
-#: Powers of jitter over that of the other noise that are tried, and nats that they must gain.
-_JITTERS, _UNEVEN = tuple(np.geomspace(0.1, 1000.0, 13).tolist()), 8.0
+#: Nats that jitter must gain beyond its price.
+_UNEVEN = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,16 +370,14 @@ def _jitter(new: FloatArray, rates: FloatArray, at: IndexArray) -> tuple[FloatAr
 
     The likeliest c for innovations `new` (n,) at some samples, 0 unless they ask for it.
     """
-    n, power = len(new), float(np.mean(rates[at] ** 2)) if len(at) else 0.0
+    power = float(np.mean(rates[at] ** 2)) if len(at) else 0.0
     squares = rates**2 / max(power, 1e-300)
-    best, found = -n * float(np.log(max(rms(new), 1e-300))) + _UNEVEN, (np.ones_like(rates), 0.0)
-    for c in _JITTERS if n and power > 0 else ():
-        spread = np.sqrt(1.0 + c * squares)
-        lost = float(np.sum(np.log(spread[at]))) + 0.5 * float(np.log(n + 2.0))
-        nats = -n * float(np.log(max(rms(new / spread[at]), 1e-300))) - lost
-        if nats > best:
-            best, found = nats, (spread, lost)
-    return found
+    ratio, gain = growth(new**2, squares[at]) if power > 0 else (0.0, 0.0)
+    price = 0.5 * float(np.log(len(new) + 2.0))
+    if gain < price + _UNEVEN:
+        return np.ones_like(rates), 0.0
+    spread = np.sqrt(1.0 + ratio * squares)
+    return spread, float(np.sum(np.log(spread[at]))) + price
 
 
 def _nats(samples: int, level: float, order: int) -> float:

@@ -7,7 +7,6 @@ follows them by chance only.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -28,16 +27,11 @@ _TURN, _TURNS = 0.01, 1000
 _CLEAR, _MOST = 5.0, 16
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Functions of the drive (k, n), of equal size, and the parts of their spectra."""
+def columns_of(inputs: Sequence[FloatArray], predicted: FloatArray) -> FloatArray:
+    """Return functions (k, n), of equal size, of inputs (n,), and of a prediction (n,).
 
-    rows: FloatArray
-    spectra: FloatArray
-
-
-def columns_of(inputs: Sequence[FloatArray], predicted: FloatArray) -> Columns:
-    """Return functions of inputs (n,), the first one foremost, and of a prediction (n,)."""
+    The foremost input comes first.
+    """
     y = _scaled(predicted)
     rate = np.gradient(y)
     found = [y, y**2, y**3, rate, np.abs(rate), np.gradient(rate)]
@@ -49,8 +43,8 @@ def columns_of(inputs: Sequence[FloatArray], predicted: FloatArray) -> Columns:
     table = np.array([straightened(c) for c in found])
     size = np.linalg.norm(table, axis=1)
     kept = size > 1e-9 * float(size.max(initial=0.0))
-    rows = table[kept] / size[kept, None]
-    return Columns(rows, _spectra(rows))
+    rows: FloatArray = table[kept] / size[kept, None]
+    return rows
 
 
 def _spectra(rows: FloatArray) -> FloatArray:
@@ -90,18 +84,18 @@ def _history(v: FloatArray) -> list[FloatArray]:
     return [*found, *play.T]
 
 
-def followed(signal: FloatArray, columns: Columns, colour: Colour) -> tuple[FloatArray, float]:
+def followed(signal: FloatArray, columns: FloatArray, colour: Colour) -> tuple[FloatArray, float]:
     """Return what of a signal (n,) follows the columns, 0 where it does none, and its price.
 
     Column by column the one that explains most is added, as long as it gains more nats than
     ln k + ln(n)/2 and `_CLEAR`; weighted by the noise's spectrum at the level of what is left.
     """
-    k, n = columns.rows.shape
+    k, n = columns.shape
     none = np.zeros(n), 0.0
     if not k or n < 4 * k:
         return none
     weight = np.repeat(1.0 / np.sqrt(colour.density(np.arange(1, n // 2 + 1) / n)), 2)
-    x, e = columns.spectra * weight, _spectra(straightened(signal)) * weight
+    x, e = _spectra(columns) * weight, _spectra(straightened(signal)) * weight
     normal, cross, power = x @ x.T, x @ e, float(e @ e)
     least = float(np.log(k)) + 0.5 * float(np.log(n))
     chosen, left, weights = list[int](), power, np.zeros(0)
@@ -118,7 +112,7 @@ def followed(signal: FloatArray, columns: Columns, colour: Colour) -> tuple[Floa
         left = max(power - float(cross[chosen] @ weights), 1e-12 * power)
     if not chosen:
         return none
-    found: FloatArray = weights @ columns.rows[chosen]
+    found: FloatArray = weights @ columns[chosen]
     return found, least * len(chosen)
 
 

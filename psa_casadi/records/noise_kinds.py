@@ -17,7 +17,7 @@ import scipy
 
 from psa_casadi.notes import Note, note
 from psa_casadi.records.drive import dominant_line, is_mains, reversals
-from psa_casadi.records.driven import Columns, columns_of, followed, period_of, returning
+from psa_casadi.records.driven import columns_of, followed, period_of, returning
 from psa_casadi.records.jumps import Jumps, jumps_in
 from psa_casadi.records.noise import (
     forgets,
@@ -126,21 +126,20 @@ def noise_kinds(
         return ()
     dt = float(np.median(np.diff(time)))
     found = _dropped(time, dt)
-    noise = high_frequency_noise((reading - predicted)[there])
-    quantum = quantum_of(reading[there])
-    again = _held(reading, predicted, there, noise, quantum)
+    quantum = quantum_of(reading[there]) or 0.0
+    again = _held(reading, predicted, there, quantum)
+    there = there & ~again
     if again.any():
-        found.append(_of_runs(again, there))
-        there = there & ~again
+        share = again.sum() / (again.sum() + there.sum())
+        ends = np.diff(np.flatnonzero(there), prepend=-1, append=there.size)
+        found.append(NoiseKind("held", {"share": float(share), "run": float(np.median(ends))}))
     index = np.flatnonzero(there)
     if index.size < FEWEST:
         return tuple(found)
     residual = (reading - predicted)[there]
-    rounding = (quantum or 0.0) / float(np.sqrt(12.0))
     rms = float(np.std(residual))
-    if rms <= _ROUNDED * rounding:
-        figures = {"step": quantum or 0.0, "rms": rms}
-        return (*found, NoiseKind("quantised", figures))
+    if rms <= _ROUNDED * quantum / np.sqrt(12.0):
+        return (*found, NoiseKind("quantised", {"step": quantum, "rms": rms}))
     seen = _Seen(time, predicted, tuple(inputs), index, dt, residual)
     return (*found, *seen.kinds())
 
@@ -160,27 +159,18 @@ _REPEATED, _BY_CHANCE, _OFTEN, _QUIET = 0.02, 3.0, 0.1, 1e-6
 
 
 def _held(
-    reading: FloatArray,
-    predicted: FloatArray,
-    there: BoolArray,
-    noise: float,
-    quantum: float | None,
+    reading: FloatArray, predicted: FloatArray, there: BoolArray, quantum: float
 ) -> BoolArray:
     """Return which readings repeat the one before though noise or motion should change it."""
     same = np.r_[False, np.diff(reading) == 0.0] & there
     moved = np.abs(np.diff(predicted, prepend=predicted[0]))
+    noise = high_frequency_noise((reading - predicted)[there])
     if noise < _QUIET * float(np.ptp(predicted)):
         same &= moved > _QUIET * float(np.ptp(predicted))  # what rests repeats by itself
-    chance = (quantum or 0.0) / (2.0 * np.sqrt(np.pi) * max(noise, float(np.median(moved)), 1e-300))
+    chance = quantum / (2.0 * np.sqrt(np.pi) * max(noise, float(np.median(moved)), 1e-300))
     share = int(np.count_nonzero(same)) / max(1, int(np.count_nonzero(there)))
     held = chance < _OFTEN and share > _REPEATED + _BY_CHANCE * chance
     return same if held else np.zeros_like(same)
-
-
-def _of_runs(again: BoolArray, there: BoolArray) -> NoiseKind:
-    starts = np.flatnonzero(there & ~again)
-    run = float(np.median(np.diff(starts))) if starts.size > 1 else 1.0
-    return NoiseKind("held", {"share": float(again.sum() / there.sum()), "run": run})
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,18 +239,16 @@ class _Seen:
     def _misfit(self, robust: FloatArray) -> tuple[FloatArray, float, Colour]:
         """Return what of the residual follows the drive, its price, and the colour of the rest."""
         colour = colour_of(robust)
-        best = np.zeros_like(robust), 0.0, colour
-        highest, weights = score(robust, colour), [colour, *([] if colour is WHITE else [WHITE])]
-        while weights:
-            misfit, price = followed(robust, self.columns, weights.pop())
-            own = colour_of(robust - misfit) if price else colour
+        best, highest = (np.zeros_like(robust), 0.0, colour), score(robust, colour)
+        for weight in (WHITE, colour):
+            misfit, price = followed(robust, self.columns, weight)
+            own = colour_of(robust - misfit)
             value = score(robust - misfit, own) - price
             share = 1.0 - float(np.var(robust - misfit)) / float(np.var(robust))
-            if share > _MUCH and highest - LEAST < value <= highest + LEAST:
-                best = best[0], best[1], replace(best[2], told=False)
             if value > highest + LEAST and share > 0.0:
                 best, highest = (misfit, price, own), value
-                weights += [own] if len(weights) < 1 and own is not WHITE else []
+            elif share > _MUCH and value > highest - LEAST:
+                best = *best[:2], replace(best[2], told=False)
         if self.period is not None and best[2] is not WHITE:
             again, cost = returning(robust - best[0], self.index, self.period)
             own = colour_of(robust - best[0] - again)
@@ -304,7 +292,7 @@ class _Seen:
         return order <= _HARMONICS and abs(place / own - order) < wide
 
     @cached_property
-    def columns(self) -> Columns:
+    def columns(self) -> FloatArray:
         """What a misfit may follow."""
         return columns_of([u[self.index] for u in self.inputs], self.predicted[self.index])
 

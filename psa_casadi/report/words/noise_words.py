@@ -2,10 +2,8 @@
 
 from collections.abc import Callable, Mapping
 
+from psa_casadi.records.drive import is_mains
 from psa_casadi.report.words.phrases import listing, quantity
-
-#: Mains frequencies [Hz], and the share by which a line may be off one.
-_MAINS, _OFF = (50.0, 60.0), 0.004
 
 
 def _places(at: tuple[float, ...], count: float) -> str:
@@ -17,39 +15,22 @@ def _times(count: float) -> str:
     return {1: "once", 2: "twice"}.get(round(count), f"{count:.0f} times")
 
 
-def _line(frequency: float) -> str:
-    mains = any(
-        abs(frequency - round(frequency / f) * f) < _OFF * frequency and round(frequency / f)
-        for f in _MAINS
-    )
-    return f"{frequency:.4g} Hz{' (mains)' if mains else ''}"
-
-
-def _autoregressive(
-    where: str, unit: str, at: object, rms: float, order: float, time: float, peak: float = 0.0
-) -> str:
-    most = f", strongest at {peak:.3g} Hz" if peak else ""
-    return (
-        f"The noise of {where} is correlated over {quantity(time, 's')} (autoregressive of order"
-        f" {order:.0f}{most}), {quantity(rms, unit)} rms, as behind a filter. Sampling faster tells"
-        " little more; longer records do."
-    )
-
-
-def _one_over_f(
-    where: str, unit: str, at: object, rms: float, slope: float, corner: float = 0.0
-) -> str:
-    above = f" below {corner:.3g} Hz, above which it is white" if corner else ""
-    return (
-        f"The noise of {where} is 1/f noise, {quantity(rms, unit)} rms: its spectrum falls with"
-        f" f^-{slope:.2g}{above}. Longer averages do not help: record shorter and more often, move"
-        " faster, or measure a target at rest beside it."
-    )
+def _lines(at: tuple[float, ...]) -> str:
+    return listing([f"{f:.4g} Hz{' (mains)' if is_mains(f) else ''}" for f in at])
 
 
 _EACH: Mapping[str, Callable[..., str]] = {
-    "autoregressive": _autoregressive,
-    "one_over_f": _one_over_f,
+    "autoregressive": lambda where, unit, at, rms, order, time, peak=0.0: (
+        f"The noise of {where} is correlated over {quantity(time, 's')} (autoregressive of order"
+        f" {order:.0f}{f', strongest at {peak:.3g} Hz' if peak else ''}), {quantity(rms, unit)}"
+        " rms, as behind a filter. Sampling faster tells little more; longer records do."
+    ),
+    "one_over_f": lambda where, unit, at, rms, slope, corner=0.0: (
+        f"The noise of {where} is 1/f noise, {quantity(rms, unit)} rms: its spectrum falls with"
+        f" f^-{slope:.2g}{f' below {corner:.3g} Hz, above which it is white' if corner else ''}."
+        " Longer averages do not help: record shorter and more often, move faster, or measure a"
+        " target at rest beside it."
+    ),
     "coloured": lambda where, unit, at, rms, time: (
         f"What is left of {where} is correlated over {quantity(time, 's')}; from these records it"
         " may be noise, or something that the model lacks. A voltage that is played twice tells."
@@ -95,7 +76,7 @@ _EACH: Mapping[str, Callable[..., str]] = {
     ),
     "lines": lambda where, unit, at, amplitude: (
         f"The noise of {where} has {'a line' if len(at) == 1 else 'lines'} whatever the drive does:"
-        f" {listing([_line(f) for f in at])}, the strongest with an amplitude of"
+        f" {_lines(at)}, the strongest with an amplitude of"
         f" {quantity(amplitude, unit)}. Look for hum and vibration: shield, earth at one point, and"
         " switch off what turns."
     ),
