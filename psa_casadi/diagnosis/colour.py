@@ -446,6 +446,8 @@ def _with_level(
 Seen = Literal["correlation", "line", "drive", "size"]
 
 _LAGS = 25
+#: So many times more rarely a correlation counts beside a residual's own colour.
+_LEFT = 100.0
 #: Squares of the residual over their mean that count at most.
 _MOST = 9.0
 
@@ -496,18 +498,20 @@ def omnibus(
     Four tests with Bonferroni's correction: are neighbours of the whitened residual correlated;
     Fisher's g for a line in its spectrum; an F test on general features of the voltage and time;
     and is its size the same everywhere? A sensor's noise is, what a colour may have swallowed of a
-    misfit is not. Where the colour is the residual's `own`, correlation and size are what it and
-    its jitter are for: the two others remain. `excess` is the share of the residual's power above
+    misfit is not. Where the colour is the residual's `own`, its jitter is for the size, and its
+    order leaves some correlation that Schwarz's criterion does not pay for. `excess` is the share of the residual's power above
     the noise `floor` [m]; what is seen must be larger than what is `knowable` [m]; `lengths` are
     the records' numbers of samples.
     """
     white = colour.whiten(residual)
+    p, share = whiteness(white)
     tests: dict[Seen, tuple[float, float]] = {
+        "correlation": (min(1.0, _LEFT * p) if own else p, share),
         "line": _fisher_line(white),
         "drive": _features(white, voltage, time, colour),
     }
     if not own:
-        tests |= {"correlation": whiteness(white), "size": _sizes(white, voltage, time, lengths)}
+        tests["size"] = _sizes(white, voltage, time, lengths)
     seen, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))
     size = float(np.sqrt(share * power))
