@@ -499,9 +499,9 @@ def omnibus(
     Fisher's g for a line in its spectrum; an F test on general features of the voltage and time;
     and is its size the same everywhere? A sensor's noise is, what a colour may have swallowed of a
     misfit is not. Where the colour is the residual's `own`, its jitter is for the size, and its
-    order leaves some correlation that Schwarz's criterion does not pay for. `excess` is the share of the residual's power above
-    the noise `floor` [m]; what is seen must be larger than what is `knowable` [m]; `lengths` are
-    the records' numbers of samples.
+    order leaves some correlation that Schwarz's criterion does not pay for. `excess` is the share
+    of the residual's power above the noise `floor` [m]; what is seen must be larger than what is
+    `knowable` [m]; `lengths` are the records' numbers of samples.
     """
     white = colour.whiten(residual)
     p, share = whiteness(white)
