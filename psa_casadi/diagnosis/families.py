@@ -63,7 +63,7 @@ def families(
 
         sum_k exp((F_k - E) / T),   T = max(temperature 2, form_of_evidence E)
 
-    Without any effect the corrections share all.
+    Without any effect the corrections share all. One whose kind nobody has declared may be of any.
     """
     scale = max(limits.temperature, limits.form_of_evidence * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
@@ -71,7 +71,7 @@ def families(
     most = max([evidence, *(e for family, e in apart if family[1] in own)])
     others: dict[tuple[str, str], float] = {}
     for family, each in apart:
-        if family[1] not in own:
+        if family[1] not in own and "" not in own:
             odds = float(np.exp(min((each - most) / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     listed = 1.0 / (bool(probability) + sum(others.values())) if probability or others else 0.0

@@ -35,7 +35,7 @@ class Thresholds:
     * `price`: prior of a cause [nats]. The largest evidence of any effect on 114 of 115 clean
       records was 7.8.
     * `noise`: evidence of a cause [nats] where each residual may be noise of a colour of its own.
-      The largest of any effect on clean records with odd noise was 11.2.
+      The largest of any effect on clean records with odd noise was 11.2, once of 30; the price.
     * `further`: share of what the other causes remove that a further one must. An effect's own form
       is not the true one; less may be that.
     * `static`: share of what a cause with a memory adds that may be a curve of the voltage alone.
@@ -77,7 +77,7 @@ class Thresholds:
     form_of_range: float = 2e-5
     dithered: float = 1.2
     price: float = 8.0
-    noise: float = 15.0
+    noise: float = 8.0
     further: float = 0.02
     static: float = 0.9
     form: float = 0.05
