@@ -11,7 +11,7 @@ import scipy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import with_noise
 from psa_casadi.notes import Note, note
-from psa_casadi.records.noise import filtered, first_order_noise, growth, uncertain
+from psa_casadi.records.noise import filtered, first_order_noise, growth, runs_of, uncertain
 from psa_casadi.records.repeats import autoregression_of
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.units import BoolArray, FloatArray, IndexArray
@@ -318,7 +318,7 @@ def own_colour(
     error = np.concatenate(errors)
     used, held = (np.concatenate(rows).astype(np.bool_) for rows in (fitted, judged))
     begins = np.cumsum([0, *(len(e) for e in errors[:-1])])
-    runs = _runs(used, begins)
+    runs = tuple(stop - start for rows in fitted for start, stop in runs_of(rows))
     for most in _ORDERS[::-1]:
         at = _ends(used, begins, most)
         if len(at) >= _EACH * most:
@@ -423,14 +423,6 @@ def _ends(
     first[begins[begins < len(there)]] = True
     since = index - np.maximum.accumulate(np.where(first, index, 0))
     return np.flatnonzero((there if ends is None else ends) & (since >= most))
-
-
-def _runs(there: BoolArray, begins: IndexArray) -> tuple[int, ...]:
-    """Return the numbers of samples between gaps and ends of records."""
-    at = np.flatnonzero(there)
-    record = np.searchsorted(begins, at, side="right")
-    new = np.flatnonzero((np.diff(at) > 1) | (np.diff(record) > 0)) + 1
-    return tuple(np.diff([0, *new, len(at)]).tolist()) if len(at) else ()
 
 
 def _with_level(

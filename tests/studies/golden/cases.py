@@ -109,6 +109,11 @@ def _sat(record: Record, folder: Path, draw: int) -> tuple[Question, Path]:
 _DRAW = 10007
 #: Range of the effects' rms over the noise's, after the base's parameters are projected out.
 _RANGES = {"strong": (1.0, 3.0), "weak": (0.1, 0.3), "foreign": (0.3, 3.0)}
+#: The group of each kind of the study.
+_GROUPS: dict[str, Group] = {
+    "strong": "one", "weak": "one", "two": "two", "three": "three", "foreign": "foreign",
+    "clean": "clean",
+}  # fmt: skip
 _FIRST_SEED = 990001
 #: Kind, hidden causes, and the noise where it is not white, or the voltage where it is not rich.
 _STUDY = """
@@ -182,10 +187,9 @@ def _studied(
         more=hidden[1:],
         more_visible=wanted if hidden[1:] else None,
     )
-    group: Group = "one" if kind in ("strong", "weak") else kind  # type: ignore[assignment]
     right = (_FAMILIES.get(name, (called(name),)) for name in hidden)
     noise = "" if how in ("white", "loops") else how
-    return Question(group, tuple(map(frozenset, right)), noise=noise), path
+    return Question(_GROUPS[kind], tuple(map(frozenset, right)), noise=noise), path
 
 
 def _asks() -> Iterator[tuple[str, str, str, Ask]]:
