@@ -177,6 +177,8 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
     const double h = run->length[step];
     const long end = 1L << finest;
     const double unit = 1.0 / (double)end;
+    const double share = 0.1 + (double)(sample + 1) / (double)run->samples;
+    const double most = (double)run->steps_limit * (share < 1.0 ? share : 1.0);
     psa_trial *const trial = &state->trial;
     for (int lane = 0; lane < PSA_LANES; ++lane) pace->at[lane] = pace->dead[lane] ? end : 0;
     for (;;) {
@@ -202,7 +204,7 @@ static int next_sample(psa_state *state, long sample, psa_pace *pace) {
         for (int lane = 0; lane < PSA_LANES; ++lane) {
             if (pace->at[lane] >= end) continue;
             const double error = LANE(trial->error, lane);
-            const int spent = ++pace->tried[lane] > run->steps_limit;
+            const int spent = (double)++pace->tried[lane] > most;
             if (spent && PSA_LANES == 1) return 3;
             if (error > 1.0 && level[lane] < finest && !spent) {
                 pace->level[lane] += error > FAR && level[lane] + 1 < finest ? 2 : 1;

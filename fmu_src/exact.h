@@ -24,7 +24,7 @@ typedef struct {
     const double *nominal; /* [nx][sets] */
     double tolerance;      /* of one step, over the nominal sizes */
     int coarsest, finest;  /* levels: a sample is divided by at least 2^coarsest, at most 2^finest */
-    long steps_limit;      /* tried steps of one set */
+    long steps_limit;      /* tried steps of one set; until a sample its share of them and a tenth */
     double *x;             /* [samples][nx][sets] or NULL */
     double *y;             /* [samples][ny][sets] or NULL */
     double *shown;         /* [samples][shown][sets] or NULL: outputs whose sensitivities the model has; nan from

@@ -163,7 +163,9 @@ static int run_all(psa_trajectory *run, psa_workshop *at) {
     for (long sample = 0; sample + 1 < run->samples && status == PSA_OK; ++sample) {
         status = next_sample(run, at, sample);
         if (status == PSA_OK && write_sample(run, at, sample + 1)) status = PSA_NOT_FINITE;
-        if (status == PSA_OK && run->steps_most > 0 && solver->steps + solver->rejected > run->steps_most)
+        const double share = fmin(1.0, 0.1 + (double)(sample + 1) / (double)run->samples);
+        const double done = (double)(solver->steps + solver->rejected);
+        if (status == PSA_OK && run->steps_most > 0 && done > share * (double)run->steps_most)
             status = PSA_TOO_MANY_STEPS;
     }
     run->steps = (long)solver->steps;

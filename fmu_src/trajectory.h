@@ -22,7 +22,7 @@ typedef struct {
     double rtol;
     double max_step;
     long steps_limit;       /* between two samples; 0: 10 million */
-    long steps_most;        /* of the whole run, rejected ones too; 0: no limit */
+    long steps_most;        /* of the whole run, rejected ones too, as in exact.h; 0: no limit */
     double *x;              /* [samples][PSA_NX] or NULL */
     double *z;              /* [samples][PSA_NS] or NULL: after an instant, if there is one */
     double *y;              /* [samples][PSA_NY] or NULL */

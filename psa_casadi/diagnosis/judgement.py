@@ -155,6 +155,11 @@ class Judge:
         return self._left[step]
 
     @property
+    def samples(self) -> int:
+        """How many samples are fitted."""
+        return len(self.first.fit.residuals)
+
+    @property
     def missing(self) -> bool:
         """Whether the base lacks something."""
         return self.first.chosen is not None or not self.left(self.first).white
@@ -216,11 +221,12 @@ class Judge:
         better: dict[str, Correction] = {}
         for name, weighed in self.each.items():
             beaten = weighed.beaten_by() if len(self.steps) > 2 else None
-            unlisted = [f for f in self.families[name] if not f.effects]
+            of = self.families[name]
+            listed = sum(sum(f.effects.values()) for f in of)
             if beaten is not None:
                 better[name] = beaten[0]
-            elif sum(f.not_listed for f in unlisted) > 0.5:
-                others = {(f.place, f.kind) for f in unlisted}
+            elif sum(f.not_listed for f in of) > listed:
+                others = {(f.place, f.kind) for f in of if not f.effects}
                 found = [c for c in weighed.corrections if place_and_kind(c) in others]
                 better[name] = max(found, key=lambda c: c.evidence)
         return better
@@ -234,6 +240,7 @@ class Judge:
                 {e.name: self.family(e) for e in (*self.task.table, s.cause)},
                 self.each[s.cause.name].evidence,
                 self.each[s.cause.name].corrections,
+                self.samples,
                 self.limits,
             )
             for s in self.steps
@@ -286,7 +293,7 @@ class Judge:
         if self.best_correction is None or self.left(self.final).white:
             return ()
         most = self.best_correction.evidence
-        return families({}, {}, most, self.beside_final, self.limits)
+        return families({}, {}, most, self.beside_final, self.samples, self.limits)
 
     @cached_property
     def budget(self) -> Budget:
@@ -324,7 +331,7 @@ class Judge:
         """Return a cause: its probability, the share of the error that it removes."""
         name, shares = step.cause.name, {c.what: c for c in self.budget.causes}
         own, of = shares.get(name), self.families.get(name, ())
-        sure = step.probability[name] * (1.0 - sum(f.not_listed for f in of))
+        sure = sum(f.effects.get(name, 0.0) for f in of) if of else step.probability[name]
         return Cause(
             effect=name,
             belongs_to=step.cause.belongs_to,

@@ -7,7 +7,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.corrections import KINDS, Patch
-from psa_casadi.diagnosis.families import families, place_and_kind
+from psa_casadi.diagnosis.families import families, known, place_and_kind
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from tests.studies.plants.make import make_record
@@ -15,6 +15,8 @@ from tests.tiers import slow
 
 CREEP, DRIFT = ("plant", "relaxation"), ("sensor", "time")
 PLACES = {"slow_creep": CREEP, "charge_leakage": ("drive", "relaxation"), "offset_drift": DRIFT}
+#: So few that hardly anything else can look like a cause with the evidence of these tests.
+FEW = 1
 
 
 def _patch(kind: str, port: str, evidence: float) -> Patch:
@@ -33,8 +35,8 @@ def test_every_effect_and_every_unnamed_correction_has_a_family() -> None:
 
 def test_effects_of_one_place_and_kind_are_one_family() -> None:
     chances = {"slow_creep": 0.6, "charge_leakage": 0.3, "offset_drift": 0.1}
-    creep, leak, drift = families(chances, PLACES, 1000.0, [], LIMITS)
-    assert (creep.place, creep.kind, creep.effects) == (*CREEP, {"slow_creep": 0.6})
+    creep, leak, drift = families(chances, PLACES, 1e15, [], FEW, LIMITS)
+    assert (creep.place, creep.kind) == CREEP
     assert [f.probability for f in (creep, leak, drift)] == pytest.approx([0.6, 0.3, 0.1])
     assert not any(f.not_listed for f in (creep, leak, drift))
 
@@ -47,19 +49,30 @@ def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_n
     same = _patch("relaxation", "force", 1100.0)
     other = _patch("curve", "drive voltage", 1080.0)
     weak = _patch("time", "reading", 5.0)
-    found = families({"slow_creep": 1.0}, PLACES, 1000.0, [same, other, weak], LIMITS)
+    found = families({"slow_creep": 1.0}, PLACES, 1000.0, [same, other, weak], FEW, LIMITS)
     shares = {(f.place, f.kind): (f.probability, f.not_listed) for f in found}
     odds = float(np.exp(-1.0))
-    assert shares[CREEP] == pytest.approx((1.0 / (1.0 + odds), 0.0))
-    assert shares["drive", "curve"] == pytest.approx((odds / (1.0 + odds),) * 2)
+    tried = known(1000.0, FEW, LIMITS)
+    assert shares[CREEP] == pytest.approx((tried / (1.0 + odds), 0.0))
+    assert shares["drive", "curve"] == pytest.approx((tried * odds / (1.0 + odds),) * 2)
     assert len(shares) == 2
 
 
 def test_what_has_no_name_is_shared_by_corrections_alone() -> None:
-    rows = [_patch("memory", "force", 500.0), _patch("curve", "reading", 490.0)]
-    found = families({}, {}, 500.0, rows, LIMITS)
-    assert [(f.place, f.kind) for f in found] == [("plant", "hysteresis"), ("sensor", "curve")]
-    assert sum(f.not_listed for f in found) == pytest.approx(1.0)
+    """A quarter less evidence are odds of exp(1/2): without the cause they tell little of it."""
+    rows = [_patch("memory", "force", 400.0), _patch("curve", "reading", 300.0)]
+    first, second = families({}, {}, 400.0, rows, FEW, LIMITS)
+    assert (first.place, first.kind) == ("plant", "hysteresis")
+    assert (second.place, second.kind) == ("sensor", "curve")
+    assert first.not_listed / second.not_listed == pytest.approx(np.exp(0.5))
+    assert first.not_listed + second.not_listed == pytest.approx(known(400.0, FEW, LIMITS))
+
+
+def test_the_smaller_a_cause_the_likelier_it_is_something_that_nobody_has_thought_of() -> None:
+    """At four times the evidence of the same samples the odds of that are half."""
+    odds = [1.0 / known(e, 4000, LIMITS) - 1.0 for e in (100.0, 400.0, 40000.0)]
+    assert odds[0] / odds[1] == pytest.approx(2.0)
+    assert odds[2] < 0.03
 
 
 @slow

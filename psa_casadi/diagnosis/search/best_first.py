@@ -87,6 +87,8 @@ class _Search:
                 break
             self.known.tell(chosen, "visited")
             self.visit(chosen)
+        while self.led(self.known.best()):
+            pass
         best = self.known.best()
         if len(best.causes) > 1 and self.known.view(best).test.alarm:
             self.task.progress("all causes to the end")
@@ -112,6 +114,8 @@ class _Search:
 
         None where neither is new, and nothing dear is left to try.
         """
+        if self.led(self.known.ranked()[0]):
+            return self.next()
         best = self.known.best()
         way = [self.known.found.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
         for own in way:
@@ -154,6 +158,16 @@ class _Search:
         self.all_afresh()
         return True
 
+    def led(self, h: Hypothesis) -> bool:
+        """Take every cause out of a hypothesis that was not challenged yet; whether that was new.
+
+        Even one that may not be the answer can have led the base to where it needs no cause.
+        """
+        new = bool(h.causes) and h.final and self.once("challenged", h.names)
+        if new:
+            self.challenge(h)
+        return new
+
     def unseen(self, h: Hypothesis) -> bool:
         """Whether a hypothesis was not visited yet, or has become much better since."""
         last = self.expanded.get(h.names)
@@ -164,8 +178,7 @@ class _Search:
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""
         series = has_series(h)
-        if h.causes and self.once("challenged", h.names):
-            self.challenge(h)
+        if self.led(h):
             return
         view = self.known.view(h)
         if not series and self.resonances(h, view):
