@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.base_fit import from_resonances, smooth_between
+from psa_casadi.diagnosis.base_fit import from_resonances
 from psa_casadi.diagnosis.judgement import NAMING, told_from
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
@@ -26,6 +26,7 @@ from psa_casadi.identification.identify import identify, unfinished
 from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
 from psa_casadi.identification.refitting import noise_levels, relevelled
+from psa_casadi.identification.sampling import even_clock, smooth_between
 from psa_casadi.identification.search import (
     LOAD,
     fit_base,
@@ -435,6 +436,8 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
     if stuck:
         refuse_stuck([e.record for e in experiments])
         base, task = _base(start, replace(task, experiments=experiments))
+    read: list[Note] = []
+    base, task = _on_even_clock(base, start, task, read)
     experiments = task.experiments
     seen = driven(base, start, task)
     if not seen.follows:
@@ -448,26 +451,41 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
         stuck += more
         steps, task = _searched(start, replace(task, experiments=fewer))
         experiments = task.experiments
-    between = None
-    if "between samples" not in task.method.without:
-        between = smooth_between(steps[0].fit, experiments)
-    if between is not None:
-        again, other = _searched(start, replace(task, experiments=between[0]))
-        if again[0].fit.rms < steps[0].fit.rms:
-            steps, task, experiments = again, other, other.experiments
-        else:
-            between = None
+    steps, task = _between_samples(steps, start, task, read)
     progress("judging")
     found = StackJudge(steps, task, scale_given=scale_given).conclude()
     decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
     found = replace(found, columns=decided)
-    more_said = [
-        *([between[1]] if between else []),
-        *([note("stuck", count=stuck)] if stuck else []),
-    ]
+    read += [note("stuck", count=stuck)] if stuck else []
     turned = [n for f in steps[0].fit.further for n in f.turned]
-    told = *seen.notes, *more_said, *turned, *steps[-1].remarks
+    told = *seen.notes, *read, *turned, *steps[-1].remarks
     return replace(found, remarks=(*found.remarks, *told))
+
+
+def _on_even_clock(base: Fit, start: Model, task: Task, said: list[Note]) -> tuple[Fit, Task]:
+    """Fit the base to samples at even times where the data say that the stamps jitter."""
+    even = None if "one clock" in task.method.without else even_clock(base, task.experiments)
+    if even is not None:
+        again, other = _base(start, replace(task, experiments=even[0]))
+        if again.rms < base.rms:
+            said.append(even[1])
+            return again, other
+    return base, task
+
+
+def _between_samples(
+    steps: list[Step], start: Model, task: Task, said: list[Note]
+) -> tuple[list[Step], Task]:
+    """Search again with a voltage that is smooth between samples where the data say so."""
+    between = None
+    if "between samples" not in task.method.without:
+        between = smooth_between(steps[0].fit, task.experiments)
+    if between is not None:
+        again, other = _searched(start, replace(task, experiments=between[0]))
+        if again[0].fit.rms < steps[0].fit.rms:
+            said.append(between[1])
+            return again, other
+    return steps, task
 
 
 def _base(start: Model, task: Task) -> tuple[Fit, Task]:

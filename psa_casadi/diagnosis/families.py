@@ -50,37 +50,45 @@ def place_and_kind(c: Correction) -> tuple[str, str]:
     return c.port, "curve"
 
 
-def known(evidence: float, samples: int, limits: Thresholds) -> float:
-    """Return the probability that a cause with evidence E [nats] of n samples is of any kind tried.
+@dataclass(frozen=True)
+class Shown:
+    """What a cause has: its evidence E [nats], from n samples, beside which k causes with it."""
 
-    The odds of what nobody has thought of, an effect or the form of another cause, that looks like
-    it are `unknown` (n/E)^(1/2): the smaller a cause beside the noise, the less of its shape shows.
-    """
-    return 1.0 / (1.0 + limits.unknown * float(np.sqrt(samples / max(evidence, 1e-300))))
+    evidence: float
+    samples: int
+    causes: int = 1
+
+    def known(self, limits: Thresholds) -> float:
+        """Return the probability that it is of any kind that was tried.
+
+        The odds of what looks like it, but nobody has thought of or is the form of another cause,
+        are `unknown` k (n/E)^(1/2). The smaller it is beside the noise, the less of its form shows.
+        """
+        small = float(np.sqrt(self.samples / max(self.evidence, 1e-300)))
+        return 1.0 / (1.0 + limits.unknown * self.causes * small)
 
 
 def families(
     probability: Mapping[str, float],
     places: Mapping[str, tuple[str, str]],
-    evidence: float,
+    shown: Shown,
     corrections: Sequence[Correction],
-    samples: int,
     limits: Thresholds,
 ) -> tuple[Family, ...]:
     """Return the families that a cause may belong to, the most probable first.
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
-    families; `evidence` is that of the best of them over the model without the cause, beside which
-    the `corrections` stand, from `samples`. With the evidence F_k, above the price of a cause, of a
-    correction whose kind no likely effect has, and that E of the cause, the odds that it is not
-    listed are
+    families; what is `shown` of the cause is over the model without it, beside which the
+    `corrections` stand. With the evidence F_k, above the price of a cause, of a correction whose
+    kind no likely effect has, and that E of the cause, the odds that it is not listed are
 
         sum_k exp((F_k - E) / T),   T = max(temperature 2, form_of_evidence E)
 
     Without any effect the corrections share all, with a form of a half: a model that lacks the
     cause says little of it. One whose kind nobody has declared may be of any. What is missing to 1
-    is of no kind that was tried (see `known`).
+    is of no kind that was tried (`Shown.known`).
     """
+    evidence = shown.evidence
     form = limits.form_of_evidence if probability else _UNNAMED
     scale = max(limits.temperature, form * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
@@ -91,8 +99,11 @@ def families(
         if family[1] not in own and "" not in own:
             odds = float(np.exp(min((each - most) / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
-    share = known(evidence, samples, limits)
-    listed = share / (bool(probability) + sum(others.values())) if probability or others else 0.0
+    listed = (
+        shown.known(limits) / (bool(probability) + sum(others.values()))
+        if probability or others
+        else 0.0
+    )
     found: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
     for name, p in probability.items():
         if name in places:

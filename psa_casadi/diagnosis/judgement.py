@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, best_of
-from psa_casadi.diagnosis.families import SUREST, Family, families, place_and_kind
+from psa_casadi.diagnosis.families import SUREST, Family, Shown, families, place_and_kind
 from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
@@ -154,10 +154,9 @@ class Judge:
             self._left[step] = found
         return self._left[step]
 
-    @property
-    def samples(self) -> int:
-        """How many samples are fitted."""
-        return len(self.first.fit.residuals)
+    def _shown(self, evidence: float) -> Shown:
+        """Return what a cause has beside the others that has so much evidence."""
+        return Shown(evidence, len(self.first.fit.residuals), len(self.last.view.of.causes))
 
     @property
     def missing(self) -> bool:
@@ -238,9 +237,8 @@ class Judge:
             s.cause.name: families(
                 s.probability,
                 {e.name: self.family(e) for e in (*self.task.table, s.cause)},
-                self.each[s.cause.name].evidence,
+                self._shown(self.each[s.cause.name].evidence),
                 self.each[s.cause.name].corrections,
-                self.samples,
                 self.limits,
             )
             for s in self.steps
@@ -293,7 +291,7 @@ class Judge:
         if self.best_correction is None or self.left(self.final).white:
             return ()
         most = self.best_correction.evidence
-        return families({}, {}, most, self.beside_final, self.samples, self.limits)
+        return families({}, {}, self._shown(most), self.beside_final, self.limits)
 
     @cached_property
     def budget(self) -> Budget:

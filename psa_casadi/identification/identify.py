@@ -14,6 +14,7 @@ from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import record_rms, refit, relevelled
 from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
+from psa_casadi.identification.sampling import even_clock
 from psa_casadi.identification.search import loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
     doubtful_quantity,
@@ -123,7 +124,7 @@ def identify(
         thorough=True,
         progress=progress,
     )
-    best, experiments = relevelled(found.best, experiments)
+    best, experiments = _on_even_clock(*relevelled(found.best, experiments), said)
     best = _with_own_levels(best, experiments, progress)
     if best.interrupted:
         current_work().wrap_up()
@@ -218,6 +219,19 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
         notes=(str(INTERRUPTED), *(() if stiffness_given else (str(FORCE_NOTE),))),
         interrupted=True,
     )  # fmt: skip
+
+
+def _on_even_clock(
+    best: Fit, experiments: tuple[Experiment, ...], said: list[Note | str]
+) -> tuple[Fit, tuple[Experiment, ...]]:
+    """Fit samples at even times where the data say that the stamps jitter."""
+    even = None if best.interrupted else even_clock(best, experiments)
+    if even is not None:
+        again = refit(best, even[0])
+        if again.rms < best.rms:
+            said.append(even[1])
+            return again, even[0]
+    return best, experiments
 
 
 def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:

@@ -7,7 +7,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.corrections import KINDS, Patch
-from psa_casadi.diagnosis.families import families, known, place_and_kind
+from psa_casadi.diagnosis.families import Shown, families, place_and_kind
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from tests.studies.plants.make import make_record
@@ -35,7 +35,7 @@ def test_every_effect_and_every_unnamed_correction_has_a_family() -> None:
 
 def test_effects_of_one_place_and_kind_are_one_family() -> None:
     chances = {"slow_creep": 0.6, "charge_leakage": 0.3, "offset_drift": 0.1}
-    creep, leak, drift = families(chances, PLACES, 1e15, [], FEW, LIMITS)
+    creep, leak, drift = families(chances, PLACES, Shown(1e15, FEW), [], LIMITS)
     assert (creep.place, creep.kind) == CREEP
     assert [f.probability for f in (creep, leak, drift)] == pytest.approx([0.6, 0.3, 0.1])
     assert not any(f.not_listed for f in (creep, leak, drift))
@@ -49,10 +49,11 @@ def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_n
     same = _patch("relaxation", "force", 1100.0)
     other = _patch("curve", "drive voltage", 1080.0)
     weak = _patch("time", "reading", 5.0)
-    found = families({"slow_creep": 1.0}, PLACES, 1000.0, [same, other, weak], FEW, LIMITS)
+    shown = Shown(1000.0, FEW)
+    found = families({"slow_creep": 1.0}, PLACES, shown, [same, other, weak], LIMITS)
     shares = {(f.place, f.kind): (f.probability, f.not_listed) for f in found}
     odds = float(np.exp(-1.0))
-    tried = known(1000.0, FEW, LIMITS)
+    tried = shown.known(LIMITS)
     assert shares[CREEP] == pytest.approx((tried / (1.0 + odds), 0.0))
     assert shares["drive", "curve"] == pytest.approx((tried * odds / (1.0 + odds),) * 2)
     assert len(shares) == 2
@@ -61,18 +62,21 @@ def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_n
 def test_what_has_no_name_is_shared_by_corrections_alone() -> None:
     """A quarter less evidence are odds of exp(1/2): without the cause they tell little of it."""
     rows = [_patch("memory", "force", 400.0), _patch("curve", "reading", 300.0)]
-    first, second = families({}, {}, 400.0, rows, FEW, LIMITS)
+    shown = Shown(400.0, FEW)
+    first, second = families({}, {}, shown, rows, LIMITS)
     assert (first.place, first.kind) == ("plant", "hysteresis")
     assert (second.place, second.kind) == ("sensor", "curve")
     assert first.not_listed / second.not_listed == pytest.approx(np.exp(0.5))
-    assert first.not_listed + second.not_listed == pytest.approx(known(400.0, FEW, LIMITS))
+    assert first.not_listed + second.not_listed == pytest.approx(shown.known(LIMITS))
 
 
 def test_the_smaller_a_cause_the_likelier_it_is_something_that_nobody_has_thought_of() -> None:
-    """At four times the evidence of the same samples the odds of that are half."""
-    odds = [1.0 / known(e, 4000, LIMITS) - 1.0 for e in (100.0, 400.0, 40000.0)]
-    assert odds[0] / odds[1] == pytest.approx(2.0)
-    assert odds[2] < 0.03
+    """At four times the evidence of the same samples the odds of that are half; of two, twice."""
+    small, large, two = (
+        1.0 / Shown(e, 4000, k).known(LIMITS) - 1.0 for e, k in ((100.0, 1), (400.0, 1), (400.0, 2))
+    )
+    assert small / large == pytest.approx(2.0)
+    assert two / large == pytest.approx(2.0)
 
 
 @slow

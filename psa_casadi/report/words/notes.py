@@ -172,6 +172,11 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " is driven by the curve, and a simulation of such a record needs more samples for each"
         " period."
     ),
+    "even_clock": lambda rms, share, low, high: (
+        f"The time stamps jitter by {quantity(rms, 's')} rms, the samples do not: of what even"
+        f" times change, the base model's error held {share:.2f} ({low:.2f} to {high:.2f}). Even"
+        " times are used; record the sampling rate instead of stamps."
+    ),
     "since": lambda removed, places, open, shown: (
         f"What the base model leaves of the reference is taken off the displacement,"
         f" {quantity(*removed)} rms, {_known_from(places)}.{_not_shown(shown)} A sound device may"

@@ -184,15 +184,17 @@ def score(asked: Question, answer: Answer, families: Mapping[str, str]) -> Score
         return next((k for k, known in enumerate(wide) if family in known), None)
 
     neutral = HYSTERESIS if asked.other_hysteresis else frozenset()
+    if asked.other_hysteresis:  # what is left of it is told rightly, but is none of the hidden
+        wide.append(frozenset({"plant hysteresis"}))
     found, covered, counted = set[int](), {of_family(answer.left)}, []
     for cause in answer.causes:
         hit = _hit_of(cause, sets)
         place = of_family(cause.family) if hit is None else hit
         if hit is not None:
             found.add(hit)
-        if place is not None or cause.effect not in neutral:
+        covered.add(place)
+        if hit is not None or cause.effect not in neutral:
             counted.append((cause, place))
-            covered.add(place)
     right = all(place is not None for _, place in counted)
     stated = [(c.of_family, c.family) for c, _ in counted] or [(answer.of_left, answer.left)]
     return Score(

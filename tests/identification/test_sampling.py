@@ -1,4 +1,4 @@
-"""Voltages that are smooth between their samples, and those that are straight lines."""
+"""Voltages that are smooth between their samples or straight lines, stamps that jitter or not."""
 
 from dataclasses import replace
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.diagnosis.base_fit import smooth_between
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.sampling import even_clock, smooth_between
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
@@ -64,6 +64,32 @@ def test_straight_lines_and_other_errors_are_left_as_they_are() -> None:
     time = experiments[0].record.time
     other = replace(found, residuals=found.residuals + 5e-8 * np.sin(700.0 * time))
     assert smooth_between(other, experiments) is None
+
+
+@pytest.mark.parametrize("stamps", [True, False])
+def test_stamps_that_jitter_are_told_from_samples_that_do(stamps: bool) -> None:
+    """A tenth of a step: either the file's times are wrong, or the samples were taken then."""
+    random = np.random.default_rng(4)
+    even: FloatArray = STEP * np.arange(COUNT)
+    jitter = 0.1 * STEP * np.clip(random.standard_normal(COUNT), -3.0, 3.0)
+    late: FloatArray = np.asarray(even + jitter, dtype=np.float64)
+    late[0] = 0.0
+    taken: FloatArray = even if stamps else late
+    fine = np.sort(np.concatenate([taken, np.linspace(0.0, taken[-1], 4 * COUNT)[1:-1]]))
+    model = stack_model("demo")
+    x = simulate(model, fine, np.interp(fine, taken, _chirp(taken))).displacement
+    shown = np.interp(taken, fine, x) + NOISE * random.standard_normal(COUNT)
+    record = Record(name="r", time=late, voltage=_chirp(taken), displacement=shown)
+    found = fit(model, (whole(record),), FREE[:4], sigma=[NOISE])
+    seen = even_clock(found, (whole(record),))
+    assert (seen is not None) == stamps
+    if seen is not None:
+        (moved,), note = seen
+        assert note.values["rms"] == pytest.approx(0.1 * STEP, rel=0.05)
+        np.testing.assert_allclose(moved.record.time, even, atol=0.01 * STEP)
+        again = fit(found.model, (moved,), FREE[:4], sigma=[NOISE])
+        assert again.rms < 1.05 * NOISE < 0.5 * found.rms
+        assert even_clock(again, (moved,)) is None
 
 
 @pytest.mark.slow
