@@ -70,7 +70,7 @@ def test_straight_lines_and_other_errors_are_left_as_they_are() -> None:
 def test_stamps_that_jitter_are_told_from_samples_that_do(stamps: bool) -> None:
     """A tenth of a step: either the file's times are wrong, or the samples were taken then."""
     random = np.random.default_rng(4)
-    even: FloatArray = STEP * np.arange(COUNT)
+    even: FloatArray = np.linspace(0.0, STEP * (COUNT - 1), COUNT)
     jitter = 0.1 * STEP * np.clip(random.standard_normal(COUNT), -3.0, 3.0)
     late: FloatArray = np.asarray(even + jitter, dtype=np.float64)
     late[0] = 0.0
