@@ -21,9 +21,6 @@ _DOES: dict[str, Kind] = {
 _PLACES = {"drive voltage": "drive", "force": "plant", "reading": "sensor"}
 #: The largest probability that is stated.
 SUREST = 0.99
-#: Share of evidence by which corrections differ and are as likely where no effect is. The likeliest
-#: of 15 such families (exams, study) was right in 5: at 0.02 it had 93 %, at 0.5 it has 38 %.
-_UNNAMED = 0.5
 #: Families less probable than this are not told.
 _LEAST = 0.01
 
@@ -84,12 +81,12 @@ def families(
 
         sum_k exp((F_k - E) / T),   T = max(temperature 2, form_of_evidence E)
 
-    Without any effect the corrections share all, with a form of a half: a model that lacks the
-    cause says little of it. One whose kind nobody has declared may be of any. What is missing to 1
-    is of no kind that was tried (`Shown.known`).
+    Without any effect the corrections share all, with `form_of_unnamed` in that place: a model that
+    lacks the cause says little of it. One whose kind nobody has declared may be of any. What is
+    missing to 1 is of no kind that was tried (`Shown.known`).
     """
     evidence = shown.evidence
-    form = limits.form_of_evidence if probability else _UNNAMED
+    form = limits.form_of_evidence if probability else limits.form_of_unnamed
     scale = max(limits.temperature, form * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
     apart = [(place_and_kind(c), c.evidence) for c in corrections if c.evidence > limits.price]

@@ -19,6 +19,7 @@ from psa_casadi.diagnosis.base_fit import (
     rings,
 )
 from psa_casadi.diagnosis.colour import noise_rms
+from psa_casadi.diagnosis.families import Shown
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.search.fits import (
     afresh,
@@ -48,6 +49,8 @@ _EXPANSIONS, _VISITS = 5, 24
 #: a first and a further cause so many get some. The noise is told too low by what was projected out
 #: of it: 1.7 % where 132 directions were taken out of 3,900 samples.
 _SETTLED, _AFRESH, _AFRESH_FURTHER = 1.03, 5, 2
+#: Causes that could not be named with this probability are small.
+_SURELY = 0.9
 #: So many neighbours are fitted first.
 _PACE = 2
 
@@ -127,7 +130,16 @@ class _Search:
             return self.next()
         if self.known.is_open(best):
             return self.next() if self.otherwise() else self.rejected()
+        if self.is_small(best) and self.once("all afresh", NONE) and self.does("all afresh"):
+            self.all_afresh()
+            return self.next()
         return None
+
+    def is_small(self, h: Hypothesis) -> bool:
+        """Whether causes are so small beside the noise that others may be as likely."""
+        count = len(h.fit.residuals)
+        shown = Shown(self.known.scale.evidence(h), count, len(h.causes))
+        return bool(h.causes) and shown.known(self.task.limits) < _SURELY
 
     def rejected(self) -> Hypothesis | None:
         """Return the best of what held-out samples reject that may lack a cause.
