@@ -10,6 +10,7 @@ from psa_casadi.diagnosis.corrections import KINDS, Patch
 from psa_casadi.diagnosis.families import Shown, families, place_and_kind
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
+from psa_casadi.report.words.verdict_words import family_sentence
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
 
@@ -77,6 +78,16 @@ def test_the_smaller_a_cause_the_likelier_it_is_something_that_nobody_has_though
     )
     assert small / large == pytest.approx(2.0)
     assert two / large == pytest.approx(2.0)
+
+
+def test_the_sentence_names_what_no_effect_is_and_what_was_not_tried() -> None:
+    chances, weak = {"slow_creep": 1.0}, Shown(100.0, 4000)
+    rival = _patch("curve", "reading", 98.0)
+    told = family_sentence(families(chances, PLACES, weak, [rival], LIMITS))
+    assert "a relaxation in the stack" in told
+    assert "none of the listed effects" in told
+    assert told.endswith("or something that was not tried (20 %)")
+    assert not family_sentence(())
 
 
 @slow

@@ -1,5 +1,6 @@
 """Fits of a model with one cause more, one less, or another: from its parent and afresh."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
 from psa_casadi.identification.refitting import quick_rtol, refit, weighted
-from psa_casadi.identification.start.ordinary import ordinary_values
+from psa_casadi.identification.start.ordinary import has_loop, ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import is_stack
@@ -203,7 +204,7 @@ def with_causes_afresh(
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
     ordinary = _ordinary_base(before.fit, experiments)
-    states = tuple(before.fit.starts())
+    states = _states(before.fit, ordinary)
     quick = fit_with_all(before.fit, experiments, added, states, ordinary, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
 
@@ -417,20 +418,33 @@ def _from_ordinary(
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
     values = _ordinary_form(effect, known)
-    ordinary = _ordinary_base(before, experiments)
+    loops = (False, True) if has_loop(before.model) else (False,)
+    bases = [_ordinary_base(before, experiments, soon=soon) for soon in loops]
 
-    def begun(share: float) -> Fit | None:
-        added, states = [(effect, values, share * size)], tuple(before.starts())
+    def begun(start: tuple[dict[str, float], float]) -> Fit | None:
+        ordinary, share = start
+        added, states = [(effect, values, share * size)], _states(before, ordinary)
         return fit_with_all(before, experiments, added, states, ordinary, QUICK)
 
-    return [f for f in side_by_side(begun, sizes) if f is not None]
+    starts = list(itertools.product(bases, sizes))
+    return [f for f in side_by_side(begun, starts) if f is not None]
 
 
-def _ordinary_base(before: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
+def _ordinary_base(
+    before: Fit, experiments: Sequence[Experiment], *, soon: bool = False
+) -> dict[str, float]:
     """Return the values of an ordinary stack; any other model goes on from its own."""
     if not is_stack(before.model):
         return {}
-    return ordinary_values(before.model, [e.record for e in fitted(experiments)])
+    return ordinary_values(before.model, [e.record for e in fitted(experiments)], soon=soon)
+
+
+def _states(before: Fit, ordinary: Mapping[str, float]) -> tuple[dict[str, float], ...]:
+    """Return the states in which records begin; of an ordinary stack they are at rest.
+
+    Those of a loop that is bent would bend the ordinary one.
+    """
+    return () if ordinary else tuple(before.starts())
 
 
 def _best_continued(

@@ -277,14 +277,22 @@ def loop_starts(model: Model) -> list[dict[str, float]]:
     ]
 
 
-def ordinary_values(model: Model, records: Sequence[Record]) -> dict[str, float]:
+#: A and beta over k_L, and n, of an ordinary loop that saturates late, and of one that does so soon.
+_LATE, _SOON = (-0.15, 0.1, 1.2), (-0.3, 0.5, 1.2)
+
+
+def ordinary_values(
+    model: Model, records: Sequence[Record], *, soon: bool = False
+) -> dict[str, float]:
     """Return an ordinary loop, some 12 % wide, and lags below the sampling, to the records' size.
 
+    A search that begins with a loop that saturates late may end beside one that does so `soon`.
     k_L comes from the regression of displacement on voltage: that of a fitted model may be far off
     it, since a steep loop trades k_L for A.
     """
     k_l = max(abs(static_slope(records)), 1e-12) / static_compliance(model.values)
-    loop = {"A": -0.15 * k_l, "beta": 0.1 * k_l, "gamma": 0.0, "delta": 0.0, "n": 1.2}
+    a, beta, n = _SOON if soon else _LATE
+    loop = {"A": a * k_l, "beta": beta * k_l, "gamma": 0.0, "delta": 0.0, "n": n}
     shape = loop if has_loop(model) else {}
     return {"k_L": k_l, **shape, **_lags(model.values, min(r.sample_time for r in records))}
 

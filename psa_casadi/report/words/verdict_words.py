@@ -157,6 +157,8 @@ def named_cause(cause: Cause) -> str:
     return f"{phrases.plain(cause.effect)} ({sure})"
 
 
+#: Something that was not tried is told from this probability on.
+_TOLD = 0.005
 #: What effects of a kind do, and the places of a rig.
 _DOES = {
     "curve": "a bent static curve",
@@ -178,7 +180,10 @@ _PLACES = {
 
 
 def family_sentence(families: Sequence[Family]) -> str:
-    """Say what a cause does and where it sits, and how far it may be none of the listed effects."""
+    """Say what a cause does and where it sits, and how far it may be none of the listed effects.
+
+    Or nothing that was tried.
+    """
     parts = []
     for f in families:
         place = _PLACES.get(f.place, f.place)
@@ -186,6 +191,9 @@ def family_sentence(families: Sequence[Family]) -> str:
         if not f.effects and any(other.effects for other in families):
             part += ", none of the listed effects"
         parts.append(part)
+    rest = 1.0 - sum(f.probability for f in families)
+    if families and rest >= _TOLD:
+        parts.append(f"something that was not tried ({phrases.percent(rest)})")
     return phrases.listing(parts, "or")
 
 
