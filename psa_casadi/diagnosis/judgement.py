@@ -47,19 +47,16 @@ _CANCEL = 5.0
 
 @dataclass(frozen=True)
 class Weighed:
-    """Causes against the unnamed corrections beside the model without them.
+    """Causes against the unnamed `corrections` beside the model without them.
 
     `evidence` of the causes together over that model; `share` that they remove of its held-out
-    excess, outputs over their noise, and `each` of every output by itself that it clearly misses;
-    `shares` are those that the `corrections` would remove.
+    excess, outputs over their noise, and `each` of every output by itself that it clearly misses.
     """
 
     evidence: float
-    causes: int
     share: float
     each: Mapping[str, float]
     corrections: Sequence[Correction]
-    shares: Sequence[float]
     limits: Thresholds
 
     @property
@@ -71,19 +68,6 @@ class Weighed:
     def least(self) -> tuple[str, float]:
         """The output of which the least is removed, "" for all together, and that share."""
         return min({"": self.share, **self.each}.items(), key=lambda item: item[1])
-
-    def beaten_by(self) -> tuple[Correction, float] | None:
-        """Return the unnamed correction that takes the names away, and what it would remove.
-
-        It has more evidence, a price paid for it too, and they remove less than `enough` of what it
-        removes of the held-out excess: it has more freedom.
-        """
-        limits = self.limits
-        own = self.evidence - limits.price * self.causes
-        for c, share in zip(self.corrections, self.shares, strict=True):
-            if self.share < limits.enough * max(share, 0.0) and c.evidence - limits.price > own:
-                return c, share
-        return None
 
 
 def told_from(step: Step, limits: Thresholds) -> tuple[str, ...]:
@@ -182,11 +166,9 @@ class Judge:
         }
         return Weighed(
             evidence=scale.evidence(after) - scale.evidence(before),
-            causes=len(after.causes) - len(before.causes),
             share=removed.from_base(after.shown),
             each=each,
             corrections=found,
-            shares=[removed.from_base(c.predicted) for c in found],
             limits=self.limits,
         )
 
@@ -197,15 +179,10 @@ class Judge:
         return self.weigh(*both, beside=self.missing and self.driven)
 
     @cached_property
-    def stands(self) -> bool:
-        """Whether neither a correction nor a doubt takes all names away."""
-        return self.weighed.beaten_by() is None and self.doubt is None
-
-    @cached_property
     def each(self) -> dict[str, Weighed]:
         """Every cause by itself, against corrections of the model without it, all others kept."""
         last, found = self.last.view.of, {}
-        for s in self.steps if self.stands else ():
+        for s in self.steps if self.doubt is None else ():
             if s.chosen is not None and s.without is not None:
                 alone = s.without.fit is self.first.fit
                 found[s.cause.name] = self.weighed if alone else self.weigh(s.without, last)
@@ -213,18 +190,11 @@ class Judge:
 
     @cached_property
     def vague(self) -> dict[str, Correction]:
-        """Causes that an unnamed correction describes better, by name.
-
-        One of several that it beats, and any that is rather none of the listed effects.
-        """
+        """Causes that are rather none of the listed effects, with the best unnamed correction."""
         better: dict[str, Correction] = {}
         for name, weighed in self.each.items():
-            beaten = weighed.beaten_by() if len(self.steps) > 2 else None
             of = self.families[name]
-            listed = sum(sum(f.effects.values()) for f in of)
-            if beaten is not None:
-                better[name] = beaten[0]
-            elif sum(f.not_listed for f in of) > listed:
+            if sum(f.not_listed for f in of) > sum(sum(f.effects.values()) for f in of):
                 others = {(f.place, f.kind) for f in of if not f.effects}
                 found = [c for c in weighed.corrections if place_and_kind(c) in others]
                 better[name] = max(found, key=lambda c: c.evidence)
@@ -254,7 +224,7 @@ class Judge:
             return "not_driven"
         if not self.missing:
             return "adequate"
-        if not self.stands or not found or little:
+        if self.doubt is not None or not found or little:
             return "unexplained"
         if told_from(found[0], self.limits):
             return "ambiguous"
@@ -264,7 +234,7 @@ class Judge:
     @cached_property
     def kept(self) -> tuple[Step, ...]:
         """The steps to the causes that the extended model holds, named or not."""
-        weak = self.verdict == "unexplained" and self.stands and not self.vague
+        weak = self.verdict == "unexplained" and self.doubt is None and not self.vague
         if self.verdict in NAMING or (weak and self.weighed.adds):
             return tuple(s for s in self.steps if s.chosen is not None)
         return ()
@@ -345,20 +315,13 @@ class Judge:
         )
 
     def withdrawn(self) -> tuple[Note, ...]:
-        """Return which names were found but not told, and why.
-
-        An unnamed correction has beaten all of them, or some have beaten each of them.
-        """
+        """Return which names were found but not told, and why."""
         names = tuple(s.cause.name for s in self.steps if s.chosen is not None)
         if not names:
             return ()
         (output, share), kept = self.weighed.least, False
-        beaten = self.weighed.beaten_by()
         if self.doubt is not None:
             why = self.doubt
-        elif beaten is not None:
-            by, theirs = beaten
-            why = note("beaten", by=by.said, evidence=by.evidence, share=theirs)
         elif self.vague:
             why = self._better()
         else:

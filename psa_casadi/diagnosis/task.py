@@ -67,10 +67,8 @@ class Thresholds:
     * `clearly`: tempered odds [nats] below which another correction, or another effect in a
       cause's place, is as likely as the best one: 20 to 1.
     * `enough`: share of the held-out excess that causes must remove to be named where structure
-      remains; and of what an unnamed correction removes, which has more freedom.
-      Of the names that were told although structure remained (study, sets of causes, exam) all 16
-      that removed less than 66 % were wrong, right ones removed 82 % and more. Beside a correction
-      all that removed 52 % and less were wrong, right ones 83 % and more (46 cases).
+      remains. Of the names that were told although it did (study, sets of causes, exam) all 16
+      that removed less than 66 % were wrong, right ones removed 82 % and more.
     * `follows`, `falling`: share of the displacement's variance that the voltage must explain; and
       correlation with it below which the other sign is tried.
     """

@@ -277,7 +277,7 @@ def loop_starts(model: Model) -> list[dict[str, float]]:
     ]
 
 
-#: A and beta over k_L, and n, of an ordinary loop that saturates late, and of one that does so soon.
+#: A and beta over k_L, and n, of ordinary loops: one that saturates late, and one soon.
 _LATE, _SOON = (-0.15, 0.1, 1.2), (-0.3, 0.5, 1.2)
 
 

@@ -256,7 +256,6 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         + "; ".join(f"{what}, instead of {name}" for what, name in each)
         + ")"
     ),
-    "beaten": ("an unnamed correction explains more: {by}, with {evidence:.0f} and {share:.0p} %"),
     "little": "that is less than {least:.0p} % and much remains",
     "correction": correction,
     "free": "a free function of {of} in {port}",
