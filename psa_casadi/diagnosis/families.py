@@ -79,14 +79,14 @@ def families(
     `corrections` stand. With the evidence F_k, above the price of a cause, of a correction whose
     kind no likely effect has, and that E of the cause, the odds that it is not listed are
 
-        sum_k exp((F_k - E) / T),   T = max(temperature 2, form_of_evidence E)
+        sum_k exp((F_k - E) / T),   T = max(temperature 2, further E)
 
     Without any effect the corrections share all, with `form_of_unnamed` in that place: a model that
     lacks the cause says little of it. One whose kind nobody has declared may be of any. What is
     missing to 1 is of no kind that was tried (`Shown.known`).
     """
     evidence = shown.evidence
-    form = limits.form_of_evidence if probability else limits.form_of_unnamed
+    form = limits.further if probability else limits.form_of_unnamed
     scale = max(limits.temperature, form * evidence)
     own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
     apart = [(place_and_kind(c), c.evidence) for c in corrections if c.evidence > limits.price]

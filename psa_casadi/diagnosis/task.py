@@ -32,12 +32,12 @@ class Thresholds:
 
     What counts as an explanation:
 
-    * `price`: prior of a cause [nats]. The largest evidence of any effect on 114 of 115 clean
-      records was 7.8.
-    * `noise`: evidence of a cause [nats] where each residual may be noise of a colour of its own.
-      The largest of any effect on clean records with odd noise was 11.2, once of 30; the price.
+    * `price`: prior of a cause [nats], and its least evidence where each residual may be noise of a
+      colour of its own. The largest of any effect on 114 of 115 clean records was 7.8; on 30 with
+      odd noise and colours of their own 11.2 once.
     * `further`: share of what the other causes remove that a further one must. An effect's own form
-      is not the true one; less may be that.
+      is not the true one; less may be that. So is an unnamed correction of another kind as likely
+      as a cause within this share of its evidence.
     * `static`: share of what a cause with a memory adds that may be a curve of the voltage alone.
       Memories of plants and of measured stacks: 5 to 86 %; gains and loads that a memory imitates:
       91 to 94 %.
@@ -46,18 +46,13 @@ class Thresholds:
       named; causes that are not named stay in the model where they remove more together.
     * `held_out`: gain in log-likelihood that held-out samples must show, and all samples together.
     * `most_causes`: of one hypothesis.
-    * `ringing`: a resonance near the band is tried where its ringing explains this share of what
-      the best effect would.
-    * `better`: a hypothesis is looked at again when its rms falls to this share.
 
     How sure:
 
     * `temperature`, `temperature_share`: evidence is divided by this, or by this share of the
       largest, before it becomes a probability. From the reliability table of the benchmark
       `diagnose`: the effects are not the true equations.
-    * `form_of_evidence`: share of a cause's evidence by which an unnamed correction of another
-      kind may differ and be as likely. The listed effects' forms are not the true ones.
-    * `form_of_unnamed`: the same where nothing is named. The likeliest of 22 such families (exams,
+    * `form_of_unnamed`: that share where nothing is named. The likeliest of 22 such families (exams,
       study) was right in 7: with 0.02 it would have 94 %, with this 36 %.
     * `unknown`: odds, at one nat a sample, that something which nobody has thought of looks like a
       cause alone. Of 193 names that had 90 % and more (exams, study; two draws of seeds) 173 were
@@ -81,17 +76,13 @@ class Thresholds:
     form_of_range: float = 2e-5
     dithered: float = 1.2
     price: float = 8.0
-    noise: float = 8.0
     further: float = 0.02
     static: float = 0.9
     form: float = 0.05
     held_out: float = 1.0
     most_causes: int = 3
-    ringing: float = 0.4
-    better: float = 0.95
     temperature: float = 2.0
     temperature_share: float = 0.004
-    form_of_evidence: float = 0.02
     form_of_unnamed: float = 0.5
     unknown: float = 0.04
     credible: float = 0.95

@@ -51,6 +51,9 @@ _EXPANSIONS, _VISITS = 5, 24
 _SETTLED, _AFRESH, _AFRESH_FURTHER = 1.03, 5, 2
 #: Causes that could not be named with this probability are small.
 _SURELY = 0.9
+#: A hypothesis is looked at again when its rms falls to this share; a resonance near the band is
+#: tried where its ringing explains this share of what the best effect would.
+_BETTER, _RINGING = 0.95, 0.4
 #: So many neighbours are fitted first.
 _PACE = 2
 
@@ -183,7 +186,7 @@ class _Search:
     def unseen(self, h: Hypothesis) -> bool:
         """Whether a hypothesis was not visited yet, or has become much better since."""
         last = self.expanded.get(h.names)
-        if last is None or h.fit.rms < self.task.limits.better * last.fit.rms:
+        if last is None or h.fit.rms < _BETTER * last.fit.rms:
             return True
         return h is self.known.best() and self.known.gained(last, h)
 
@@ -335,7 +338,7 @@ class _Search:
         rung = ringing(h.fit, experiments)
         if rung is None or rung.decrease < SEEN:
             return False
-        if view.shows and rung.decrease < self.task.limits.ringing * view.decrease:
+        if view.shows and rung.decrease < _RINGING * view.decrease:
             return False
         found = from_band(h.fit, experiments, task.progress)
         own = hypothesis(h.causes, found, experiments, final=True)

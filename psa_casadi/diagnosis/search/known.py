@@ -246,7 +246,7 @@ class Known:
         that back.
         """
         if (h, before) not in self.noises:
-            least = self.task.limits.noise
+            least = self.task.limits.price
             found = h.beyond_noise(before) > least
             if found and before.own[0].autoregression.size:
                 led = as_led(h, cause, self.task.experiments)
