@@ -140,8 +140,7 @@ class _Search:
 
     def is_small(self, h: Hypothesis) -> bool:
         """Whether causes are so small beside the noise that others may be as likely."""
-        count = len(h.fit.residuals)
-        shown = Shown(self.known.scale.evidence(h), count, len(h.causes))
+        shown = Shown(self.known.scale.evidence(h), len(h.fit.residuals))
         return bool(h.causes) and shown.known(self.task.limits) < _SURELY
 
     def rejected(self) -> Hypothesis | None:
@@ -174,13 +173,16 @@ class _Search:
         return True
 
     def led(self, h: Hypothesis) -> bool:
-        """Take every cause out of a hypothesis that was not challenged yet; whether that was new.
+        """Fit the base again without each cause of a hypothesis; whether that is done anew.
 
         Even one that may not be the answer can have led the base to where it needs no cause.
         """
-        new = bool(h.causes) and h.final and self.once("challenged", h.names)
-        if new:
-            self.challenge(h)
+        new = bool(h.causes) and h.final and self.once("base again", h.names)
+        for cause in h.causes if new else ():
+            less = self.known.found.get(h.names - {cause.name})
+            if (less is None or not cause.more_of) and self.does("base again"):
+                self.task.progress(f"without {cause.name}")
+                self.known.note(without(h, cause, self.task.experiments, less))
         return new
 
     def unseen(self, h: Hypothesis) -> bool:
@@ -193,11 +195,12 @@ class _Search:
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""
         series = has_series(h)
-        if self.led(h):
+        if h.causes and self.once("challenged", h.names):
+            self.challenge(h)
             return
         view = self.known.view(h)
         if not series and self.resonances(h, view):
-            self.done.discard(("challenged", h.names))
+            self.done -= {("challenged", h.names), ("base again", h.names)}
             return
         self.expanded[h.names] = h
         if self.several_modes(h, view):
@@ -300,12 +303,8 @@ class _Search:
 
         Several modes that leave structure are challenged by a single one.
         """
+        self.led(h)
         task = self.task
-        for cause in h.causes:
-            less = self.known.found.get(h.names - {cause.name})
-            if (less is None or not cause.more_of) and self.does("base again"):
-                task.progress(f"without {cause.name}")
-                self.known.note(without(h, cause, task.experiments, less))
         before = self.known.found.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
