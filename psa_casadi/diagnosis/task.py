@@ -52,8 +52,8 @@ class Thresholds:
     * `temperature`, `temperature_share`: evidence is divided by this, or by this share of the
       largest, before it becomes a probability. From the reliability table of the benchmark
       `diagnose`: the effects are not the true equations.
-    * `form_of_unnamed`: that share where nothing is named. The likeliest of 22 such families (exams,
-      study) was right in 7: with 0.02 it would have 94 %, with this 36 %.
+    * `form_of_unnamed`: that share where nothing is named. The likeliest of 22 such families
+      (exams, study) was right in 7: with 0.02 it would have 94 %, with this 36 %.
     * `unknown`: odds, at one nat a sample, that something which nobody has thought of looks like a
       cause alone. Of 193 names that had 90 % and more (exams, study; two draws of seeds) 173 were
       right: 97 % above half a nat a sample, 81 % below; 96 % alone, 84 % of several. Odds as

@@ -164,7 +164,7 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     rms = 1e6 * np.sqrt(np.mean(held**2))
     assert page.text.startswith("Diagnosis of oscillator: cause named")
     assert (
-        "The cause is hysteresis of x in v (the rate of v, confidence 99 %: virtually certain):"
+        "The cause is hysteresis of x in v (the rate of v, confidence 98 %: extremely likely):"
         f" it removes {d.budget.together.percents[0]} % of the base" in page.text
     )
     assert "position: error on held-out samples, rms base model 160 µm" in page.text

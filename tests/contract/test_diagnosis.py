@@ -75,7 +75,7 @@ def test_the_demos_diagnosis_names_the_hidden_cause(demo: Demo) -> None:
     assert d["verdict"] == "cause_named"
     (cause,) = d["causes"]
     assert (cause["effect"], cause["belongs_to"]) == ("slow_creep", "plant")
-    assert cause["confidence"] > 0.95
+    assert cause["confidence"] > 0.93
     assert cause["cannot_be_told_from"] == []
     for name, unit in (("creep_gain", "1"), ("creep_time", "s")):
         estimate = cause["parameters"][name]
