@@ -215,11 +215,19 @@ class Judge:
             if s.chosen is not None and s.cause.name in self.each
         }
 
+    @property
+    def least(self) -> float:
+        """The share of the held-out excess that causes must remove to be named.
+
+        More where structure remains; else held-out samples need only show them.
+        """
+        return self.limits.enough if self.last.test.alarm else self.limits.form
+
     @cached_property
     def verdict(self) -> Verdict:
         """The verdict; the first of these that is so decides."""
         found = [s for s in self.steps if s.chosen is not None and s.cause.name not in self.vague]
-        little = self.last.test.alarm and self.weighed.least[1] < self.limits.enough
+        little = self.weighed.least[1] < self.least
         if not self.driven:
             return "not_driven"
         if not self.missing:
@@ -325,7 +333,8 @@ class Judge:
         elif self.vague:
             why = self._better()
         else:
-            why, kept = note("little", least=self.limits.enough), self.weighed.adds
+            more = self.last.test.alarm
+            why, kept = note("little", least=self.least, more=more), self.weighed.adds
         return (
             note("withdrawn", names=names, evidence=self.weighed.evidence, share=max(0.0, share),
                  output=output, kept=kept, why=why),

@@ -256,7 +256,9 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         + "; ".join(f"{what}, instead of {name}" for what, name in each)
         + ")"
     ),
-    "little": "that is less than {least:.0p} % and much remains",
+    "little": lambda least, more: (
+        f"that is less than {100.0 * least:.0f} %" + " and much remains" * more
+    ),
     "correction": correction,
     "free": "a free function of {of} in {port}",
     "would_remove": lambda what, share: (
