@@ -76,11 +76,13 @@ def families(
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
     families; what is `shown` of the cause is over the model without it, beside which the
-    `corrections` stand. With the evidence F_k, above the price of a cause, of a correction whose
-    kind no likely effect has, and that E of the cause, the odds that it is not listed are
+    `corrections` stand. With the evidence F_k, above the price of a cause, of each correction and
+    that E of the cause, the odds that it is not listed are
 
-        sum_k exp((F_k - E) / T),   T = max(temperature 2, further E)
+        sum_k exp((F_k - E*) / T),   T = max(temperature 2, further E)
 
+    over corrections whose kind no likely effect has; E* is E, or F of one of its kind if larger.
+    One of its kind has more freedom: it counts where `enough` of its F is more than E.
     Without any effect the corrections share all, with `form_of_unnamed` in that place: a model that
     lacks the cause says little of it. One whose kind nobody has declared may be of any. What is
     missing to 1 is of no kind that was tried (`Shown.known`).
@@ -93,8 +95,9 @@ def families(
     most = max([evidence, *(e for family, e in apart if family[1] in own)])
     others: dict[tuple[str, str], float] = {}
     for family, each in apart:
-        if family[1] not in own and "" not in own:
-            odds = float(np.exp(min((each - most) / scale, 50.0)))
+        if "" not in own:
+            ahead = limits.enough * each - evidence if family[1] in own else each - most
+            odds = float(np.exp(min(ahead / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     listed = (
         shown.known(limits) / (bool(probability) + sum(others.values()))

@@ -195,7 +195,7 @@ class Judge:
         for name, weighed in self.each.items():
             of = self.families[name]
             if sum(f.not_listed for f in of) > sum(sum(f.effects.values()) for f in of):
-                others = {(f.place, f.kind) for f in of if not f.effects}
+                others = {(f.place, f.kind) for f in of if f.not_listed > 0.0}
                 found = [c for c in weighed.corrections if place_and_kind(c) in others]
                 better[name] = max(found, key=lambda c: c.evidence)
         return better
