@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from psa_casadi.diagnosis.colour import OwnColour, rms
+from psa_casadi.diagnosis.colour import rms
 from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
 from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
+from psa_casadi.diagnosis.own_colour import OwnColour
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage

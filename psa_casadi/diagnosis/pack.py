@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from psa_casadi.component import DISPLACEMENT_PEAKS, Component
-from psa_casadi.diagnosis.colour import Colour, Omnibus, noise_rms, omnibus
+from psa_casadi.diagnosis.colour import Colour, noise_rms
 from psa_casadi.diagnosis.noise import knowable_of, known_colour
+from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
 from psa_casadi.errors import PsaError

@@ -8,10 +8,10 @@ import pytest
 from scipy.signal import lfilter
 
 from psa_casadi.components import BASE
-from psa_casadi.diagnosis.colour import OwnColour, own_colour
 from psa_casadi.diagnosis.confirmation import held_out_excess
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.noise import noise_floor
+from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit

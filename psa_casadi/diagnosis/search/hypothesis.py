@@ -20,15 +20,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.colour import (
-    Colour,
-    Omnibus,
-    OwnColour,
-    own_colour,
-    residual_colour,
-    rms,
-)
+from psa_casadi.diagnosis.colour import Colour, residual_colour, rms
 from psa_casadi.diagnosis.held_out import held_out_gain
+from psa_casadi.diagnosis.omnibus import Omnibus
+from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
 from psa_casadi.diagnosis.screening import Score, Screening, estimated, evidence, occam, screen

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.colour import Omnibus
+from psa_casadi.diagnosis.omnibus import Omnibus
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.screening import (

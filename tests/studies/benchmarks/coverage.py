@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.colour import whiteness
+from psa_casadi.diagnosis.omnibus import whiteness
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
