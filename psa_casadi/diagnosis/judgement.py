@@ -219,9 +219,12 @@ class Judge:
     def least(self) -> float:
         """The share of the held-out excess that causes must remove to be named.
 
-        More where structure remains; else held-out samples need only show them.
+        More where structure remains; else held-out samples need only show them, unless a further
+        column may do so alone.
         """
-        return self.limits.enough if self.last.test.alarm else self.limits.form
+        if self.last.test.alarm:
+            return self.limits.enough
+        return -np.inf if self.first.fit.further else self.limits.form
 
     @cached_property
     def verdict(self) -> Verdict:

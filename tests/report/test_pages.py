@@ -86,7 +86,8 @@ def test_every_note_has_a_sentence_that_takes_its_values() -> None:
 
 def test_values_have_their_units_and_names_stand_in_a_row() -> None:
     assert str(note("noise_repeats", apart=(0.02, "s"))).endswith("returns after 20 ms")
-    assert str(note("little", least=0.7)) == "that is less than 70 % and much remains"
+    assert str(note("little", least=0.7, more=True)) == "that is less than 70 % and much remains"
+    assert str(note("little", least=0.05, more=False)) == "that is less than 5 %"
     said = str(note("vague", names=("a", "b"), why=note("no_such_voltage")))
     assert said.startswith("a, b: in the extended model and not named: no stack bears")
     assert str(note("same_curve", effects=("a", "b", "c"))).startswith("a and b and c bend")
