@@ -200,6 +200,11 @@ class Judge:
                 better[name] = max(found, key=lambda c: c.evidence)
         return better
 
+    @property
+    def needless(self) -> set[str]:
+        """Causes without which the model is as likely: the search has not dropped them."""
+        return {n for n, weighed in self.each.items() if weighed.evidence <= self.limits.price}
+
     @cached_property
     def families(self) -> dict[str, tuple[Family, ...]]:
         """The places and kinds that every cause may be of, by its name."""
@@ -229,7 +234,8 @@ class Judge:
     @cached_property
     def verdict(self) -> Verdict:
         """The verdict; the first of these that is so decides."""
-        found = [s for s in self.steps if s.chosen is not None and s.cause.name not in self.vague]
+        unnamed = {*self.vague, *self.needless}
+        found = [s for s in self.steps if s.chosen is not None and s.cause.name not in unnamed]
         little = self.weighed.least[1] < self.least
         if not self.driven:
             return "not_driven"
@@ -302,7 +308,7 @@ class Judge:
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
         """The causes that are named."""
-        unnamed = {*self.vague, *(c.what for c in self.small)}
+        unnamed = {*self.vague, *self.needless, *(c.what for c in self.small)}
         steps = self.kept if self.verdict in NAMING else ()
         return tuple(self.named(s) for s in steps if s.cause.name not in unnamed)
 
