@@ -99,11 +99,8 @@ def families(
             ahead = limits.enough * each - evidence if family[1] in own else each - most
             odds = float(np.exp(min(ahead / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
-    listed = (
-        shown.known(limits) / (bool(probability) + sum(others.values()))
-        if probability or others
-        else 0.0
-    )
+    odds_of_all = bool(probability) + sum(others.values())
+    listed = shown.known(limits) / odds_of_all if odds_of_all else 0.0
     found: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
     for name, p in probability.items():
         if name in places:

@@ -201,9 +201,10 @@ class Judge:
         return better
 
     @property
-    def needless(self) -> set[str]:
-        """Causes without which the model is as likely: the search has not dropped them."""
-        return {n for n, weighed in self.each.items() if weighed.evidence <= self.limits.price}
+    def unnamed(self) -> set[str]:
+        """Causes that are vague, or without which the model is as likely."""
+        price = self.limits.price
+        return {*self.vague, *(n for n, own in self.each.items() if own.evidence <= price)}
 
     @cached_property
     def families(self) -> dict[str, tuple[Family, ...]]:
@@ -234,7 +235,7 @@ class Judge:
     @cached_property
     def verdict(self) -> Verdict:
         """The verdict; the first of these that is so decides."""
-        unnamed = {*self.vague, *self.needless}
+        unnamed = self.unnamed
         found = [s for s in self.steps if s.chosen is not None and s.cause.name not in unnamed]
         little = self.weighed.least[1] < self.least
         if not self.driven:
@@ -308,7 +309,7 @@ class Judge:
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
         """The causes that are named."""
-        unnamed = {*self.vague, *self.needless, *(c.what for c in self.small)}
+        unnamed = {*self.unnamed, *(c.what for c in self.small)}
         steps = self.kept if self.verdict in NAMING else ()
         return tuple(self.named(s) for s in steps if s.cause.name not in unnamed)
 
