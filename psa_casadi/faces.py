@@ -13,7 +13,7 @@ from psa_casadi.diagnosis.task import Method
 from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
 from psa_casadi.identification.identify import StackIdentification
-from psa_casadi.identification.multistart import identify_ode
+from psa_casadi.identification.own_model import identify_ode
 from psa_casadi.identification.result import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.interruption import interruptible_work

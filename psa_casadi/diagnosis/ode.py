@@ -1,9 +1,12 @@
 """Diagnose any model: fit it, search generic effects at its ports, judge."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
+
+import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.free_functions import model_of
@@ -13,25 +16,42 @@ from psa_casadi.diagnosis.judgement import ModelJudge
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
+from psa_casadi.diagnosis.search.hypothesis import hypothesis
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.rivals import fit_rivals
 from psa_casadi.diagnosis.task import Method, Tried
-from psa_casadi.errors import InputError
-from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.experiments import (
+    experiments_of,
+    given_to,
+    told_of_columns,
+    undecided,
+)
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.multistart import free_of, known_zeros, refuse_unfit, search_starts
+from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
 from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.refitting import reweighted, unlike, with_noise
+from psa_casadi.identification.parts import begun, cut, follows, from_starts, held_as
+from psa_casadi.identification.refitting import (
+    refit,
+    reweighted,
+    unlike,
+    weighted,
+    with_noise,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import with_ports
+from psa_casadi.notes import Note, note
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
-from psa_casadi.simulation.sizes import sized, sizes_of
+from psa_casadi.simulation.sizes import sizes_of
 
 #: The steps of a search that are a stack's: they need its voltage, its loop or its resonances.
 _OF_STACKS = frozenset(
     {"one clock", "fits afresh", "resonances", "several modes", "between samples"}
 )
+#: An input that is held is late by half a sampling interval, give or take; a fit explains as much
+#: as another one if it leaves no more than this share of its rms.
+_HALF, _AS_MUCH = (0.3, 0.7), 1.2
 
 
 def diagnose_ode(
@@ -73,38 +93,111 @@ def diagnose_ode(
     none = isinstance(holdout, tuple | list) and not holdout
     held = [] if none else given_to(model, holdout, hold, len(given) + 1)
     shifted = known_zeros(model, zeros)
-    runs = experiments_of(model, given, held, zeros=shifted, known_start=known_start)
     progress("fitting from several starts")
-    base, runs, _ = search_starts(sized(model, runs), runs, free_of(model, free), starts=starts)
+
+    def made(length: int | None) -> tuple[Experiment, ...]:
+        parts = cut(given, length), cut(held, length)
+        return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
+
+    free_choice = undecided(records, hold)
+    base, runs, _, said = from_starts(
+        model, given, made, free_of(model, free), undecided=free_choice, starts=starts
+    )
     if base.interrupted:
         raise KeyboardInterrupt
     table = _table(base, runs, effects, leave_out, [f"zero_of_{n}" for n in shifted])
     searched, so_far = tuple(e.component for e in table.values()), [base]
 
-    def search(base: Fit, experiments: tuple[Experiment, ...]) -> Known:
-        opened = replace(base, model=with_ports(base.model))
+    def task_of(experiments: tuple[Experiment, ...]) -> Task:
         method, pack = Method(without=_OF_STACKS), Pack()
-        task = Task(experiments, searched, pack, method, progress, so_far.append, watch)
-        found = best_first(opened, task)
-        task.keep(found.answer.fit)
-        return found
+        return Task(experiments, searched, pack, method, progress, so_far.append, watch)
 
     try:
-        known = search(base, runs)
-        told = with_noise(known.answer.fit, runs)
-        if unlike(told, runs):
-            progress("searching again, noise by record")
-            known = search(reweighted(base, told), told)
+        known = _search(base, runs, task_of)
+        if free_choice and (other := _held_instead(known, base, task_of)):
+            known, said = other[0], (*said, other[1])
+        whole = held_as(made(None), known.task.experiments[0].record.hold)
+        if len(runs) > len(whole):
+            known = _of_whole(known, task_of(whole)) or known
         fit_rivals(known)
         progress("judging")
         found = ModelJudge(known, base.model, table).conclude()
     except KeyboardInterrupt:
         best = so_far[-1]
         attached = [table[c.name] for c in best.model.effects]
-        whole = model_of(base.model, best, attached, runs, interrupted=True)
-        raise DiagnosisInterrupted(whole) from None
+        cut_off = model_of(base.model, best, attached, runs, interrupted=True)
+        raise DiagnosisInterrupted(cut_off) from None
     noise = noise_found(found.extended_fit, found.experiments, (*given, *held))
-    return found.with_noise(noise, (*known.remarks, *told_of_columns(model, runs)))
+    return found.with_noise(noise, (*said, *known.remarks, *told_of_columns(model, runs)))
+
+
+_Tasks = Callable[[tuple[Experiment, ...]], Task]
+
+
+def _search(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Known:
+    """Search from a base fit, and again where the records' noise differs by what it finds."""
+
+    def once(base: Fit, experiments: tuple[Experiment, ...]) -> Known:
+        task = task_of(experiments)
+        found = best_first(replace(base, model=with_ports(base.model)), task)
+        task.keep(found.answer.fit)
+        return found
+
+    known = once(base, experiments)
+    told = with_noise(known.answer.fit, experiments)
+    if not unlike(told, experiments):
+        return known
+    known.task.progress("searching again, noise by record")
+    return once(reweighted(base, told), told)
+
+
+def _held_instead(known: Known, base: Fit, task_of: _Tasks) -> tuple[Known, Note] | None:
+    """Return what is found with held inputs where one is late by half a sampling interval.
+
+    Of straight lines, and if that explains as much with fewer causes.
+    """
+    best, runs = known.answer, known.task.experiments
+    step = float(np.median([e.record.sample_time for e in runs]))
+    times = [best.fit.model.values[f"{c.name}_time"] for c in best.causes if c.name in _late(base)]
+    if runs[0].record.hold == "zero" or not any(_HALF[0] < t / step < _HALF[1] for t in times):
+        return None
+    held = held_as(runs, "zero")
+    try:
+        found = _search(refit(base, weighted(base, held), sigma=base.sigma), held, task_of)
+    except PsaError:
+        return None
+    less = len(found.answer.causes) < len(best.causes)
+    if not less or found.answer.fit.rms > _AS_MUCH * best.fit.rms:
+        return None
+    gained = found.answer.fit.residuals.size * np.log(best.fit.rms / found.answer.fit.rms)
+    return found, note("hold_found", hold="zero", nats=max(float(gained), 0.0))
+
+
+def _late(base: Fit) -> set[str]:
+    return {f"{kind}_of_{n}" for kind in ("delay", "lag") for n in base.model.input_names}
+
+
+def _of_whole(known: Known, task: Task) -> Known | None:
+    """Return what was found in parts of records as hypotheses of whole ones.
+
+    None where what was found does not follow these.
+    """
+    best, parts = known.answer, known.task.experiments
+    task.progress("fitting the whole records")
+    try:
+        top = begun(best.fit, parts, task.experiments)
+        if not best.causes or not follows(top, task.experiments):
+            return None
+        base = begun(known.root.fit, parts, task.experiments)
+        found = Known(levelled(base, task.experiments)[0], task)
+        for h in (h for h in known.found.values() if h.causes and h.final):
+            with suppress(PsaError):
+                fit = top if h is best else begun(h.fit, parts, task.experiments)
+                found.note(hypothesis(h.causes, fit, task.experiments, final=True))
+        found.conclude()
+    except PsaError:
+        return None
+    return found
 
 
 def _table(

@@ -12,7 +12,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.read.reading import signals_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.signals import Hold, Signals, stairs
+from psa_casadi.records.signals import Hold, Signals, in_parts, stairs
 from psa_casadi.records.split import Channel, Experiment, divided, whole, without_gaps
 from psa_casadi.records.suspects import suspects_of
 from psa_casadi.units import FloatArray, convert, parse_unit, si_unit
@@ -26,6 +26,12 @@ _FIRST_LEVEL = 0.1
 def given_to(model: Model, records: Any, hold: Hold | None, first: int = 1) -> list[Signals]:
     """Return the records that a user gave to a model (`signals_given`). Raises InputError."""
     return signals_given(records, model.input_names, model.output_names, hold=hold, first=first)
+
+
+def undecided(records: Any, hold: Hold | None) -> bool:
+    """Whether nobody said what inputs do between samples: no `hold`, and no `Signals`."""
+    given = records if isinstance(records, list | tuple) else [records]
+    return hold is None and not any(isinstance(r, Signals) for r in given)
 
 
 def experiments_of(
@@ -63,8 +69,13 @@ def experiments_of(
     shadows = [[_shadow(model, s) for s, _ in part] for part in clean]
     split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
     records = cast("Sequence[Any]", [own for part in clean for own in part])
+    begins: dict[str, float] = {}  # a part of a record begins anywhere
+    for s, _ in records:
+        begins[s.sha256] = min(s.time[0], begins.get(s.sha256, np.inf))
     found = [
-        replace(e, record=s, known_start=known_start, remarks=said)
+        replace(
+            e, record=s, known_start=known_start and s.time[0] == begins[s.sha256], remarks=said
+        )
         for e, (s, said) in zip(split, records, strict=True)
     ]
     channels = []
@@ -116,13 +127,16 @@ def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[No
     """
     records = cast("Sequence[Any]", [e.record for e in experiments])
     lines = [r for r in records if r.hold == "linear"]
-    held = {n: tuple(s.name for s in lines if n in stairs(s, (n,))) for n in model.input_names}
+    held = {
+        n: tuple(name for name, own in in_parts(lines) if n in stairs(own[0], (n,)))
+        for n in model.input_names
+    }
     absent = [n for n in model.output_names if all(r.column(n) is None for r in records)]
     spare = {n for r in records for n in (*r.columns, *r.unread)} - set(_units(model))
     stated, units = [n for n, unit in _units(model).items() if unit != "1"], list[Note]()
-    for r in records:
+    for name, (r, *_) in in_parts(records):
         bare = tuple(n for n in stated if r.units.get(n) == "")
-        units += [note("no_unit", record=r.name, names=bare)] if bare else []
+        units += [note("no_unit", record=name, names=bare)] if bare else []
     return (
         *(note("stairs", input=n, records=names) for n, names in held.items() if names),
         *(

@@ -2,15 +2,12 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from psa_casadi.errors import InputError, PsaError, quoted
-from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.refitting import (
     refit,
     relevelled,
@@ -20,19 +17,11 @@ from psa_casadi.identification.refitting import (
     with_noise,
 )
 from psa_casadi.identification.result import (
-    MISSED,
-    Identification,
     StartOutcome,
-    doubts_of,
-    with_told,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent
-from psa_casadi.records.noise_kinds import notes_of
-from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
-from psa_casadi.simulation.sizes import sized
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.variables import Parameter
 
@@ -45,73 +34,6 @@ _DECADES, _CHANGES = 2.3, 2.0
 _SEED = 29
 #: A fit that leaves this share of an output's standard deviation explains nothing of it.
 _ALL = 0.8
-
-
-def identify_ode(
-    model: Model,
-    records: Any,
-    *,
-    free: Sequence[str] | None = None,
-    starts: int = 8,
-    zeros: Sequence[str] = (),
-    known_start: bool = False,
-    hold: Hold | None = None,
-    progress: Progress = silent,
-) -> Identification:
-    """Fit the parameters of a model to all samples of all its records.
-
-    `records` are `Signals`, tables with a column `time`, or CSV files, whose columns bear the names
-    of the model's inputs and outputs. Between samples inputs are straight lines, or constant with
-    `hold="zero"`. Maximum likelihood over all outputs, each with the noise level that it leaves,
-    and where the noise of records differs, each with its own; the parameters stay within their
-    bounds. `free` names the parameters to fit, all that are `fitted` by default. The initial state
-    of every record is estimated too, unless it is known to be the declared one (`known_start`).
-    `zeros` names outputs whose zero is unknown in each record. The search begins at the declared
-    values and at `starts` - 1 random ones within the bounds, and follows the best two to their end.
-    `progress` gets what is done in words, by default a terminal.
-
-    Raises InputError for records or names that do not fit, SimulationError where the model cannot
-    be simulated at its values.
-    """
-    refuse_unfit(model)
-    given = given_to(model, records, hold)
-    runs = experiments_of(
-        model, given, judged=False, zeros=known_zeros(model, zeros), known_start=known_start
-    )
-    progress("fitting from several starts")
-    best, runs, outcomes = search_starts(
-        sized(model, runs), runs, free_of(model, free), starts=starts, progress=progress
-    )
-    found = determinacy(best, runs)
-    result = Identification(
-        model=with_told(
-            best.model, [e.record for e in runs], found.names, found.intervals,
-            force_scale="given", interrupted=best.interrupted,
-        ),
-        fit=best,
-        determinacy=found,
-        experiments=runs,
-        doubts=(),
-        starts=outcomes,
-        interrupted=best.interrupted,
-    )  # fmt: skip
-    doubts = *doubts_of(best, found, outcomes), *_of_outputs(result), *told_of_columns(model, runs)
-    noise = () if best.interrupted else noise_found(best, runs, given)
-    return replace(result, doubts=doubts, notes=notes_of(noise), noise_kinds=noise)
-
-
-def _of_outputs(found: Identification) -> list[Note]:
-    """Return which outputs a model misses, and which it does not follow at all."""
-    said, rms = [], found.rms
-    for o in found.fit.channels:
-        left, noise = rms[o.column], found.noise[o.column]
-        parts = [e.measured(o.number)[e.at(o.number)] for e in found.experiments]
-        share = left / float(np.std(np.concatenate(parts)))
-        if noise > 0 and left > MISSED * noise:
-            said.append(note("output_missed", output=o.column, ratio=left / noise))
-        if share > _ALL:
-            said.append(note("output_not_followed", output=o.column, share=share))
-    return said
 
 
 def free_of(model: Model, free: Sequence[str] | None) -> tuple[str, ...]:
@@ -174,7 +96,7 @@ def search_starts(
     can be simulated.
     """
     sigma = [experiments[0].channels[0].level] * len(experiments)
-    seen = None if experiments[0].known_start else seen_starts(model, experiments)
+    seen = seen_starts(model, experiments)
     rng, declared = np.random.default_rng(_SEED), model.values
     drawn = [{n: _drawn(model.parameter(n), declared, rng) for n in free} for _ in range(1, starts)]
     begins = [("declared values", {}), *((f"random values {k}", v) for k, v in enumerate(drawn, 1))]
@@ -202,11 +124,16 @@ def search_starts(
     outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begins)
     if cut:
         return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
+    return *levelled(best, experiments), outcomes
+
+
+def levelled(best: Fit, experiments: Sequence[Experiment]) -> tuple[Fit, tuple[Experiment, ...]]:
+    """Fit again with the noise that every output leaves; and that of each experiment."""
     best = relevelled(best, experiments, every=True)[0]
     again = with_noise(best, experiments)
     if unlike(again, experiments):
         best = reweighted(best, again)
-    return best, again, outcomes
+    return best, again
 
 
 def _outcome(name: str, end: Fit | None, best: Fit) -> StartOutcome:
@@ -230,7 +157,7 @@ def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[st
         own, known = {}, e.known if e.held_out_whole else e.used
         for output, k in shown:
             readings = e.record.column(output)
-            if readings is None:
+            if readings is None or e.known_start:
                 continue
             valid = readings[known & np.isfinite(readings)]
             if valid.size:

@@ -18,7 +18,8 @@ from psa_casadi.identification.fitting.further import further_of
 from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum
 from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
-from psa_casadi.identification.multistart import free_of, identify_ode
+from psa_casadi.identification.multistart import free_of
+from psa_casadi.identification.own_model import identify_ode
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import noise_levels, weighted
 from psa_casadi.identification.search import free_parameters

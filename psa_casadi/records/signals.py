@@ -137,6 +137,14 @@ def stairs(signals: Signals, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
+def in_parts(records: Iterable[Any]) -> list[tuple[str, list[Any]]]:
+    """Return the parts of every record (`slice`), each by the name of the whole."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    for r in records:
+        found.setdefault((r.name.partition("[")[0], r.sha256), []).append(r)
+    return [(name if own[1:] else own[0].name, own) for (name, _), own in found.items()]
+
+
 def frozen(values: npt.ArrayLike) -> FloatArray:
     """Return numbers that cannot be changed, copied where they could."""
     array = np.asarray(values, dtype=np.float64)

@@ -356,7 +356,17 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     "no_unit": lambda record, names: (
         f"{record} states no unit of {listing(names)}; the model's are taken."
     ),
+    "hold_found": lambda hold, nats: (
+        f"The inputs are {'held' if hold == 'zero' else 'straight lines'} between samples, which"
+        f" explains the records better (ln of the likelihood higher by {nats:.0f}). Nobody said so;"
+        f" if you know better, say --hold {'linear' if hold == 'zero' else 'zero'}."
+    ),
     # the fit
+    "in_parts": lambda parts, lasts: (
+        f"The records are fitted in {parts} parts of {quantity(*lasts)}, each with a state of its"
+        " own to begin with. What the model misses at the beginning of a whole record grows or"
+        " stays, so that one simulation of it cannot be followed."
+    ),
     "own_interrupted": "The search was interrupted; these are the best values so far.",
     "cut_off": "The fit was cut off before it converged; its values are not final.",
     "one_start": (

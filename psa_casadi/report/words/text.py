@@ -1,6 +1,6 @@
 """The results as plain text for a terminal."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
+from psa_casadi.records.signals import in_parts
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words import verdict_words
 from psa_casadi.report.words.misfit_words import strongest
@@ -203,14 +204,15 @@ def check_sentence(report: "CheckReport") -> str:
     return f"{Path(report.path).name} did not pass: {failed}.{against}"
 
 
-def _records_text(experiments: Iterable[Experiment], origin: str) -> str:
+def _records_text(experiments: Sequence[Experiment], origin: str) -> str:
     """Return the records with their samples, duration and what they are."""
-    parts = []
-    for e in experiments:
-        held = int(e.held_out.sum())
+    parts, out = [], {id(e.record): int(e.held_out.sum()) for e in experiments}
+    for name, own in in_parts(e.record for e in experiments):
+        held, lasts = sum(out[id(r)] for r in own), sum(r.duration for r in own)
         rest = f", {held} of them held out" if held else ""
-        size = f"{e.record.n} samples in {number(e.record.duration)} s{rest}"
-        parts.append(f"{e.record.name} ({origin}: {size})")
+        cut = f"{len(own)} parts, " * (len(own) > 1)
+        size = f"{cut}{sum(r.n for r in own)} samples in {number(lasts)} s{rest}"
+        parts.append(f"{name} ({origin}: {size})")
     return "; ".join(parts)
 
 

@@ -1,0 +1,96 @@
+"""Identify a model of one's own from its records."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from psa_casadi.identification.determinacy import determinacy
+from psa_casadi.identification.experiments import (
+    experiments_of,
+    given_to,
+    told_of_columns,
+    undecided,
+)
+from psa_casadi.identification.multistart import free_of, known_zeros, refuse_unfit
+from psa_casadi.identification.noise_found import noise_found
+from psa_casadi.identification.parts import cut, from_starts
+from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
+from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
+from psa_casadi.progress import Progress, silent
+from psa_casadi.records.noise_kinds import notes_of
+from psa_casadi.records.signals import Hold
+
+#: A fit that leaves this share of an output's standard deviation explains nothing of it.
+_ALL = 0.8
+
+
+def identify_ode(
+    model: Model,
+    records: Any,
+    *,
+    free: Sequence[str] | None = None,
+    starts: int = 8,
+    zeros: Sequence[str] = (),
+    known_start: bool = False,
+    hold: Hold | None = None,
+    progress: Progress = silent,
+) -> Identification:
+    """Fit the parameters of a model to all samples of all its records.
+
+    `records` are `Signals`, tables with a column `time`, or CSV files, whose columns bear the names
+    of the model's inputs and outputs. Between samples inputs are straight lines, or constant with
+    `hold="zero"`. Maximum likelihood over all outputs, each with the noise level that it leaves,
+    and where the noise of records differs, each with its own; the parameters stay within their
+    bounds. `free` names the parameters to fit, all that are `fitted` by default. The initial state
+    of every record is estimated too, unless it is known to be the declared one (`known_start`).
+    `zeros` names outputs whose zero is unknown in each record. The search begins at the declared
+    values and at `starts` - 1 random ones within the bounds, and follows the best two to their end.
+    `progress` gets what is done in words, by default a terminal.
+
+    Raises InputError for records or names that do not fit, SimulationError where the model cannot
+    be simulated at its values.
+    """
+    refuse_unfit(model)
+    given = given_to(model, records, hold)
+    shifted = known_zeros(model, zeros)
+    progress("fitting from several starts")
+    best, runs, outcomes, said = from_starts(
+        model, given,
+        lambda length: experiments_of(
+            model, cut(given, length), judged=False, zeros=shifted, known_start=known_start
+        ),
+        free_of(model, free), undecided=undecided(records, hold), starts=starts, progress=progress,
+    )  # fmt: skip
+    found = determinacy(best, runs)
+    result = Identification(
+        model=with_told(
+            best.model, [e.record for e in runs], found.names, found.intervals,
+            force_scale="given", interrupted=best.interrupted,
+        ),
+        fit=best,
+        determinacy=found,
+        experiments=runs,
+        doubts=(),
+        starts=outcomes,
+        interrupted=best.interrupted,
+    )  # fmt: skip
+    doubts = *doubts_of(best, found, outcomes), *_of_outputs(result), *told_of_columns(model, runs)
+    noise = () if best.interrupted else noise_found(best, runs, given)
+    return replace(result, doubts=doubts, notes=(*said, *notes_of(noise)), noise_kinds=noise)
+
+
+def _of_outputs(found: Identification) -> list[Note]:
+    """Return which outputs a model misses, and which it does not follow at all."""
+    said, rms = [], found.rms
+    for o in found.fit.channels:
+        left, noise = rms[o.column], found.noise[o.column]
+        parts = [e.measured(o.number)[e.at(o.number)] for e in found.experiments]
+        share = left / float(np.std(np.concatenate(parts)))
+        if noise > 0 and left > MISSED * noise:
+            said.append(note("output_missed", output=o.column, ratio=left / noise))
+        if share > _ALL:
+            said.append(note("output_not_followed", output=o.column, share=share))
+    return said

@@ -1,0 +1,240 @@
+"""Multiple shooting: records in parts where one simulation of the whole cannot be followed.
+
+What a model misses grows with time where it is unstable or chaotic, and stays where it integrates:
+no fit comes near the data from ordinary starts, and what is missing shows as a drift of its own.
+Each part begins with a state of its own, which is estimated with the parameters (Bock, Recent
+advances in parameter identification techniques for ODE, 1983). Short parts are fitted from several
+starts; then two become one, with the state that the first began with, as long as the model follows
+them. Where it follows the whole records so, they are whole again, from a better start.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from psa_casadi.errors import PsaError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.further import Further
+from psa_casadi.identification.multistart import levelled, search_starts
+from psa_casadi.identification.refitting import POLISH, refit, relevelled, weighted
+from psa_casadi.identification.result import MISSED, StartOutcome
+from psa_casadi.model.compose import Model
+from psa_casadi.notes import Note, note
+from psa_casadi.progress import Progress, silent
+from psa_casadi.records.noise import first_order_noise
+from psa_casadi.records.signals import Hold, Signals
+from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.sizes import sized
+from psa_casadi.units import FloatArray
+
+#: A model follows an output where it misses less than this share of its standard deviation.
+_FOLLOWED = 0.05
+#: Samples of a part at least, and parts at most.
+_FEWEST, _MOST = 64, 64
+#: A model forgets where its outputs depend on the first states less than this at the end, over the
+#: most that they ever do; so large a share of the record is the end.
+_FORGOTTEN, _END = 0.1, 0.1
+#: An error at the beginning of a part grows to so many times its size in it, at most.
+_GROWTH = 1000.0
+#: Nats by which held inputs are likelier than lines, or lines than held ones: a cause's price.
+_LIKELIER = 8.0
+#: Order of the autoregression of a residual.
+_ORDER = 8
+
+#: The experiments of records in parts of so many samples, or whole.
+Made = Callable[[int | None], tuple[Experiment, ...]]
+#: A fit, its experiments, what became of every start, and what is to be said.
+Found = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note, ...]]
+
+
+def from_starts(
+    model: Model,
+    given: Sequence[Signals],
+    made: Made,
+    free: Sequence[str],
+    *,
+    undecided: bool,
+    starts: int,
+    progress: Progress = silent,
+) -> Found:
+    """Return the best fit of a search from several starts, of whole records or of their parts.
+
+    `made` turns the records that were `given` into experiments, `cut` into parts or not. Where it
+    is `undecided` what inputs do between samples, it is what is likelier. Raises SimulationError
+    where whole records cannot be simulated.
+    """
+    runs = made(None)
+    best, whole, outcomes = search_starts(
+        sized(model, runs), runs, free, starts=starts, progress=progress
+    )
+    if best.interrupted:
+        return best, whole, outcomes, ()
+    if not follows(best, whole):
+        progress("fitting parts of the records")
+        found = _in_parts(model, given, made, free, undecided, starts, progress)
+        if found is not None and (found[0].cost < best.cost or len(found[1]) > len(whole)):
+            return found
+    if undecided and (other := held_otherwise(best, whole)):
+        best, whole, said = other
+        return best, whole, outcomes, (said,)
+    return best, whole, outcomes, ()
+
+
+def held_otherwise(
+    of: Fit, experiments: Sequence[Experiment]
+) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
+    """Return the fit with inputs the other way between samples, where that is likelier.
+
+    By `_LIKELIER` nats, sum_j n_j ln(w_j/w'_j), w the rms of what an autoregression leaves of an
+    output's residual: half a sample shows at jumps, whatever slow structure the model misses. All
+    inputs of all records are held, or none is.
+    """
+    hold: Hold = "linear" if any(e.record.hold == "zero" for e in experiments) else "zero"
+    others = held_as(experiments, hold)
+    try:
+        found = refit(of, weighted(of, others), sigma=of.sigma, tolerance=1e-6)
+    except PsaError:
+        return None
+    nats = sum(
+        o.residuals.size * float(np.log(_innovation(o) / _innovation(new)))
+        for o, new in zip(of.channels, found.channels, strict=True)
+    )
+    if nats < _LIKELIER:
+        return None
+    best, again = relevelled(found, others, every=True)
+    return best, again, note("hold_found", hold=hold, nats=nats)
+
+
+def _innovation(o: Further) -> float:
+    """Return the rms of what an autoregression leaves of an output's residual, in its unit."""
+    windows = [sliding_window_view(p, _ORDER + 1) for p in o.parts if p.size > _ORDER]
+    if not windows:
+        return max(o.rms, 1e-300)
+    *past, now = np.vstack(windows).T
+    weights, *_ = np.linalg.lstsq(np.transpose(past), now, rcond=1e-12)
+    left = now - np.transpose(past) @ weights
+    return max(float(np.sqrt(np.mean(left**2))), o.straight, 1e-300)
+
+
+def follows(of: Fit, experiments: Sequence[Experiment]) -> bool:
+    """Whether a model follows every output of the records, but for a small share or its noise."""
+    for o in of.channels:
+        shown = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
+        noise = np.concatenate(
+            [np.full(len(p), first_order_noise(p)[0]) for p in o.parts if p.size]
+        )
+        least = MISSED * float(np.sqrt(np.mean(noise**2)))
+        if o.rms > max(_FOLLOWED * float(np.std(shown)), least):
+            return False
+    return True
+
+
+def _in_parts(
+    model: Model, given: Sequence[Signals], made: Made, free: Sequence[str], undecided: bool,
+    starts: int, progress: Progress,
+) -> Found | None:  # fmt: skip
+    """Return the fit of the longest parts that a model follows, or of whole records.
+
+    None where it follows none, and where it forgets how records began: what it misses is told as
+    well of whole ones.
+    """
+    longest = max(s.n for s in given)
+    length: int | None = max(_FEWEST, -(-sum(s.n for s in given) // _MOST))
+    if length is None or 2 * length > longest:
+        return None
+    parts, said = made(length), list[Note]()
+    try:
+        best, parts, outcomes = search_starts(
+            sized(model, parts), parts, free, starts=starts, progress=progress
+        )
+    except PsaError:
+        return None
+    if best.interrupted or not follows(best, parts):
+        return None
+    if undecided and (other := held_otherwise(best, parts)):
+        best, parts, told = other
+        said.append(told)
+    while length is not None:
+        double = 2 * length if 4 * length <= longest else None
+        longer = held_as(made(double), parts[0].record.hold if said else None)
+        progress("fitting longer parts")
+        try:
+            again = begun(best, parts, longer)
+        except PsaError:
+            break
+        if again.interrupted or not follows(again, longer) or _grows(again, longer):
+            break
+        best, parts, length = again, longer, double
+    if length is not None:
+        if _forgets(best, parts):
+            return None
+        lasts = length * float(np.median([s.sample_time for s in given]))
+        said.append(note("in_parts", parts=len(parts), lasts=(lasts, "s")))
+    return *levelled(best, parts), outcomes, tuple(said)
+
+
+def held_as(experiments: Sequence[Experiment], hold: Hold | None) -> tuple[Experiment, ...]:
+    """Return experiments whose inputs are held, or straight lines, or as they are."""
+    if hold is None:
+        return tuple(experiments)
+    return tuple(replace(e, record=replace(e.record, hold=hold)) for e in experiments)
+
+
+def cut(given: Sequence[Signals], length: int | None) -> list[Signals]:
+    """Return records in parts of so many samples, the last one of up to half of them more."""
+    if length is None:
+        return list(given)
+    found = []
+    for s in given:
+        begins = [a for a in range(0, s.n, length) if not a or a <= s.n - length // 2]
+        ends = [*begins[1:], s.n]
+        found += [s.slice(a, b) for a, b in zip(begins, ends, strict=True)] if ends[1:] else [s]
+    return found
+
+
+def begun(of: Fit, parts: Sequence[Experiment], longer: Sequence[Experiment]) -> Fit:
+    """Fit longer parts from where a fit of shorter ones stands. Raises SimulationError."""
+    known = {_place(e): own for e, own in zip(parts, of.starts(), strict=True)}
+    starts: list[Mapping[str, float]] = [known.get(_place(e), {}) for e in longer]
+    sigma = [of.sigma[0]] * len(longer)
+    return fit(
+        of.model, weighted(of, longer), of.unknowns.names, sigma=sigma, start_states=starts,
+        evaluations=POLISH, tolerance=1e-6,
+    )  # fmt: skip
+
+
+def _place(e: Experiment) -> tuple[str, float]:
+    return e.record.sha256, float(e.record.time[0])
+
+
+def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[tuple[FloatArray, ...]]:
+    """Yield what outputs depend on the first states of every part (outputs, states).
+
+    The largest derivatives in its first tenth, in all of it, and in its last tenth.
+    """
+    for k, p in enumerate(of.predictions(parts, further=True)):
+        own = slice(of.unknowns.first(k), of.unknowns.first(k + 1) - 1)
+        size = np.abs([p.further[o.channel.outputs[0]][1][:, own] for o in of.channels])
+        n = max(1, int(_END * size.shape[1]))
+        first, whole, last = size[:, :n], size, size[:, -n:]
+        yield tuple(np.maximum(q.max(axis=1), 1e-300) for q in (first, whole, last))
+
+
+def _grows(of: Fit, parts: Sequence[Experiment]) -> bool:
+    """Whether an error at the beginning of a part grows too much in it."""
+    each = _influences(of, parts)
+    return any(np.max(whole / first, initial=0.0) > _GROWTH for first, whole, _ in each)
+
+
+def _forgets(of: Fit, parts: Sequence[Experiment]) -> bool:
+    """Whether the outputs depend less and less on the states that records began with.
+
+    The part of the influence that is left is the product of what is left in each of its parts.
+    """
+    left = dict[str, float]()
+    for e, (_, whole, last) in zip(parts, _influences(of, parts), strict=True):
+        own = float(np.log(np.max(last / whole, initial=1e-300)))
+        left[e.record.sha256] = left.get(e.record.sha256, 0.0) + own
+    return max(left.values()) < float(np.log(_FORGOTTEN))
