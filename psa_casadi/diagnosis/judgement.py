@@ -185,8 +185,22 @@ class Judge:
         for s in self.steps if self.doubt is None else ():
             if s.chosen is not None and s.without is not None:
                 alone = s.without.fit is self.first.fit
-                found[s.cause.name] = self.weighed if alone else self.weigh(s.without, last)
+                own = self.weighed if alone else self.weigh(s.without, last)
+                found[s.cause.name] = replace(own, corrections=self._instead(own.corrections))
         return found
+
+    def _instead(self, found: Sequence[Correction]) -> list[Correction]:
+        """Return corrections with what they add in a cause's place alone.
+
+        What they add beside all causes as well is no word against one of these.
+        """
+        more = {c.name: max(c.evidence, 0.0) for c in self._beside_last}
+        return [replace(c, evidence=c.evidence - more.get(c.name, 0.0)) for c in found]
+
+    @cached_property
+    def _beside_last(self) -> Sequence[Correction]:
+        """The unnamed corrections beside all causes, where structure remains."""
+        return self.corrections(self.last.view.of) if self.last.test.alarm else ()
 
     @cached_property
     def vague(self) -> dict[str, Correction]:
@@ -265,6 +279,8 @@ class Judge:
     @cached_property
     def beside_final(self) -> Sequence[Correction]:
         """The unnamed corrections beside the extended model."""
+        if self.final is self.last and self.last.test.alarm:
+            return self._beside_last
         return self.corrections(self.final.view.of) if self.kept else self.weighed.corrections
 
     @cached_property

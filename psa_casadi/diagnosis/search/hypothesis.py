@@ -108,6 +108,12 @@ class Hypothesis:
         )
         return before.fit.rms**2 - self.fit.rms**2 + beside
 
+    def leaves(self, before: "Hypothesis") -> float:
+        """What it leaves of another one's error over whole records, in power, over that [-]."""
+        levels = np.array([f.level for f in before.fit.channels])
+        old, new = (np.square(h.whole / levels).sum() for h in (before, self))
+        return float(new / max(old, 1e-300))
+
     def share(self, before: "Hypothesis", root: "Hypothesis") -> float:
         """What it takes from another one's error over whole records, over what that one takes.
 

@@ -247,17 +247,25 @@ class Known:
         """
         if (h, before) not in self.noises:
             least = self.task.limits.price
-            found = h.beyond_noise(before) > least
+            found = self._beyond(h, before) > least
             if found and before.own[0].autoregression.size:
                 led = as_led(h, cause, self.task.experiments)
-                found = led is None or h.beyond_noise(led) > least
+                found = led is None or self._beyond(h, led) > least
             self.noises[h, before] = found
         return self.noises[h, before]
 
+    def _beyond(self, h: Hypothesis, before: Hypothesis) -> float:
+        gained = self.scale.held_out(h, before)
+        return h.beyond_noise(before) + gained
+
     def little(self, h: Hypothesis, before: Hypothesis) -> bool:
-        """Whether a further cause removes no more than the form of the others may miss."""
-        few = h.share(before, self.root) <= self.task.limits.further
-        return bool(before.causes) and few
+        """Whether a further cause removes no more than the form of the others may miss.
+
+        What it removes of all that these remove is small then, and it leaves much of what they do.
+        """
+        limits = self.task.limits
+        few = h.share(before, self.root) <= limits.further
+        return bool(before.causes) and few and h.leaves(before) > 1.0 - limits.enough
 
     def slight(self, h: Hypothesis) -> tuple[str, ...]:
         """Name the causes that remove too little beside the others to be told from their form."""
