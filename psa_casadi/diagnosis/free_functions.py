@@ -79,7 +79,8 @@ def fit_free_functions(
     `base` is the model before its ports were opened, `effects` are the hypothesis' causes.
     """
     of, experiments = view.of, task.experiments
-    sizes = sizes_of(base, experiments, of.fit.starts())
+    starts = [{n: v for n, v in s.items() if n in base.state_names} for s in of.fit.starts()]
+    sizes = sizes_of(base, experiments, starts)
     scored: list[tuple[float, Attached, _Law]] = []
     for attached, law in [_free(base, p, sizes) for p in ports_of(base)]:
         with suppress(PsaError):

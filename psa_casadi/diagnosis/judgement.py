@@ -184,8 +184,10 @@ class Judge:
         last, found = self.last.view.of, {}
         for s in self.steps if self.doubt is None else ():
             if s.chosen is not None and s.without is not None:
-                alone = s.without.fit is self.first.fit
-                own = self.weighed if alone else self.weigh(s.without, last)
+                if s.without.fit is self.first.fit:
+                    found[s.cause.name] = self.weighed
+                    continue
+                own = self.weigh(s.without, last)
                 found[s.cause.name] = replace(own, corrections=self._instead(own.corrections))
         return found
 
@@ -206,6 +208,9 @@ class Judge:
     def vague(self) -> dict[str, Correction]:
         """Causes that are rather none of the listed effects, with the best unnamed correction."""
         better: dict[str, Correction] = {}
+        alone = max(self.weighed.corrections, key=lambda c: c.evidence, default=None)
+        if alone is not None and len(self.each) > 1 and alone.evidence > self.weighed.evidence:
+            return dict.fromkeys(self.each, alone)  # one explains more than they do together
         for name, weighed in self.each.items():
             of = self.families[name]
             if sum(f.not_listed for f in of) > sum(sum(f.effects.values()) for f in of):

@@ -1,9 +1,10 @@
 """Diagnose any model: fit it, search generic effects at its ports, judge."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,9 +40,9 @@ from psa_casadi.identification.refitting import (
     with_noise,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import with_ports
+from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
 from psa_casadi.notes import Note, note
-from psa_casadi.records.signals import Hold
+from psa_casadi.records.signals import Hold, Signals
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sizes_of
 
@@ -49,6 +50,8 @@ from psa_casadi.simulation.sizes import sizes_of
 _OF_STACKS = frozenset(
     {"one clock", "fits afresh", "resonances", "several modes", "between samples"}
 )
+#: Verdicts that leave something open.
+_OPEN = ("unexplained", "partly_explained")
 #: An input that is held is late by half a sampling interval, give or take; a fit explains as much
 #: as another one if it leaves no more than this share of its rms.
 _HALF, _AS_MUCH = (0.3, 0.7), 1.2
@@ -83,15 +86,7 @@ def diagnose_ode(
     be simulated at its values, DiagnosisInterrupted with the best model so far at a keyboard
     interrupt once there is one.
     """
-    refuse_unfit(model)
-    if model.effects:
-        names = ", ".join(c.name for c in model.effects)
-        raise InputError(
-            f"The model '{model.name}' has effects already ({names}); diagnose it without them."
-        )
-    given = given_to(model, records, hold)
-    none = isinstance(holdout, tuple | list) and not holdout
-    held = [] if none else given_to(model, holdout, hold, len(given) + 1)
+    given, held = _given(model, records, holdout, hold)
     shifted = known_zeros(model, zeros)
     progress("fitting from several starts")
 
@@ -106,52 +101,96 @@ def diagnose_ode(
     if base.interrupted:
         raise KeyboardInterrupt
     table = _table(base, runs, effects, leave_out, [f"zero_of_{n}" for n in shifted])
-    searched, so_far = tuple(e.component for e in table.values()), [base]
+    so_far = [base]
 
-    def task_of(experiments: tuple[Experiment, ...]) -> Task:
+    def task_of(names: Collection[str], experiments: tuple[Experiment, ...]) -> Task:
+        chosen = tuple(table[n].component for n in names)
         method, pack = Method(without=_OF_STACKS), Pack()
-        return Task(experiments, searched, pack, method, progress, so_far.append, watch)
+        return Task(experiments, chosen, pack, method, progress, so_far.append, watch)
 
-    try:
-        known = _search(base, runs, task_of)
-        if free_choice and (other := _held_instead(known, base, task_of)):
-            known, said = other[0], (*said, other[1])
+    def judged(names: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
+        known, notes = _search(base, runs, partial(task_of, names), told=not free_choice)
         whole = held_as(made(None), known.task.experiments[0].record.hold)
         if len(runs) > len(whole):
-            known = _of_whole(known, task_of(whole)) or known
+            known = _of_whole(known, task_of(names, whole)) or known
         fit_rivals(known)
         progress("judging")
-        found = ModelJudge(known, base.model, table).conclude()
+        return ModelJudge(known, base.model, table), notes
+
+    own = {c.name for c in effects}
+    fixed = [n for n, e in table.items() if n in own or e.port.kind != "parameter"]
+    try:
+        judge, notes = judged(fixed)
+        if judge.verdict in _OPEN and len(fixed) < len(table):
+            progress("searching again, with parameters that change")
+            other, more = judged(table)
+            if _better(other, judge):
+                judge, notes = other, more
+        found = judge.conclude()
     except KeyboardInterrupt:
         best = so_far[-1]
         attached = [table[c.name] for c in best.model.effects]
         cut_off = model_of(base.model, best, attached, runs, interrupted=True)
         raise DiagnosisInterrupted(cut_off) from None
     noise = noise_found(found.extended_fit, found.experiments, (*given, *held))
-    return found.with_noise(noise, (*said, *known.remarks, *told_of_columns(model, runs)))
+    remarks = (*said, *notes, *judge.known.remarks, *told_of_columns(model, runs))
+    return found.with_noise(noise, remarks)
+
+
+def _given(
+    model: Model, records: Any, holdout: Any, hold: Hold | None
+) -> tuple[list[Signals], list[Signals]]:
+    """Return the records to fit and those to judge by. Raises InputError."""
+    refuse_unfit(model)
+    if model.effects:
+        names = ", ".join(c.name for c in model.effects)
+        raise InputError(
+            f"The model '{model.name}' has effects already ({names}); diagnose it without them."
+        )
+    given = given_to(model, records, hold)
+    none = isinstance(holdout, tuple | list) and not holdout
+    return given, [] if none else given_to(model, holdout, hold, len(given) + 1)
+
+
+def _better(new: ModelJudge, old: ModelJudge) -> bool:
+    """Whether parameters that change explain more, and with no more causes."""
+    if "unexplained" in (new.verdict, old.verdict):
+        return new.verdict != "unexplained"
+    now, before = new.last.view.of, old.last.view.of
+    fewer = len(now.causes) <= len(before.causes)
+    return fewer and new.known.scale.evidence(now) > old.known.scale.evidence(before)
 
 
 _Tasks = Callable[[tuple[Experiment, ...]], Task]
 
 
-def _search(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Known:
-    """Search from a base fit, and again where the records' noise differs by what it finds."""
+def _search(
+    base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks, *, told: bool
+) -> tuple[Known, tuple[Note, ...]]:
+    """Search from a base fit, and again where the records' noise differs by what it finds.
 
-    def once(base: Fit, experiments: tuple[Experiment, ...]) -> Known:
-        task = task_of(experiments)
-        found = best_first(replace(base, model=with_ports(base.model)), task)
-        task.keep(found.answer.fit)
-        return found
-
-    known = once(base, experiments)
-    told = with_noise(known.answer.fit, experiments)
-    if not unlike(told, experiments):
-        return known
-    known.task.progress("searching again, noise by record")
-    return once(reweighted(base, told), told)
+    And with held inputs, if that is likelier and nobody has `told` what they do between samples.
+    """
+    known = _once(base, experiments, task_of)
+    noise = with_noise(known.answer.fit, experiments)
+    if unlike(noise, experiments):
+        known.task.progress("searching again, noise by record")
+        known = _once(reweighted(base, noise), noise, task_of)
+    other = None if told else _held_instead(known, base, task_of)
+    return (known, ()) if other is None else other
 
 
-def _held_instead(known: Known, base: Fit, task_of: _Tasks) -> tuple[Known, Note] | None:
+def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Known:
+    ports = {*ports_of(base.model), *parameter_ports(base.model)}
+    task = task_of(experiments)
+    found = best_first(replace(base, model=with_ports(base.model, ports)), task)
+    task.keep(found.answer.fit)
+    return found
+
+
+def _held_instead(
+    known: Known, base: Fit, task_of: _Tasks
+) -> tuple[Known, tuple[Note, ...]] | None:
     """Return what is found with held inputs where one is late by half a sampling interval.
 
     Of straight lines, and if that explains as much with fewer causes.
@@ -163,14 +202,14 @@ def _held_instead(known: Known, base: Fit, task_of: _Tasks) -> tuple[Known, Note
         return None
     held = held_as(runs, "zero")
     try:
-        found = _search(refit(base, weighted(base, held), sigma=base.sigma), held, task_of)
+        found = _once(refit(base, weighted(base, held), sigma=base.sigma), held, task_of)
     except PsaError:
         return None
     less = len(found.answer.causes) < len(best.causes)
     if not less or found.answer.fit.rms > _AS_MUCH * best.fit.rms:
         return None
     gained = found.answer.fit.residuals.size * np.log(best.fit.rms / found.answer.fit.rms)
-    return found, note("hold_found", hold="zero", nats=max(float(gained), 0.0))
+    return found, (note("hold_found", hold="zero", nats=max(float(gained), 0.0)),)
 
 
 def _late(base: Fit) -> set[str]:

@@ -29,8 +29,9 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized
 from psa_casadi.units import FloatArray
 
-#: A model follows an output where it misses less than this share of its standard deviation.
-_FOLLOWED = 0.05
+#: A model follows an output where it misses less than this share of its standard deviation; one
+#: that forgets its start is not lost where it comes so near.
+_FOLLOWED, _NEAR = 0.05, 0.25
 #: Samples of a part at least, and parts at most.
 _FEWEST, _MOST = 64, 64
 #: A model forgets where its outputs depend on the first states less than this at the end, over the
@@ -71,7 +72,8 @@ def from_starts(
     )
     if best.interrupted:
         return best, whole, outcomes, ()
-    if not follows(best, whole):
+    known = follows(best, whole, _NEAR) and _forgets(best, whole)
+    if not known and not follows(best, whole):
         progress("fitting parts of the records")
         found = _in_parts(model, given, made, free, undecided, starts, progress)
         if found is not None and (found[0].cost < best.cost or len(found[1]) > len(whole)):
@@ -118,7 +120,7 @@ def _innovation(o: Further) -> float:
     return max(float(np.sqrt(np.mean(left**2))), o.straight, 1e-300)
 
 
-def follows(of: Fit, experiments: Sequence[Experiment]) -> bool:
+def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED) -> bool:
     """Whether a model follows every output of the records, but for a small share or its noise."""
     for o in of.channels:
         shown = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
@@ -126,7 +128,7 @@ def follows(of: Fit, experiments: Sequence[Experiment]) -> bool:
             [np.full(len(p), first_order_noise(p)[0]) for p in o.parts if p.size]
         )
         least = MISSED * float(np.sqrt(np.mean(noise**2)))
-        if o.rms > max(_FOLLOWED * float(np.std(shown)), least):
+        if o.rms > max(share * float(np.std(shown)), least):
             return False
     return True
 

@@ -1,4 +1,4 @@
-"""The places of a model where something may be missing: its inputs, outputs and states' rates.
+"""The places of a model where something may be missing: inputs, outputs, rates, parameters.
 
 A model with ports is the same model, written so that others may add to it:
 
@@ -6,6 +6,7 @@ A model with ports is the same model, written so that others may add to it:
     rate_x    = f_x(...) + ...   the rate of the state x
     true_y    = h_y(...)         an output as the equations have it
     shown_y   = true_y + ...     what the sensor shows of it
+    varied_p  = p + ...          what acts in the place of the parameter p
 """
 
 from collections.abc import Iterable
@@ -20,8 +21,10 @@ from psa_casadi.model.compose import Model
 from psa_casadi.symbolic import in_turn
 from psa_casadi.units import rate_unit, si_unit
 
-Kind = Literal["input", "rate", "output"]
-_PREFIX: dict[Kind, str] = {"input": "applied_", "rate": "rate_", "output": "shown_"}
+Kind = Literal["input", "rate", "output", "parameter"]
+_PREFIX: dict[Kind, str] = {
+    "input": "applied_", "rate": "rate_", "output": "shown_", "parameter": "varied_",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Port:
 
     @property
     def words(self) -> str:
-        """The place in words: "the input u", "the rate of x", "the output y"."""
+        """The place in words: "the input u", "the rate of x", "the parameter p"."""
         if self.kind == "rate":
             return f"the rate of {self.variable}"
         return f"the {self.kind} {self.variable}"
@@ -71,6 +74,18 @@ def ports_of(model: Model) -> tuple[Port, ...]:
     )
 
 
+def parameter_ports(model: Model) -> tuple[Port, ...]:
+    """Return the ports of the parameters of a model's own physics that may be fitted.
+
+    None of an imported FMU, whose parameters are numbers.
+    """
+    if model.structure.foreign:
+        return ()
+    base = [c for c in model.components if c.gain is None]
+    own = [p for c in base for p in c.parameters if p.fitted]
+    return tuple(Port("parameter", p.name, _si(p.unit)) for p in own)
+
+
 def _is_physics(rate: Expression, state: str) -> bool:
     """Whether a rate is more than a symbol, but for the sum at its port."""
     return not rate.is_symbolic() or rate.name() == _PREFIX["rate"] + state
@@ -97,11 +112,13 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
         "input": [i.name for i in component.inputs],
         "rate": [q.name for q in component.states],
         "output": [o.name for o in component.outputs],
+        "parameter": [p.name for p in component.parameters],
     }
     own = [p for p in sorted(ports, key=lambda p: p.balance) if p.variable in names[p.kind]]
     if component.gain is not None or not own:
         return component
-    about = {"input": "what acts in the place of ", "rate": "", "output": "what is shown of "}
+    acts = "what acts in the place of "
+    about = {"input": acts, "rate": "", "output": "what is shown of ", "parameter": acts}
     balances = []
     for p in own:
         if p.kind == "output":
@@ -129,12 +146,13 @@ class Opened:
 
     def __call__(self, s: Symbols) -> Equations:
         """Return the equations in these symbols."""
-        replaced = {p.variable: getattr(s, p.balance) for p in self.ports if p.kind == "input"}
+        given = [p for p in self.ports if p.kind in ("input", "parameter")]
+        replaced = {p.variable: getattr(s, p.balance) for p in given}
         plain = self.component.equations(_Replaced(s, replaced))
         add: dict[str, Expression] = dict(plain.add)
         der, out = dict(plain.der), dict(plain.out)
         for p in self.ports:
-            if p.kind == "input":
+            if p in given:
                 add[p.balance] = getattr(s, p.variable)
             elif p.kind == "rate":
                 add[p.balance], der[p.variable] = der[p.variable], getattr(s, p.balance)

@@ -373,7 +373,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
             law = re.sub(r"\|(\w+)\|", r"abs(\1)", c.equation_text)
             what = c.description.removeprefix(f"{effect.port.words}: ")
             assert f"\n| `{c.name}` | {what} | `{law}` | {said} |\n" in text
-    assert len(shown) == text.count("\n| `") == 14
+    assert len(shown) == text.count("\n| `") == 15
 
 
 def test_the_help_of_both_faces_tells_of_own_models() -> None:

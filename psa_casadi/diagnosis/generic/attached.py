@@ -15,7 +15,7 @@ from psa_casadi.component import (
 )
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import Port, ports_of, with_ports
+from psa_casadi.model.ports import Port, parameter_ports, ports_of, with_ports
 from psa_casadi.variables import Parameter, State
 
 #: An ordinary size of an effect over what it acts on, and the largest that a fit may reach.
@@ -29,6 +29,7 @@ _DOES: dict[str, Kind] = {
     "lag": "lag", "delay": "lag", "bend": "curve", "saturation": "curve", "dead_zone": "curve",
     "zero": "time", "drift": "time", "constant": "time", "loss": "damping", "friction": "damping",
     "drag": "damping", "curve": "curve", "stop": "curve", "hysteresis": "hysteresis",
+    "change": "changing gain",
 }  # fmt: skip
 #: Returns a parameter or a state of an effect by its short name.
 Own = Callable[[str], Expression]
@@ -113,7 +114,8 @@ def of_ones_own(model: Model, component: Component) -> Attached:
 
     Raises InputError for one without a gain, or that adds to no port.
     """
-    symbols, ports = OnDemand(), {p.balance: p for p in ports_of(model)}
+    places = (*ports_of(model), *parameter_ports(model))
+    symbols, ports = OnDemand(), {p.balance: p for p in places}
     added = [ports[name] for name in component.equations(symbols).add if name in ports]
     if component.gain is None or not added:
         lacks = "adds to no port" if component.gain else "has no gain that removes it at 0"

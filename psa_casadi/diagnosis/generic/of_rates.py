@@ -14,6 +14,7 @@ from psa_casadi.diagnosis.generic.attached import (
     scale_of,
     size_of,
 )
+from psa_casadi.diagnosis.generic.of_parameters import parameter_effects
 from psa_casadi.diagnosis.generic.of_signals import ANGLE, bent, beyond, level_of, signal_effects
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, ports_of, state_unit
@@ -241,4 +242,4 @@ def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
             found += rate_effects(model, port, sizes)
         else:
             found += signal_effects(port, sizes)
-    return tuple(found)
+    return (*found, *parameter_effects(model, sizes))

@@ -67,15 +67,20 @@ class Hypothesis:
         first, *beside = (own.colour for own in self.own)
         return replace(first, further=tuple(beside))
 
-    def beyond_noise(self, before: "Hypothesis") -> float:
+    def beyond_noise(self, before: "Hypothesis", held: Sequence[int], chance: float) -> float:
         """Return its evidence over another one where either's residual may be noise of its colour.
 
-        Less than 0 where noise of another colour explains the data as well [nats].
+        With what it gains beyond `chance` [nats] in the samples of every channel that are `held`
+        out, of which noise of the other one's colour leaves few independent ones. Less than 0 where
+        noise of another colour explains the data as well [nats].
         """
         rows = list(zip(self.fit.channels, before.own, self.own, strict=True))
         gained = sum(new.nats(f.straight) - old.nats(f.straight) for f, old, new in rows)
         levels = [float(np.hypot(new.level, f.straight)) for f, _, new in rows]
-        return gained - occam(before.fit, self.fit, self.colour, levels)
+        straight = [f.straight for f in self.fit.channels]
+        ahead = held_out_gain(held, before.colour, straight, before.held, self.held) if held else 0
+        spent = occam(before.fit, self.fit, self.colour, levels)
+        return gained + max(ahead - chance, 0.0) - spent
 
     @property
     def holdout_rms(self) -> float:

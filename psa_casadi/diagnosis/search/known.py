@@ -247,16 +247,13 @@ class Known:
         """
         if (h, before) not in self.noises:
             least = self.task.limits.price
-            found = self._beyond(h, before) > least
+            held = self.scale.held
+            found = h.beyond_noise(before, held, least) > least
             if found and before.own[0].autoregression.size:
                 led = as_led(h, cause, self.task.experiments)
-                found = led is None or self._beyond(h, led) > least
+                found = led is None or h.beyond_noise(led, held, least) > least
             self.noises[h, before] = found
         return self.noises[h, before]
-
-    def _beyond(self, h: Hypothesis, before: Hypothesis) -> float:
-        gained = self.scale.held_out(h, before)
-        return h.beyond_noise(before) + gained
 
     def little(self, h: Hypothesis, before: Hypothesis) -> bool:
         """Whether a further cause removes no more than the form of the others may miss.

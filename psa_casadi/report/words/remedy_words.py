@@ -101,6 +101,7 @@ DO: Mapping[str, str] = {
     "friction": "Lubricate or preload what rubs, overcome it by the input, or keep it in the model",
     "drag": "Put the quadratic loss into the equation",
     "curve": "Put the law into the equation in the place of a constant stiffness or conductance",
+    "change": "Put the dependence into the equation in the place of a constant",
     "stop": "Stay clear of the stop, or keep it in the model",
     "hysteresis": "Approach from the same side, correct by the extended model, or close a loop",
 }

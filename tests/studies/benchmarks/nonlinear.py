@@ -1,0 +1,136 @@
+"""Models that are no stacks: plants that are hard, and public nonlinear benchmarks.
+
+The public records are not in the project: `--folder` holds DATA_EMPS.mat and DATA_EMPS_PULSES.mat
+(Janot, Gautier and Brunot 2019), as nonlinearbenchmark.org gives them; what is not there is said.
+Each model is the plain one that an engineer begins with.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from time import process_time
+
+import casadi as ca
+import numpy as np
+from scipy.io import loadmat
+
+import psa_casadi as psa
+from psa_casadi.units import FloatArray
+from tests.any_model import hard_plants as hard
+from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable
+
+Table = hard.Table
+#: Every so many samples of EMPS are taken (1 kHz, whose force is held).
+_EVERY = 10
+
+
+def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
+    """Identify and diagnose the plants, and the public records that there are; `quick`: two."""
+    plants = [
+        ("pendulum under a controller", hard.pendulum, ""),
+        ("the same, hidden drag", lambda: hard.pendulum(drag=0.05), "drag_in_w"),
+        ("chaos in two wells", hard.duffing, ""),
+        ("slide, dry friction and slope", hard.slide, "friction_in_v, constant_in_v"),
+        ("spring that softens", lambda: (hard.spring(), hard.aged(0), {}), "change_of_k_with_time"),
+        ("battery, resistance over charge", lambda: (*hard.battery(), {}), "change_of_R0_with_soc"),
+    ]
+    rows = [_plant(progress, *plant) for plant in plants[: 2 if quick else None]]
+    tables = [
+        TitledTable(
+            "Plants that are hard", rows,
+            "Off: the largest relative error of a parameter, of the base where nothing is hidden,"
+            " else of the extended model. Errors: held-out rms over the noise's.",
+        )
+    ]  # fmt: skip
+    if folder is not None and not quick:
+        found = [_public(progress, folder, *case) for case in PUBLIC]
+        tables.append(TitledTable("Public benchmarks", found, "Test: rms of simulated records."))
+    return Outcome(tables)
+
+
+def _plant(progress: Progress, name: str, made: Callable[[], hard.Plant], hidden: str) -> Row:
+    progress(name)
+    model, record, truth = made()
+    begin = process_time()
+    d = psa.diagnose(model, record)
+    off = max((abs(d.model.values[n] / v - 1.0) for n, v in truth.items()), default=np.nan)
+    errors = [(e.base / e.noise, e.extended / e.noise) for e in d.errors]
+    base, extended = (max(e) for e in zip(*errors, strict=True))
+    return {
+        "plant": name, "hidden": hidden or "-", "verdict": d.verdict, "named": _names(d),
+        "off": "-" if np.isnan(off) else f"{100 * off:.1f} %", "base": f"{base:.3g}",
+        "extended": f"{extended:.3g}", "parts": len(d.experiments), "s": _seconds(begin),
+    }  # fmt: skip
+
+
+def _names(d: psa.Diagnosis) -> str:
+    return ", ".join(f"{c.effect} {c.confidence:.2f}" for c in d.causes) or "-"
+
+
+def _seconds(begin: float) -> str:
+    return f"{process_time() - begin:.1f}"
+
+
+def _public(
+    progress: Progress, folder: Path, name: str, files: tuple[str, ...],
+    made: Callable[..., tuple[psa.Model, Table, Table]], published: str,
+) -> Row:  # fmt: skip
+    progress(name)
+    paths = [folder / f for f in files]
+    if absent := [p.name for p in paths if not p.exists()]:
+        return dict.fromkeys(("benchmark", "verdict"), name) | {"verdict": f"no {absent[0]}"}
+    model, fitted, test = made(*paths)
+    begin = process_time()
+    d = psa.diagnose(model, fitted)
+    output = d.errors[0].output
+    both = [_simulated(fit.model, output, test) for fit in (d.base_fit, d.extended_fit)]
+    return {
+        "benchmark": name, "verdict": d.verdict, "named": _names(d),
+        "test, base": f"{both[0]:.3g}", "test, extended": f"{both[1]:.3g}",
+        "published": published, "s": _seconds(begin),
+    }  # fmt: skip
+
+
+def _simulated(model: psa.Model, output: str, test: Table) -> float:
+    """Return the rms error of a simulation from the first reading on; the rest rests."""
+    x0 = np.zeros(len(model.state_names))
+    x0[0] = test[output][0]
+    u = np.column_stack([test[n] for n in model.input_names])
+    y = psa.run(model, test["time"], u, x0, hold="linear").y[:, model.output_names.index(output)]
+    return float(np.sqrt(np.mean((y - test[output]) ** 2)))
+
+
+def emps(*paths: Path) -> tuple[psa.Model, Table, Table]:
+    """An electro-mechanical positioning system: a mass with viscous friction alone [m]."""
+    q, v, u, mass, friction = (ca.SX.sym(n) for n in ("q", "v", "force", "M", "Fv"))
+    model = psa.ode_model(
+        {
+            "x": [q, v], "u": u, "p": [mass, friction], "y": q,
+            "ode": [v, (u - friction * v) / mass],
+        },
+        name="emps",
+        states=[psa.State("q", "m", "position", 0.1), psa.State("v", "m/s", "speed", 0.1)],
+        inputs=[psa.Input("force", "N", "force")],
+        outputs=[psa.Output("position", "m", "position")],
+        parameters=[
+            psa.Parameter("M", 80.0, "kg", (10.0, 500.0), "mass", log=True),
+            psa.Parameter("Fv", 100.0, "N.s/m", (1.0, 2000.0), "viscous friction", log=True),
+        ],
+    )  # fmt: skip
+
+    def table(path: Path) -> Table:
+        found = loadmat(str(path))
+        rows: Mapping[str, FloatArray] = {n: found[n][::_EVERY, 0] for n in ("t", "vir", "qm")}
+        force = float(found["gtau"][0, 0]) * rows["vir"]
+        return {"time": rows["t"], "force": force, "position": rows["qm"]}
+
+    fitted, test = map(table, paths)
+    return model, fitted, test
+
+
+#: Name, files, what makes model and records, and figures of others on the same test.
+PUBLIC = (
+    (
+        "EMPS, viscous friction alone [m]", ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"), emps,
+        "dynoNet 0.00264",
+    ),
+)  # fmt: skip
