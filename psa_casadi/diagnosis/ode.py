@@ -31,12 +31,10 @@ from psa_casadi.identification.experiments import (
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
 from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.parts import begun, cut, follows, from_starts, held_as
+from psa_casadi.identification.parts import begun, cut, follows, from_starts, held_as, refitted
 from psa_casadi.identification.refitting import (
-    refit,
     reweighted,
     unlike,
-    weighted,
     with_noise,
 )
 from psa_casadi.model.compose import Model
@@ -202,7 +200,7 @@ def _held_instead(
         return None
     held = held_as(runs, "zero")
     try:
-        found = _once(refit(base, weighted(base, held), sigma=base.sigma), held, task_of)
+        found = _once(refitted(base, held), held, task_of)
     except PsaError:
         return None
     less = len(found.answer.causes) < len(best.causes)

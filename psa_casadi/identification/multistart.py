@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+import casadi as ca
 import numpy as np
 
 from psa_casadi.errors import InputError, PsaError, quoted
@@ -32,6 +33,8 @@ _SAME = 0.01
 #: Starts lie within so many natural logarithms, or ordinary changes, of the declared value.
 _DECADES, _CHANGES = 2.3, 2.0
 _SEED = 29
+#: Samples at least from which a rate is told.
+_SLOPE = 8
 #: A fit that leaves this share of an output's standard deviation explains nothing of it.
 _ALL = 0.8
 
@@ -144,24 +147,32 @@ def _outcome(name: str, end: Fit | None, best: Fit) -> StartOutcome:
 
 
 def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[str, float]]:
-    """Return deviations of initial states that an output shows at its first sample."""
-    y, x = model.structure.y, model.structure.x
+    """Return deviations of initial states that an output shows at its first samples.
+
+    A state that an output is, and one that is the rate of such a state.
+    """
+    y, x, der = model.structure.y, model.structure.x, model.structure.der
     names = [x[k].name() for k in range(x.numel())]
+    starts = {q.name: q.start for q in model.structure.states}
     shown = [
-        (model.output_names[j], names.index(y[j].name()))
+        (model.output_names[j], y[j].name())
         for j in range(y.numel())
         if y[j].is_symbolic() and y[j].name() in names
     ]
     found = []
     for e in experiments:
         own, known = {}, e.known if e.held_out_whole else e.used
-        for output, k in shown:
+        for output, state in shown:
             readings = e.record.column(output)
             if readings is None or e.known_start:
                 continue
-            valid = readings[known & np.isfinite(readings)]
+            valid = np.flatnonzero(known & np.isfinite(readings))
             if valid.size:
-                own[names[k]] = float(valid[0]) - model.structure.states[k].start
+                own[state] = float(readings[valid[0]]) - starts[state]
+            rate, first = ca.SX(der[state]), valid[: max(_SLOPE, valid.size // 16)]
+            if rate.is_symbolic() and rate.name() in starts and first.size >= _SLOPE:
+                slope = np.polyfit(e.record.time[first], readings[first], 1)[0]
+                own[rate.name()] = float(slope) - starts[rate.name()]
         found.append(own)
     return found
 

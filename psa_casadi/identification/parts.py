@@ -33,7 +33,9 @@ from psa_casadi.units import FloatArray
 #: that forgets its start is not lost where it comes so near.
 _FOLLOWED, _NEAR = 0.05, 0.25
 #: Samples of a part at least, and parts at most.
-_FEWEST, _MOST = 64, 64
+_FEWEST, _MOST = 16, 128
+#: Lengths of short parts that are tried, over the shortest.
+_SHORT = (4, 2, 1)
 #: A model forgets where its outputs depend on the first states less than this at the end, over the
 #: most that they ever do; so large a share of the record is the end.
 _FORGOTTEN, _END = 0.1, 0.1
@@ -96,7 +98,7 @@ def held_otherwise(
     hold: Hold = "linear" if any(e.record.hold == "zero" for e in experiments) else "zero"
     others = held_as(experiments, hold)
     try:
-        found = refit(of, weighted(of, others), sigma=of.sigma, tolerance=1e-6)
+        found = refitted(of, others)
     except PsaError:
         return None
     nats = sum(
@@ -107,6 +109,17 @@ def held_otherwise(
         return None
     best, again = relevelled(found, others, every=True)
     return best, again, note("hold_found", hold=hold, nats=nats)
+
+
+def refitted(of: Fit, others: Sequence[Experiment]) -> Fit:
+    """Fit other experiments of as many records from where a fit stands, or from its values alone.
+
+    Raises SimulationError.
+    """
+    try:
+        return refit(of, weighted(of, others), sigma=of.sigma, tolerance=1e-6)
+    except PsaError:
+        return search_starts(of.model, weighted(of, others), of.unknowns.names, starts=1)[0]
 
 
 def _innovation(o: Further) -> float:
@@ -142,39 +155,65 @@ def _in_parts(
     None where it follows none, and where it forgets how records began: what it misses is told as
     well of whole ones.
     """
-    longest = max(s.n for s in given)
-    length: int | None = max(_FEWEST, -(-sum(s.n for s in given) // _MOST))
-    if length is None or 2 * length > longest:
+    shortest = _shortest(model, given, made, free, starts, progress)
+    if shortest is None:
         return None
-    parts, said = made(length), list[Note]()
-    try:
-        best, parts, outcomes = search_starts(
-            sized(model, parts), parts, free, starts=starts, progress=progress
-        )
-    except PsaError:
-        return None
-    if best.interrupted or not follows(best, parts):
-        return None
+    (best, parts, outcomes), length = shortest
+    said: tuple[Note, ...] = ()
     if undecided and (other := held_otherwise(best, parts)):
         best, parts, told = other
-        said.append(told)
-    while length is not None:
-        double = 2 * length if 4 * length <= longest else None
-        longer = held_as(made(double), parts[0].record.hold if said else None)
-        progress("fitting longer parts")
+        said = (told,)
+        whole = made
+        made = lambda n: held_as(whole(n), told.values["hold"])  # noqa: E731
+    progress("fitting longer parts")
+    best, parts, reached = _longest(best, parts, made, length, max(s.n for s in given))
+    if reached is not None:
+        if _forgets(best, parts):
+            return None
+        lasts = reached * float(np.median([s.sample_time for s in given]))
+        said = (*said, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
+    return *levelled(best, parts), outcomes, said
+
+
+def _shortest(
+    model: Model, given: Sequence[Signals], made: Made, free: Sequence[str], starts: int,
+    progress: Progress,
+) -> tuple[tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]], int] | None:  # fmt: skip
+    """Return the search in short parts, shorter ones where a model does not follow, and samples."""
+    finest = max(_FEWEST, -(-sum(s.n for s in given) // _MOST))
+    for length in (k * finest for k in _SHORT):
+        if 2 * length > max(s.n for s in given):
+            continue
+        parts = made(length)
+        try:
+            found = search_starts(
+                sized(model, parts), parts, free, starts=starts, progress=progress
+            )
+        except PsaError:
+            continue
+        if found[0].interrupted:
+            return None
+        if follows(*found[:2]):
+            return found, length
+    return None
+
+
+def _longest(
+    best: Fit, parts: tuple[Experiment, ...], made: Made, length: int, longest: int
+) -> tuple[Fit, tuple[Experiment, ...], int | None]:
+    """Return the fit of the longest parts that a model follows, and their samples; None: whole."""
+    reached: int | None = length
+    while reached is not None:
+        double = 2 * reached if 4 * reached <= longest else None
+        longer = made(double)
         try:
             again = begun(best, parts, longer)
         except PsaError:
             break
         if again.interrupted or not follows(again, longer) or _grows(again, longer):
             break
-        best, parts, length = again, longer, double
-    if length is not None:
-        if _forgets(best, parts):
-            return None
-        lasts = length * float(np.median([s.sample_time for s in given]))
-        said.append(note("in_parts", parts=len(parts), lasts=(lasts, "s")))
-    return *levelled(best, parts), outcomes, tuple(said)
+        best, parts, reached = again, longer, double
+    return best, parts, reached
 
 
 def held_as(experiments: Sequence[Experiment], hold: Hold | None) -> tuple[Experiment, ...]:
@@ -211,32 +250,33 @@ def _place(e: Experiment) -> tuple[str, float]:
     return e.record.sha256, float(e.record.time[0])
 
 
-def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[tuple[FloatArray, ...]]:
-    """Yield what outputs depend on the first states of every part (outputs, states).
+def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[FloatArray]:
+    """Yield what outputs depend on the first states of every part (3, outputs).
 
-    The largest derivatives in its first tenth, in all of it, and in its last tenth.
+    The largest derivative by a usual size of any state, in the first tenth of the part, in all of
+    it, and in its last tenth.
     """
     for k, p in enumerate(of.predictions(parts, further=True)):
         own = slice(of.unknowns.first(k), of.unknowns.first(k + 1) - 1)
-        size = np.abs([p.further[o.channel.outputs[0]][1][:, own] for o in of.channels])
+        each = [p.further[o.channel.outputs[0]][1][:, own] for o in of.channels]
+        size = np.max(np.abs(each), axis=2, initial=0.0)
         n = max(1, int(_END * size.shape[1]))
-        first, whole, last = size[:, :n], size, size[:, -n:]
-        yield tuple(np.maximum(q.max(axis=1), 1e-300) for q in (first, whole, last))
+        spans = size[:, :n], size, size[:, -n:]
+        yield np.maximum([np.max(q, axis=1) for q in spans], 1e-300)
 
 
 def _grows(of: Fit, parts: Sequence[Experiment]) -> bool:
     """Whether an error at the beginning of a part grows too much in it."""
-    each = _influences(of, parts)
-    return any(np.max(whole / first, initial=0.0) > _GROWTH for first, whole, _ in each)
+    return any(np.max(whole / first) > _GROWTH for first, whole, _ in _influences(of, parts))
 
 
 def _forgets(of: Fit, parts: Sequence[Experiment]) -> bool:
     """Whether the outputs depend less and less on the states that records began with.
 
-    The part of the influence that is left is the product of what is left in each of its parts.
+    What is left of the influence at the end of a record is the product of what is in its parts.
     """
     left = dict[str, float]()
-    for e, (_, whole, last) in zip(parts, _influences(of, parts), strict=True):
-        own = float(np.log(np.max(last / whole, initial=1e-300)))
+    for e, (first, _, last) in zip(parts, _influences(of, parts), strict=True):
+        own = float(np.log(np.max(last / first)))
         left[e.record.sha256] = left.get(e.record.sha256, 0.0) + own
     return max(left.values()) < float(np.log(_FORGOTTEN))

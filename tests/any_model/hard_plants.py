@@ -152,3 +152,55 @@ def battery() -> tuple[psa.Model, Table]:
         parameters=[_log("R0", 0.03), _log("R1", 0.03), _log("C1", 1000.0)],
     )  # fmt: skip
     return model, {"time": np.arange(n, dtype=np.float64), "i": i, "volt": volt}
+
+
+def lorenz() -> Plant:
+    """Chaos of which one state is not shown (Lorenz, J. Atmos. Sci. 20 (1963), 130)."""
+    rng, t = np.random.default_rng(4), 0.01 * np.arange(2000, dtype=np.float64)
+    truth = {"s": 10.0, "r": 28.0, "b": 8.0 / 3.0}
+
+    def rates(_: float, q: FloatArray) -> list[float]:
+        return [
+            truth["s"] * (q[1] - q[0]), q[0] * (truth["r"] - q[2]) - q[1],
+            q[0] * q[1] - truth["b"] * q[2],
+        ]  # fmt: skip
+
+    found = solve_ivp(rates, (0.0, t[-1]), [1.0, 1.0, 20.0], t_eval=t, rtol=1e-10, atol=1e-12).y
+    x, y, z, *p = (ca.SX.sym(n) for n in ("x", "y", "z", "s", "r", "b"))
+    model = psa.ode_model(
+        {
+            "x": [x, y, z], "p": p, "y": [x, z],
+            "ode": [p[0] * (y - x), x * (p[1] - z) - y, x * y - p[2] * z],
+        },
+        name="lorenz",
+        outputs=["first", "last"],
+        parameters=[_log("s", 7.0), _log("r", 20.0), _log("b", 2.0)],
+    )  # fmt: skip
+    first, last = (found[k] + 0.3 * rng.standard_normal(t.size) for k in (0, 2))
+    return model, {"time": t, "first": first, "last": last}, truth
+
+
+def levitated() -> Plant:
+    """A ball under a magnet whose controller holds the current; its force falls with the gap."""
+    rng, n, dt = np.random.default_rng(3), 2000, 0.002
+    t, q = dt * np.arange(n, dtype=np.float64), np.array([0.01, 0.0])
+    gap, current, rest = np.zeros(n), np.zeros(n), 0.01 * np.sqrt(9.81 / 0.0025)
+    steps = 0.0012 * np.sign(np.sin(2 * np.pi * 1.3 * t)) * np.minimum(1.0, t / 0.2)
+    wanted = 0.01 + steps + 0.0006 * np.sin(2 * np.pi * 4.0 * t)
+    for k in range(n):
+        gap[k], current[k] = q[0], rest * (1.0 + 180.0 * (q[0] - wanted[k]) + 4.0 * q[1])
+
+        def rates(_: float, z: FloatArray, i: float = float(current[k])) -> list[float]:
+            return [z[1], 9.81 - 0.0025 * i**2 / z[0] ** 2]
+
+        q = solve_ivp(rates, (0.0, dt), q, rtol=1e-9, atol=1e-12).y[:, -1]
+    x, v, i, c = (ca.SX.sym(m) for m in ("x", "v", "i", "c"))
+    model = psa.ode_model(
+        {"x": [x, v], "u": i, "p": [c], "ode": [v, 9.81 - c * i * i / x**2], "y": x},
+        name="levitated",
+        states=[psa.State("x", "m", "gap", 0.01, 0.01), psa.State("v", "m/s", "speed", 0.1)],
+        outputs=["gap"],
+        parameters=[_log("c", 0.002)],
+    )
+    record = {"time": t, "i": current, "gap": gap + 5e-6 * rng.standard_normal(n)}
+    return model, record, {"c": 0.0025}

@@ -1,6 +1,6 @@
 """Records that one simulation cannot follow: unstable, chaotic and integrating plants."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
@@ -35,6 +35,17 @@ def test_parts_find_the_parameters_of_chaos() -> None:
     _near(found.model.values, truth, rel=0.02)
     assert found.rms["x"] == pytest.approx(0.02, rel=0.05)
     assert "hold_found" not in _codes(found.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", [hard.lorenz, hard.levitated])
+def test_parts_are_as_short_as_a_plant_needs(plant: Callable[[], hard.Plant]) -> None:
+    """Chaos with a hidden state; a rate that is not finite at 0, which no exact steps can have."""
+    model, record, truth = plant()
+    found = psa.identify(model, record)
+    _near(found.model.values, truth, rel=0.01)
+    assert all(found.rms[n] == pytest.approx(found.noise[n], rel=0.05) for n in found.rms)
+    assert "in_parts" in _codes(found.notes)
 
 
 def test_what_is_missing_in_an_unstable_plant_is_named() -> None:

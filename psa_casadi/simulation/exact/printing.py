@@ -61,7 +61,9 @@ class Graph:
         return self.numbers[node]
 
     def constant(self, value: float) -> int:
-        """Return the number of a constant."""
+        """Return the number of a constant; raises Unprintable for one that is not finite."""
+        if not math.isfinite(value):
+            raise Unprintable("a rate is not finite where all states and inputs are 0")
         return self.add("c", float(value))
 
     def value(self, number: int) -> float | None:

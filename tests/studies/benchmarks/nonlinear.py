@@ -29,6 +29,7 @@ def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
         ("pendulum under a controller", hard.pendulum, ""),
         ("the same, hidden drag", lambda: hard.pendulum(drag=0.05), "drag_in_w"),
         ("chaos in two wells", hard.duffing, ""),
+        ("chaos, a state is not shown", hard.lorenz, ""),
         ("slide, dry friction and slope", hard.slide, "friction_in_v, constant_in_v"),
         ("spring that softens", lambda: (hard.spring(), hard.aged(0), {}), "change_of_k_with_time"),
         ("battery, resistance over charge", lambda: (*hard.battery(), {}), "change_of_R0_with_soc"),
