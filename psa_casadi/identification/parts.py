@@ -27,6 +27,7 @@ from psa_casadi.records.noise import first_order_noise
 from psa_casadi.records.signals import Hold, Signals
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized
+from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
 #: A model follows an output where it misses less than this share of its standard deviation; one
@@ -66,24 +67,41 @@ def from_starts(
 
     `made` turns the records that were `given` into experiments, `cut` into parts or not. Where it
     is `undecided` what inputs do between samples, it is what is likelier. Raises SimulationError
-    where whole records cannot be simulated.
+    where neither whole records nor parts can be simulated.
     """
-    runs = made(None)
-    best, whole, outcomes = search_starts(
-        sized(model, runs), runs, free, starts=starts, progress=progress
-    )
-    if best.interrupted:
-        return best, whole, outcomes, ()
-    known = follows(best, whole, _NEAR) and _forgets(best, whole)
-    if not known and not follows(best, whole):
+    runs, lost = made(None), None
+    try:
+        best, whole, outcomes = search_starts(
+            sized(model, runs), runs, free, starts=starts, progress=progress
+        )
+    except SimulationError as error:
+        lost = error
+    else:
+        if best.interrupted or (follows(best, whole, _NEAR) and _forgets(best, whole)):
+            return _held_or_not(best, whole, outcomes, undecided and not best.interrupted)
+    if lost is not None or not follows(best, whole):
         progress("fitting parts of the records")
         found = _in_parts(model, given, made, free, undecided, starts, progress)
-        if found is not None and (found[0].cost < best.cost or len(found[1]) > len(whole)):
+        if found is not None and (lost or len(found[1]) > len(whole) or _nearer(found[0], best)):
             return found
+    if lost is not None:
+        raise lost
+    return _held_or_not(best, whole, outcomes, undecided)
+
+
+def _held_or_not(
+    best: Fit, whole: tuple[Experiment, ...], outcomes: tuple[StartOutcome, ...], undecided: bool
+) -> Found:
     if undecided and (other := held_otherwise(best, whole)):
         best, whole, said = other
         return best, whole, outcomes, (said,)
     return best, whole, outcomes, ()
+
+
+def _nearer(one: Fit, other: Fit) -> bool:
+    """Whether a fit leaves less of the outputs than another one, in the geometric mean."""
+    pairs = zip(one.channels, other.channels, strict=True)
+    return sum(float(np.log(a.rms / max(b.rms, 1e-300))) for a, b in pairs if a.rms > 0) < 0.0
 
 
 def held_otherwise(

@@ -3,10 +3,16 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import casadi as ca
+import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
+from psa_casadi.identification.experiments import experiments_of, given_to
+from psa_casadi.identification.multistart import search_starts
 from psa_casadi.notes import Note
+from psa_casadi.simulation.stepper import SimulationError
 from tests.any_model import hard_plants as hard
 
 
@@ -46,6 +52,28 @@ def test_parts_are_as_short_as_a_plant_needs(plant: Callable[[], hard.Plant]) ->
     _near(found.model.values, truth, rel=0.01)
     assert all(found.rms[n] == pytest.approx(found.noise[n], rel=0.05) for n in found.rms)
     assert "in_parts" in _codes(found.notes)
+
+
+def test_parts_are_fitted_where_no_whole_record_can_be_simulated() -> None:
+    """A reaction that runs away within a second where nothing holds it."""
+    rng, t, x = np.random.default_rng(6), 0.01 * np.arange(800, dtype=np.float64), np.zeros(801)
+    u, x[0] = np.zeros(t.size), 2.0
+    for k, now in enumerate(t):
+        u[k] = -2.0 * x[k] ** 2 - 4.0 * (x[k] - 2.0 - 0.5 * np.sin(3.0 * now))
+        rate = lambda _, z, u=u[k]: 2.0 * z**2 + u  # noqa: E731
+        x[k + 1] = solve_ivp(rate, (0.0, 0.01), x[k : k + 1], rtol=1e-9).y[0, -1]
+    q, inflow, a = (ca.SX.sym(n) for n in ("q", "u", "a"))
+    model = psa.ode_model(
+        {"x": q, "u": inflow, "p": a, "ode": a * q**2 + inflow, "y": q},
+        name="runaway",
+        outputs=["shown"],
+        parameters=[psa.Parameter("a", 3.0, "1", (0.2, 20.0), "rate constant", log=True)],
+    )
+    record = {"time": t, "u": u, "shown": x[:-1] + 0.01 * rng.standard_normal(t.size)}
+    whole = experiments_of(model, given_to(model, record, None), judged=False)
+    with pytest.raises(SimulationError, match="cannot be simulated on these records"):
+        search_starts(model, whole, ["a"], starts=1)
+    _near(psa.identify(model, record, starts=1).model.values, {"a": 2.0}, rel=0.005)
 
 
 def test_what_is_missing_in_an_unstable_plant_is_named() -> None:
