@@ -45,6 +45,8 @@ _FIT = (
         "moments",
         "the model",
         "fitting from",
+        "fitting parts",
+        "fitting longer",
         "fit from",
     ),
 )
@@ -59,7 +61,15 @@ DIAGNOSE = Course(
         ("screening the effects", ("the displacement with", "screening", "searching again")),
         (
             "trying causes",
-            ("cause ", "several causes", "without ", "all causes", "fitting the r", "the same"),
+            (
+                "cause ",
+                "several causes",
+                "without ",
+                "all causes",
+                "fitting the r",
+                "fitting the w",
+                "the same",
+            ),
         ),
         ("judging", ("judging", "a free function")),
         ("files", ("comparing", "improving", "writing", "fitting the unnamed")),

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+import scipy
 
 from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
@@ -252,7 +253,10 @@ def independent(columns: FloatArray) -> FloatArray:
     scaled: FloatArray = columns[:, norm > 0] / norm[norm > 0]
     if not scaled.shape[1]:
         return scaled
-    u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    try:
+        u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    except np.linalg.LinAlgError:  # divide and conquer may fail where the plain method does not
+        u, s, _ = scipy.linalg.svd(scaled, full_matrices=False, lapack_driver="gesvd")
     basis: FloatArray = u[:, s > 1e-7 * s[0]]
     return basis
 
