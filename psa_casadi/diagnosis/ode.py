@@ -32,11 +32,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
 from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.parts import begun, cut, follows, from_starts, held_as, refitted
-from psa_casadi.identification.refitting import (
-    reweighted,
-    unlike,
-    with_noise,
-)
+from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
 from psa_casadi.notes import Note, note

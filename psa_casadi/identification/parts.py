@@ -37,8 +37,8 @@ _FOLLOWED, _NEAR = 0.05, 0.25
 _FEWEST, _MOST = 16, 128
 #: Lengths of short parts that are tried, over the shortest.
 _SHORT = (4, 2, 1)
-#: A model forgets where its outputs depend on the first states less than this at the end, over the
-#: most that they ever do; so large a share of the record is the end.
+#: A model forgets where its outputs depend on the first states less than this at the end, over how
+#: they do at the beginning; so large a share of a part is its beginning, and its end.
 _FORGOTTEN, _END = 0.1, 0.1
 #: An error at the beginning of a part grows to so many times its size in it, at most.
 _GROWTH = 1000.0
@@ -234,10 +234,8 @@ def _longest(
     return best, parts, reached
 
 
-def held_as(experiments: Sequence[Experiment], hold: Hold | None) -> tuple[Experiment, ...]:
-    """Return experiments whose inputs are held, or straight lines, or as they are."""
-    if hold is None:
-        return tuple(experiments)
+def held_as(experiments: Sequence[Experiment], hold: Hold) -> tuple[Experiment, ...]:
+    """Return experiments whose inputs are held, or straight lines."""
     return tuple(replace(e, record=replace(e.record, hold=hold)) for e in experiments)
 
 
