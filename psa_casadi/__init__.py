@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from psa_casadi.model.parts import PARTS, compensator_for, part_model
     from psa_casadi.model.stacks import STACKS, stack_model
     from psa_casadi.model.system import System, connect
+    from psa_casadi.model.table import table
     from psa_casadi.online import (
         AdaptiveFeedForward,
         FeedForward,
@@ -118,6 +119,7 @@ _HOMES = {
     "model.system": "System connect",
     "model.nanopositioner": "controller_for margins_of nanopositioner",
     "model.ode_model": "ode_model",
+    "model.table": "table",
     "export.importer.model_with_fmu": "load_model",
     "model.model_file": "save_model",
     "design.mechanism.mechanism": "design_mechanism mechanism_model port_model",
@@ -156,8 +158,8 @@ __all__ = [
     "two_clocks", "BASE", "SIMPLIFIED", "COMPONENTS", "EFFECTS", "Component", "Equations",
     "Symbols", "own_effects", "patched_model", "STACKS", "stack_model", "Model", "compose",
     "PARTS", "part_model", "compensator_for", "controller_for", "margins_of", "System", "connect",
-    "nanopositioner", "ode_model", "fmu_model", "Input", "Output", "Parameter", "Publication",
-    "State", "load_model", "save_model", "Trajectory", "simulate", "simulate_record",
+    "nanopositioner", "ode_model", "table", "fmu_model", "Input", "Output", "Parameter",
+    "Publication", "State", "load_model", "save_model", "Trajectory", "simulate", "simulate_record",
     "simulate_many", "memory_after", "settled_at", "run", "Identification",
     "identify", "sample", "Posterior", "diagnose", "Diagnosis", "StackDiagnosis",
     "StackIdentification", "load_diagnosis",

@@ -10,6 +10,7 @@ Source: FMI 2.0.5, section 2.2.2, and FMI 3.0.2, section 2.4.3 (definition of un
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
@@ -291,6 +292,13 @@ def _spell(unit: Unit) -> str:
 
 def _describe(unit: Unit) -> str:
     return unit.quantity or f"dimension {_spell(unit)}"
+
+
+def per(unit: str, below: Sequence[str]) -> str:
+    """Return the SI unit of one quantity over the product of others, in base units."""
+    above, *lower = (parse_unit(si_unit(q)) if q else parse_unit("1") for q in (unit, *below))
+    left = [a - sum(rest) for a, *rest in zip(*(q.exponents for q in (above, *lower)), strict=True)]
+    return _spell(replace(above, exponents=tuple(left), counts=above.counts))
 
 
 def rate_unit(unit: str) -> str:

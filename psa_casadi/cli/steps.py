@@ -71,7 +71,7 @@ DIAGNOSE = Course(
                 "the same",
             ),
         ),
-        ("judging", ("judging", "a free function")),
+        ("judging", ("judging", "a free function", "a formula")),
         ("files", ("comparing", "improving", "writing", "fitting the unnamed")),
     ),
     40.0,

@@ -19,12 +19,13 @@ Stops and plays: Visintin 1994; their squares and cubes make loops that are asym
 (generalised Prandtl-Ishlinskii, Al Janaideh, Rakheja and Su 2009).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.held_out import held_out_rms
 from psa_casadi.diagnosis.screening import independent, temperature, without
@@ -186,6 +187,25 @@ _AT_BOUND = 1e-6
 _SIZES = np.geomspace(1e-3, 1e3, 25)
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter of a cause: value and 95 % interval in its unit."""
+
+    value: float
+    unit: str
+    interval: tuple[float, float]
+
+
+def estimates(effect: Component, model: Model) -> dict[str, Estimate]:
+    """Return what a fitted model's provenance says of an effect's own parameters."""
+    known = model.provenance.intervals
+    return {
+        p.name: Estimate(model.values[p.name], p.unit, (known[p.name].low, known[p.name].high))
+        for p in effect.parameters
+        if p.name in known
+    }
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
     """An unnamed correction beside a model, at a `port`: evidence over it, and what it leaves.
@@ -258,7 +278,9 @@ class FreeFunction(Correction):
     """One of any model: a function without memory `of` some variables, added to a port's sum.
 
     Along all records it adds `added` (n,) in the port's `unit`; that follows the `variable`, of
-    these the one that tells most of it, with the values `along` (n,). `model` holds it.
+    these the one that tells most of it, with the values `along` (n,). `model` holds it. Where few
+    terms of a library predict as well as a polynomial, it is their sum: `equation`, with
+    `parameters` in SI units. `fitted` is the hypothesis that has it.
     """
 
     of: str
@@ -268,6 +290,9 @@ class FreeFunction(Correction):
     along: FloatArray
     added: FloatArray
     model: Model
+    fitted: Any = None
+    equation: str = ""
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -277,11 +302,11 @@ class FreeFunction(Correction):
     @property
     def said(self) -> Note:
         """What it is."""
-        return note("free", of=self.of, port=self.port)
+        return note("free", of=self.of, port=self.port, equation=self.equation)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for DIAGNOSIS.json."""
-        names = ("port", "of", "evidence", "share", "unit", "variable")
+        names = ("port", "of", "evidence", "share", "unit", "variable", "equation", "parameters")
         return {n: getattr(self, n) for n in names}
 
 

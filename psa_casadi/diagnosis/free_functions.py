@@ -3,21 +3,20 @@
     Q gains sum_k c_k m_k(r)
 
 m_k are the monomials up to the third power of what the port sees (the states and inputs of a rate),
-or up to the fifth of a signal, each over its size. They have no memory and no time.
+or up to the fifth of a signal. They have no memory and no time.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
-from math import prod
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.diagnosis.corrections import FreeFunction
-from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, Attached, extended
+from psa_casadi.component import Component, Expression, Symbols
+from psa_casadi.diagnosis.corrections import FreeFunction, estimates
+from psa_casadi.diagnosis.formulas import Formula, Place, fitted, formula, place_of
+from psa_casadi.diagnosis.generic.attached import Attached, extended
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes
 from psa_casadi.diagnosis.screening import (
@@ -26,31 +25,25 @@ from psa_casadi.diagnosis.screening import (
     whitened_residuals,
     without,
 )
-from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.refitting import refit, weighted
+from psa_casadi.identification.parts import begun, follows
 from psa_casadi.identification.result import with_told
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import Port, ports_of, true_output
+from psa_casadi.model.ports import is_place, ports_of
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.sizes import Sizes, sizes_of, states_of
 from psa_casadi.units import FloatArray
-from psa_casadi.variables import Parameter
 
-_OF_SIGNAL, _OF_STATES, _VARIABLES = 5, 3, 3
-#: So many ports are fitted, and with so many evaluations.
-_FITTED, _EVALUATIONS = 2, 25
-
-
-@dataclass(frozen=True)
-class _Law:
-    """The monomials of a free function, and the sizes that its variables are taken over."""
-
-    names: tuple[str, ...]
-    terms: tuple[tuple[str, ...], ...]
-    scales: dict[str, float]
+#: So many ports are fitted.
+_FITTED = 2
+#: A formula stands for a free function if it misses at most so many times as much.
+_AS_WELL = 1.1
+#: Powers of a variable that what is added is compared with.
+_POWERS = 5
 
 
 def model_of(
@@ -79,154 +72,121 @@ def fit_free_functions(
     `base` is the model before its ports were opened, `effects` are the hypothesis' causes.
     """
     of, experiments = view.of, task.experiments
-    starts = [{n: v for n, v in s.items() if n in base.state_names} for s in of.fit.starts()]
-    sizes = sizes_of(base, experiments, starts)
-    scored: list[tuple[float, Attached, _Law]] = []
-    for attached, law in [_free(base, p, sizes) for p in ports_of(base)]:
-        with suppress(PsaError):
-            scored.append((_decrease(view, attached, experiments), attached, law))
+    sizes = _sizes(base, of, experiments)
+    scored: list[tuple[float, Place, Component]] = []
+    for port in ports_of(base):
+        if port.kind != "intermediate" or is_place(base, port):
+            place = place_of(base, port, sizes)
+            component = place.component(f"free_in_{port.kind}_{port.variable}", place.polynomial())
+            with suppress(PsaError):
+                scored.append((_decrease(view, component, experiments), place, component))
     scored.sort(key=lambda s: -s[0])
     found = []
-    for _, attached, law in scored[:_FITTED]:
-        task.progress(f"a free function in {attached.port.words}")
+    for _, place, component in scored[:_FITTED]:
+        task.progress(f"a free function in {place.port.words}")
         with suppress(PsaError):
-            model = of.fit.model.with_effect(attached.component)
-            fit = refit(
-                replace(of.fit, model=model), weighted(of.fit, experiments),
-                [*of.fit.unknowns.names, *attached.component.fitted],
-                sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
-            )  # fmt: skip
-            h = hypothesis((*of.causes, attached.component), fit, experiments)
-            if h is not None:
-                gained = scale.evidence(h) - scale.evidence(of)
-                model = model_of(base, fit, [*effects, attached], experiments)
-                found.append(_told(h, attached, law, model, gained, experiments))
+            free = fitted(of, of.fit, component, place.polynomial(), experiments)
+            if free is not None:
+                found.append(_told(free, of, place, task, base, effects, scale))
     return sorted(found, key=lambda f: -f.evidence)
 
 
-def _told(
-    h: Hypothesis,
-    attached: Attached,
-    law: _Law,
-    model: Model,
-    evidence: float,
-    experiments: Sequence[Experiment],
-) -> FreeFunction:
-    """Return a fitted function, and what it adds beside the variable that it follows most."""
-    component = attached.component
-    values = _along(h.fit, component.fitted, experiments, law.names)
-    added = np.asarray(
-        sum(
-            h.fit.model.values[c] * prod(values[n] / law.scales[n] for n in term)
-            for c, term in zip(component.fitted, law.terms, strict=True)
-        )
+def formula_of(
+    told: FreeFunction, of: Hypothesis, task: Task, base: Model, effects: Sequence[Attached],
+    scale: Scale, whole: Sequence[Experiment],
+) -> FreeFunction | None:  # fmt: skip
+    """Return the formula in the place of a free function; None where it predicts less.
+
+    Its numbers are those of the `whole` records where the model with it follows these.
+    """
+    port = next(p for p in ports_of(base) if p.words == told.port)
+    place = place_of(base, port, _sizes(base, of, task.experiments))
+    task.progress(f"a formula in {port.words}")
+    free = Formula(told.fitted, told.fitted.causes[-1], tuple(place.polynomial()))
+    found = formula(of, free, place, task.experiments, scale, task.limits.price)
+    if found is None:
+        return None
+    rows = zip(found.hypothesis.errors, told.held, strict=True)
+    if any(error > _AS_WELL * before for error, before in rows):
+        return None
+    own = _told(found, of, place, task, base, effects, scale)
+    if len(whole) < len(task.experiments):
+        with suppress(PsaError):
+            fit = begun(found.hypothesis.fit, task.experiments, whole)
+            if follows(fit, whole):
+                added = [*effects, Attached(found.component, port)]
+                own = replace(own, model=model_of(base, fit, added, whole))
+    return replace(
+        own,
+        equation=found.equation(port.balance, own.model.values),
+        parameters=estimates(found.component, own.model),
     )
+
+
+def _told(
+    found: Formula, of: Hypothesis, place: Place, task: Task, base: Model,
+    effects: Sequence[Attached], scale: Scale,
+) -> FreeFunction:  # fmt: skip
+    """Return a fitted function, and what it adds beside the variable that it follows most."""
+    h, port, experiments = found.hypothesis, place.port, task.experiments
+    s = h.fit.model.structure
+    term = found.component.equations(Symbols(s.symbols)).add[port.balance]
+    seen = [s.symbols[place.symbols[n]] for n in place.names]
+    *rows, added = _along(h.fit, experiments, [*seen, term])
+    values = dict(zip(place.names, rows, strict=True))
 
     def scatter(name: str) -> float:
         """What a polynomial of one variable leaves of what is added (sum of squares)."""
-        place = values[name] / max(float(np.max(np.abs(values[name]))), 1e-300)
-        powers = np.vander(place, _OF_SIGNAL + 1)
+        along = values[name] / max(float(np.max(np.abs(values[name]))), 1e-300)
+        powers = np.vander(along, _POWERS + 1)
         rest = added - powers @ np.linalg.lstsq(powers, added, rcond=None)[0]
         return float(rest @ rest)
 
-    name, s = min(values, key=scatter), h.fit.model.structure
-    units = {v.name: v.unit for rows in (s.states, s.inputs, s.outputs) for v in rows}
+    name = min(values, key=scatter)
     return FreeFunction(
-        port=attached.port.words,
-        evidence=evidence,
+        port=port.words,
+        evidence=scale.evidence(h) - scale.evidence(of),
         held=h.errors,
         predicted=h.shown,
-        of=" and ".join(law.names),
-        unit=attached.port.unit,
+        of=" and ".join(
+            n for n in place.names if any(n in (*t.factors, t.over) for t in found.terms)
+        ),
+        unit=port.unit,
         variable=name,
-        variable_unit=units[name],
+        variable_unit=place.units[name],
         along=values[name],
         added=added,
-        model=model,
+        model=model_of(base, h.fit, [*effects, Attached(found.component, port)], experiments),
+        fitted=h,
     )
 
 
 def _along(
-    fit: Fit, coefficients: Sequence[str], experiments: Sequence[Experiment], names: Sequence[str]
-) -> dict[str, FloatArray]:
-    """Return variables along all records: inputs, states, or outputs before their sensors."""
-    model, found = fit.model, dict[str, FloatArray]()
-    inputs = [n for n in names if n in model.input_names]
-    for n in inputs:
-        found[n] = np.concatenate([e.record.column(n) for e in experiments])
-    states = [n for n in names if n in model.state_names and n not in found]
-    if states:
-        theta = fit.placed(experiments)
-        x = np.vstack([
-            states_of(model, e, fit.unknowns.start(theta, r), fit.way.step_rtol)
-            for r, e in enumerate(experiments)
-        ])  # fmt: skip
-        found |= {n: x[:, model.state_names.index(n)] for n in states}
-    outputs = [n for n in names if n not in found]
-    if outputs:
-        y = np.vstack(fit.at(dict.fromkeys(coefficients, 0.0)).outputs(experiments))
-        found |= {n: y[:, model.output_names.index(n)] for n in outputs}
-    return {n: found[n] for n in names}
+    fit: Fit, experiments: Sequence[Experiment], expressions: Sequence[Expression]
+) -> FloatArray:
+    """Return expressions in a model's symbols along all records (expressions, n)."""
+    model, theta, found = fit.model, fit.placed(experiments), []
+    s, p = model.structure, model.parameter_vector()
+    sums = ca.vertcat(*(s.symbols[n] for n in s.sums)), ca.vertcat(*s.sums.values())
+    f = ca.Function("along", s.arguments, [ca.substitute(ca.vertcat(*expressions), *sums)])
+    for r, e in enumerate(experiments):
+        x = states_of(model, e, fit.unknowns.start(theta, r), fit.way.step_rtol)
+        time, u = e.record.time - e.record.time[0], record_inputs(model, e.record, e.record.n)
+        found.append(np.array(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x)))))
+    return np.hstack(found)
 
 
-def _decrease(view: View, attached: Attached, experiments: Sequence[Experiment]) -> float:
+def _sizes(base: Model, of: Hypothesis, experiments: Sequence[Experiment]) -> Sizes:
+    starts = [{n: v for n, v in s.items() if n in base.state_names} for s in of.fit.starts()]
+    return sizes_of(base, experiments, starts)
+
+
+def _decrease(view: View, component: Component, experiments: Sequence[Experiment]) -> float:
     """Return the decrease of the whitened sum of squares that the coefficients promise together."""
     fit, colour = view.of.fit, view.screening.colour
-    model = fit.model.with_effect(attached.component)
-    moved = dict.fromkeys(attached.component.fitted, 1.0)
+    model = fit.model.with_effect(component)
+    moved = {p.name: p.typical(fit.model.values) for p in component.parameters}
     columns, further = changes(fit, experiments, model, moved, tuple(fit.starts()), 0.0)
     basis = independent(whitened_jacobian(fit, colour))
     free = independent(without(colour.whiten_all(columns, further), basis))
     return float(np.sum((free.T @ without(whitened_residuals(fit, colour), basis)) ** 2))
-
-
-def _free(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, _Law]:
-    """Return the free function of a port, and its monomials."""
-    scales = {**sizes.inputs, **sizes.states}
-    if port.kind == "rate":
-        rate = model.structure.xdot[model.state_names.index(port.variable)]
-        seen = {q.name() for q in ca.symvar(rate)} | {port.variable}
-        names = [n for n in (*model.state_names, *model.input_names) if n in seen][:_VARIABLES]
-        size, powers = sizes.rates[port.variable], range(1, _OF_STATES + 1)
-        symbols = dict.fromkeys(names, "")
-    else:
-        names, powers = [port.variable], range(2, _OF_SIGNAL + 1)
-        size = (sizes.inputs if port.kind == "input" else sizes.outputs)[port.variable]
-        scales = {port.variable: size}
-        symbols = {port.variable: "" if port.kind == "input" else true_output(port.variable)}
-    terms = [t for p in powers for t in combinations_with_replacement(names, p)]
-    prefix = f"free_in_{port.kind}_{port.variable}"
-    equations = _equations(port, prefix, terms, {n: symbols[n] or n for n in names}, scales)
-    component = Component(
-        name=prefix,
-        description=f"{port.words}: a free function of {' and '.join(names)}",
-        source="polynomial without physics",
-        equations=equations,
-        parameters=tuple(
-            Parameter(
-                f"{prefix}_{k}", 0.0, port.unit, (-LARGEST * size, LARGEST * size),
-                f"coefficient of {'*'.join(t)}", scale=ORDINARY * size,
-            )
-            for k, t in enumerate(terms)
-        ),
-        gain=f"{prefix}_0",
-    )  # fmt: skip
-    own = {n: scales[n] for n in names}
-    return Attached(component, port), _Law(tuple(names), tuple(terms), own)
-
-
-def _equations(
-    port: Port,
-    prefix: str,
-    terms: Sequence[tuple[str, ...]],
-    symbols: dict[str, str],
-    scales: dict[str, float],
-) -> Callable[[Symbols], Equations]:
-    def equations(s: Symbols) -> Equations:
-        total = sum(
-            getattr(s, f"{prefix}_{k}") * prod(getattr(s, symbols[n]) / scales[n] for n in term)
-            for k, term in enumerate(terms)
-        )
-        return Equations(add={port.balance: total})
-
-    return equations

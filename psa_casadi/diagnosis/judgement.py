@@ -10,9 +10,9 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import too_few_held_out
-from psa_casadi.diagnosis.corrections import Correction, best_of
+from psa_casadi.diagnosis.corrections import Correction, FreeFunction, best_of, estimates
 from psa_casadi.diagnosis.families import SUREST, Family, Shown, families, place_and_kind
-from psa_casadi.diagnosis.free_functions import fit_free_functions, model_of
+from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
 from psa_casadi.diagnosis.pack import Task
@@ -24,7 +24,6 @@ from psa_casadi.diagnosis.result import (
     OutputError,
     Remaining,
     Verdict,
-    estimates,
 )
 from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
@@ -295,6 +294,11 @@ class Judge:
         return best_of(self.beside_final, self.experiments, of.errors, colour, self.limits)
 
     @property
+    def told_correction(self) -> Correction | None:
+        """The same in the form that is told."""
+        return self.best_correction
+
+    @property
     def families_left(self) -> tuple[Family, ...]:
         """The places and kinds that what has no name may be of, where something is left."""
         if self.best_correction is None or self.left(self.final).white:
@@ -305,7 +309,7 @@ class Judge:
     @cached_property
     def budget(self) -> Budget:
         """Where the base's held-out error goes."""
-        unnamed = self.best_correction
+        unnamed = self.told_correction
         return budget(
             removed_from(self.experiments, self.first.view.of.shown, self.noise),
             self.final.view.of.shown,
@@ -416,7 +420,7 @@ class Judge:
     @property
     def common(self) -> dict[str, Any]:
         """What the diagnosis of every kind of device holds."""
-        best = self.best_correction
+        best = self.told_correction
         share = 0.0 if self.budget.unnamed is None else self.budget.unnamed.share
         return {
             "verdict": self.verdict,
@@ -435,11 +439,16 @@ class Judge:
 
 
 class ModelJudge(Judge):
-    """The judge of any model: `base` as it was before the search, `table` effects at its ports."""
+    """The judge of any model: `base` as it was before the search, `table` effects at its ports.
 
-    def __init__(self, known: Known, base: Model, table: Mapping[str, Attached]) -> None:
+    `whole` are the records, of which the search may have seen parts.
+    """
+
+    def __init__(
+        self, known: Known, base: Model, table: Mapping[str, Attached], whole: Sequence[Experiment]
+    ) -> None:
         super().__init__(steps_of(known, known.task), known.task)
-        self.known, self.base, self.table = known, base, table
+        self.known, self.base, self.table, self.whole = known, base, table, whole
         self.views = {s.view.of.names: s.view for s in self.steps}
         self.views |= {s.beside.of.names: s.beside for s in self.steps if s.beside is not None}
 
@@ -467,6 +476,17 @@ class ModelJudge(Judge):
         scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
         effects = [self.table[c.name] for c in of.causes]
         return fit_free_functions(view, self.task, self.base, effects, scale)
+
+    @cached_property
+    def told_correction(self) -> Correction | None:
+        """The unnamed correction as a formula, where few terms predict as well."""
+        best, of = self.best_correction, self.final.view.of
+        if not isinstance(best, FreeFunction):
+            return best
+        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
+        effects = [self.table[c.name] for c in of.causes]
+        law = formula_of(best, of, self.task, self.base, effects, scale, self.whole)
+        return best if law is None else replace(law, open_to=best.open_to)
 
     def unseen(self, step: Step) -> tuple[Note, float] | None:
         """Return which output's held-out samples are unlike the fitted ones."""

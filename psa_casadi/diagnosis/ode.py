@@ -31,7 +31,18 @@ from psa_casadi.identification.experiments import (
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
 from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.parts import begun, cut, follows, from_starts, held_as, refitted
+from psa_casadi.identification.parts import (
+    LIKELIER,
+    begun,
+    cut,
+    follows,
+    from_starts,
+    held_as,
+    held_otherwise,
+    likelier,
+    other_hold,
+    refitted,
+)
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
@@ -46,9 +57,8 @@ _OF_STACKS = frozenset(
 )
 #: Verdicts that leave something open.
 _OPEN = ("unexplained", "partly_explained")
-#: An input that is held is late by half a sampling interval, give or take; a fit explains as much
-#: as another one if it leaves no more than this share of its rms.
-_HALF, _AS_MUCH = (0.3, 0.7), 1.2
+#: An input that is held is late by half a sampling interval, give or take.
+_HALF = (0.3, 0.7)
 
 
 def diagnose_ode(
@@ -109,10 +119,10 @@ def diagnose_ode(
             known = _of_whole(known, task_of(names, whole)) or known
         fit_rivals(known)
         progress("judging")
-        return ModelJudge(known, base.model, table), notes
+        return ModelJudge(known, base.model, table, whole), notes
 
     own = {c.name for c in effects}
-    fixed = [n for n, e in table.items() if n in own or e.port.kind != "parameter"]
+    fixed = [n for n, e in table.items() if n in own or e.component.kind != "changing gain"]
     try:
         judge, notes = judged(fixed)
         if judge.verdict in _OPEN and len(fixed) < len(table):
@@ -127,7 +137,13 @@ def diagnose_ode(
         cut_off = model_of(base.model, best, attached, runs, interrupted=True)
         raise DiagnosisInterrupted(cut_off) from None
     noise = noise_found(found.extended_fit, found.experiments, (*given, *held))
-    remarks = (*said, *notes, *judge.known.remarks, *told_of_columns(model, runs))
+    codes = {n.code for n in notes}
+    remarks = (
+        *(n for n in said if n.code not in codes),
+        *notes,
+        *judge.known.remarks,
+        *told_of_columns(model, runs),
+    )
     return found.with_noise(noise, remarks)
 
 
@@ -185,25 +201,26 @@ def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Kn
 def _held_instead(
     known: Known, base: Fit, task_of: _Tasks
 ) -> tuple[Known, tuple[Note, ...]] | None:
-    """Return what is found with held inputs where one is late by half a sampling interval.
+    """Return what is found with inputs the other way between samples, if that is likelier.
 
-    Of straight lines, and if that explains as much with fewer causes.
+    Looked for where the answer is likelier so, or has straight lines that are late by half a
+    sampling interval. A cause counts as much as for the choice itself.
     """
-    best, runs = known.answer, known.task.experiments
+    best, runs, hold = known.answer, known.task.experiments, other_hold(known.task.experiments)
     step = float(np.median([e.record.sample_time for e in runs]))
     times = [best.fit.model.values[f"{c.name}_time"] for c in best.causes if c.name in _late(base)]
-    if runs[0].record.hold == "zero" or not any(_HALF[0] < t / step < _HALF[1] for t in times):
+    late = hold == "zero" and any(_HALF[0] < t / step < _HALF[1] for t in times)
+    if not late and not held_otherwise(best.fit, runs):
         return None
-    held = held_as(runs, "zero")
+    others = held_as(runs, hold)
     try:
-        found = _once(refitted(base, held), held, task_of)
+        found = _once(refitted(base, others), others, task_of)
     except PsaError:
         return None
-    less = len(found.answer.causes) < len(best.causes)
-    if not less or found.answer.fit.rms > _AS_MUCH * best.fit.rms:
+    nats = likelier(found.answer.fit, best.fit)
+    if nats < LIKELIER * (1 + len(found.answer.causes) - len(best.causes)) - LIKELIER * late:
         return None
-    gained = found.answer.fit.residuals.size * np.log(best.fit.rms / found.answer.fit.rms)
-    return found, (note("hold_found", hold="zero", nats=max(float(gained), 0.0)),)
+    return found, (note("hold_found", hold=hold, nats=max(nats, 0.0)),)
 
 
 def _late(base: Fit) -> set[str]:

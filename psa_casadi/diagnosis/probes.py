@@ -146,6 +146,8 @@ _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's 
 #: A column along the course of a fit counts where the fitted parameters leave so many times of it
 #: what it may err by; else the effect is simulated.
 _CLEAR = 3.0
+#: A tangent that may err by this share of its size is no tangent.
+_ROUGH = 0.05
 #: A difference below this share of the readings is rounding, which looks like the residual's.
 _ROUNDING = 1e-12
 
@@ -205,6 +207,33 @@ def directions(
         return list(_directions_at(fit, experiments, effect, model, values, finite_steps, beside))
 
     return [d for found in side_by_side(one, tasks) for d in found]
+
+
+def tangents(
+    fit: Fit, experiments: Sequence[Experiment], effects: Sequence[Component]
+) -> dict[str, tuple[FloatArray, tuple[FloatArray, ...]]]:
+    """Return what each of many effects without own states changes, for its gain's ordinary size.
+
+    In fitted samples (samples,), and in every further channel. All at once in one model, or along
+    the fit's course, where they have laws; without those that may err by more than `_ROUGH`.
+    """
+    laws = laws_of(fit.model, [e.record for e in experiments if e.stop], effects)
+    model = fit.model.with_components((*fit.model.components, *effects))
+    gains = [e.gain or "" for e in effects]
+    sizes = {n: model.parameter(n).typical(model.values) for n in gains}
+    memory = tuple(fit.starts())
+    if len(laws) < len(effects):
+        columns, further = changes(fit, experiments, model, sizes, memory, 0.0)
+        return {
+            e.name: (columns[:, k], tuple(f[:, k] for f in further)) for k, e in enumerate(effects)
+        }
+    beside, found = _Beside(fit, experiments, laws), {}
+    for e, gain in zip(effects, gains, strict=True):
+        model, moved = fit.model.with_effect(e), {gain: sizes[gain]}
+        columns, further, error = _changes(fit, experiments, model, moved, memory, 0.0, beside)
+        if error < _ROUGH:
+            found[e.name] = columns[:, 0], tuple(f[:, 0] for f in further)
+    return found
 
 
 def laws_of(

@@ -7,8 +7,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from psa_casadi.component import Component
-from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
+from psa_casadi.diagnosis.corrections import Correction, Estimate, FreeFunction, Patch
 from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit
@@ -31,25 +30,6 @@ Verdict = Literal[
 FORMAT, ANY_MODEL = "psa_casadi.diagnosis/1", "psa_casadi.own_model_diagnosis/1"
 #: What remains is noise.
 NOISE = note("noise_only")
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A parameter of a cause: value and 95 % interval in its unit."""
-
-    value: float
-    unit: str
-    interval: tuple[float, float]
-
-
-def estimates(effect: Component, model: Model) -> dict[str, Estimate]:
-    """Return what a fitted model's provenance says of an effect's own parameters."""
-    known = model.provenance.intervals
-    return {
-        p.name: Estimate(model.values[p.name], p.unit, (known[p.name].low, known[p.name].high))
-        for p in effect.parameters
-        if p.name in known
-    }
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ _FORGOTTEN, _END = 0.1, 0.1
 #: An error at the beginning of a part grows to so many times its size in it, at most.
 _GROWTH = 1000.0
 #: Nats by which held inputs are likelier than lines, or lines than held ones: a cause's price.
-_LIKELIER = 8.0
+LIKELIER = 8.0
 #: Order of the autoregression of a residual.
 _ORDER = 8
 
@@ -107,26 +107,36 @@ def _nearer(one: Fit, other: Fit) -> bool:
 def held_otherwise(
     of: Fit, experiments: Sequence[Experiment]
 ) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
-    """Return the fit with inputs the other way between samples, where that is likelier.
+    """Return the fit with inputs the other way between samples, where that is `LIKELIER`.
 
-    By `_LIKELIER` nats, sum_j n_j ln(w_j/w'_j), w the rms of what an autoregression leaves of an
-    output's residual: half a sample shows at jumps, whatever slow structure the model misses. All
-    inputs of all records are held, or none is.
+    All inputs of all records are held, or none is.
     """
-    hold: Hold = "linear" if any(e.record.hold == "zero" for e in experiments) else "zero"
+    hold = other_hold(experiments)
     others = held_as(experiments, hold)
     try:
         found = refitted(of, others)
     except PsaError:
         return None
-    nats = sum(
-        o.residuals.size * float(np.log(_innovation(o) / _innovation(new)))
-        for o, new in zip(of.channels, found.channels, strict=True)
-    )
-    if nats < _LIKELIER:
+    nats = likelier(found, of)
+    if nats < LIKELIER:
         return None
     best, again = relevelled(found, others, every=True)
     return best, again, note("hold_found", hold=hold, nats=nats)
+
+
+def likelier(new: Fit, old: Fit) -> float:
+    """Return by how many nats a fit is likelier than another one of the same readings.
+
+    sum_j n_j ln(w_j/w'_j), w the rms of what an autoregression leaves of an output's residual: half
+    a sample shows at jumps, whatever slow structure the model misses.
+    """
+    pairs = zip(old.channels, new.channels, strict=True)
+    return sum(a.residuals.size * float(np.log(_innovation(a) / _innovation(b))) for a, b in pairs)
+
+
+def other_hold(experiments: Sequence[Experiment]) -> Hold:
+    """Return what inputs are not between samples."""
+    return "linear" if any(e.record.hold == "zero" for e in experiments) else "zero"
 
 
 def refitted(of: Fit, others: Sequence[Experiment]) -> Fit:

@@ -7,20 +7,22 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Expression, OnDemand, Symbols
+from psa_casadi.component import Balance, Component, Equations, Expression, OnDemand, Symbols
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 
 #: The columns of symbols and of expressions, in the order of the function's inputs and outputs.
-SYMBOLS, EXPRESSIONS = ("t", "x", "u", "p"), ("ode", "y", "zero")
+SYMBOLS, EXPRESSIONS = ("t", "x", "u", "p", "w", "z"), ("ode", "y", "zero", "wdef", "alg")
 #: What else CasADi's integrators know, and why it cannot be here.
-_REFUSED = {
-    "z": "algebraic variables: solve the algebraic equations for them, or differentiate them once",
-    "alg": "algebraic equations: solve them, or differentiate them once",
-    "quad": "quadratures: make each a state, its expression a row of 'ode'",
-}
+_REFUSED = {"quad": "quadratures: make each a state, its expression a row of 'ode'"}
+#: Columns of which one says how many rows the other has, and what the rows of both are.
+_PAIRS = (
+    ("x", "ode", "state", "derivative"),
+    ("w", "wdef", "intermediate", "expression"),
+    ("z", "alg", "algebraic variable", "equation"),
+)
 #: Other names of the same columns, as this package's own functions have them.
 _ALIASES = {"time": "t", "xdot": "ode"}
 #: What the rows of a column are declared as.
@@ -29,6 +31,7 @@ _KINDS: dict[str, tuple[type, str]] = {
     "u": (Input, "inputs"),
     "p": (Parameter, "parameters"),
     "y": (Output, "outputs"),
+    "w": (Output, "intermediates"),
 }
 #: Equations longer than this are not repeated as text in an exported model's documentation.
 _TEXT_LIMIT = 600
@@ -42,6 +45,7 @@ def ode_model(
     inputs: Sequence[Input | str] | None = None,
     parameters: Sequence[Parameter | str] | None = None,
     outputs: Sequence[Output | str] | None = None,
+    intermediates: Sequence[Output | str] | None = None,
     values: Mapping[str, float] | None = None,
     description: str = "",
     source: str = "given as a CasADi ODE",
@@ -57,27 +61,34 @@ def ode_model(
     CasADi function with these names of inputs and outputs. Symbols are SX or MX, in one column for
     each name.
 
-    `states`, `inputs`, `parameters` and `outputs` say what the rows are: `State`, `Input`,
-    `Parameter`, `Output` with unit, start, size and bounds; or a name alone: then the unit is 1,
-    the start 0 and the usual size 1, and a parameter needs its number in `values`. Left out, the
-    names of the symbols are taken (outputs: y, or y_0, y_1, ...). The usual size (`nominal`) is
-    what the solver's absolute tolerance is measured by. `values` are numbers of parameters in SI
-    units.
+    "w" are intermediates (nw symbols: a force, a flow, a voltage drop), which "ode", "y" and other
+    intermediates use, and "wdef" their expressions. Each is a port: a place where a diagnosis looks
+    for what is missing. "z" are algebraic variables (nz), and "alg" the equations alg(t, x, u, p,
+    w, z) = 0, linear in z, that they are solved from.
+
+    `states`, `inputs`, `parameters`, `outputs` and `intermediates` say what the rows are: `State`,
+    `Input`, `Parameter`, `Output` (of intermediates, too) with unit, start, size and bounds; or a
+    name alone: then the unit is 1, the start 0 and the usual size 1, and a parameter needs its
+    number in `values`. Left out, the names of the symbols are taken (outputs: y, or y_0, y_1, ...).
+    The usual size (`nominal`) is what the solver's absolute tolerance is measured by. `values` are
+    numbers of parameters in SI units.
 
     MODEL.json keeps it with its equations as text (`psa.save_model`); a usual size that is a
     function of parameters is a number there.
 
     Raises InputError with every mistake: a symbol that is not in x, u, p or t; rows that do not
     fit; SX beside MX; what cannot be expanded to scalar operations; names used twice or reserved;
-    unknown units; numbers that are not finite; algebraic equations.
+    unknown units; numbers that are not finite; algebraic equations that are not linear in z or
+    leave it open; intermediates that need each other.
     """
     f, names = _read(ode)
-    given = {"x": states, "u": inputs, "p": parameters, "y": outputs}
+    given = {"x": states, "u": inputs, "p": parameters, "y": outputs, "w": intermediates}
     table = _declared(f, names, given, values or {}, name)
     equations = _equations(f, table)
     written = equations(OnDemand())
     lines = [f"{state}' = {side}" for state, side in written.der.items()]
-    text = ",  ".join([*lines, *(f"{output} = {side}" for output, side in written.out.items())])
+    sides = {**written.out, **written.add}
+    text = ",  ".join([*lines, *(f"{name} = {side}" for name, side in sides.items())])
     component = Component(
         name=name,
         description=description or f"the ordinary differential equation '{name}'",
@@ -87,6 +98,7 @@ def ode_model(
         states=tuple(table["x"]),
         inputs=tuple(table["u"]),
         outputs=tuple(table["y"]),
+        balances=tuple(Balance(w.name, w.unit, w.description) for w in table["w"]),
         equation_text=text if len(text) <= _TEXT_LIMIT else "",
     )
     return compose([component], values, name=name, description=description)
@@ -95,7 +107,7 @@ def ode_model(
 def _read(
     ode: Mapping[str, Expression] | ca.Function,
 ) -> tuple[ca.Function, dict[str, list[str]]]:
-    """Return f(t, x, u, p) -> (ode, y, zero) of SX columns, and the names of the symbols' rows."""
+    """Return f(t, x, u, p, w) -> (ode, y, zero, wdef) of SX, and the names of the symbols' rows."""
     kind: Any
     if isinstance(ode, ca.Function):
         kind, what = ca.MX, f"The function '{ode.name()}'"
@@ -128,7 +140,8 @@ def _read(
             names[k] += [own] if count == 1 else [f"{own}_{i}" for i in range(count)]
     whole = {"t": kind.sym("t"), **columns}
     before, after = ([whole.get(k, kind(0, 1)) for k in q] for q in (SYMBOLS, EXPRESSIONS))
-    return _scalar(ca.Function("ode", before, after, list(SYMBOLS), list(EXPRESSIONS))), names
+    found = _scalar(ca.Function("ode", before, after, list(SYMBOLS), list(EXPRESSIONS)))
+    return _without_algebra(found), names
 
 
 def _check_names(names: list[str], what: str) -> None:
@@ -141,10 +154,12 @@ def _check_names(names: list[str], what: str) -> None:
                 f"{what} has '{name}', which is not known; there are the symbols"
                 f" {', '.join(SYMBOLS)} and the expressions {', '.join(EXPRESSIONS)}."
             )
-    for name in ("x", "ode"):
-        if name not in names:
-            what_it_is = "states" if name == "x" else "derivatives of the states"
-            problems.add(f"{what} lacks '{name}', the column of the {what_it_is}; give it.")
+    for symbol, expression, row, side in _PAIRS:
+        lacks = {symbol, expression} - {*names}
+        if lacks and (row == "state" or len(lacks) == 1):
+            for name in sorted(lacks, reverse=True):
+                of = f"{row}s" if name == symbol else f"{side}s of the {row}s"
+                problems.add(f"{what} lacks '{name}', the column of the {of}; give it.")
     problems.raise_if_any()
 
 
@@ -200,11 +215,13 @@ def _check_symbols(columns: Mapping[str, Expression]) -> None:
                 f"'{name}' uses the symbol '{symbol.name()}', which is in none of 'x', 'u', 'p' and"
                 " 't'; add it to one of them, or put in its number."
             )
-    if columns["ode"].numel() != columns["x"].numel():
-        problems.add(
-            f"'x' has {_rows(columns['x'].numel())} and 'ode' {_rows(columns['ode'].numel())};"
-            " give one derivative for every state."
-        )
+    for one, other, row, side in _PAIRS:
+        rows = [columns[n].numel() for n in (one, other) if n in columns]
+        if len({*rows}) > 1:
+            problems.add(
+                f"'{one}' has {_rows(rows[0])} and '{other}' {_rows(rows[1])};"
+                f" give one {side} for every {row}."
+            )
     problems.raise_if_any()
 
 
@@ -225,9 +242,39 @@ def _scalar(function: ca.Function) -> ca.Function:
         raise InputError(
             "The ODE has an operation that is no elementary function of scalars (a table, a"
             f" solver, an external function): {why} Write it with elementary functions, so that it"
-            " can be printed as C and as Modelica."
+            " can be printed as C and as Modelica; psa.table looks up with these."
         )
     return expanded
+
+
+def _without_algebra(f: ca.Function) -> ca.Function:
+    """Return f(t, x, u, p, w) with algebraic variables replaced by what their equations make them.
+
+    An intermediate that depends on them stands in these equations as what it is defined as.
+    """
+    *known, w, z = f.sx_in()
+    *found, wdef, alg = f(*known, w, z)
+    if z.numel():
+        follows, of = ca.SX(z), [ca.SX(0, 1)] * 2
+        for _ in range(w.numel()):
+            rows = [k for k in range(w.numel()) if ca.depends_on(wdef[k], follows)]
+            of = [ca.vertcat(*(column[k] for k in rows)) for column in (w, wdef)]
+            follows = ca.vertcat(z, of[0])
+        for _ in range(w.numel()):
+            alg = ca.substitute(alg, *of)
+        slopes = ca.jacobian(alg, z)
+        open_rows = z.numel() - ca.sprank(slopes)
+        if ca.depends_on(slopes, z) or open_rows:
+            why = (
+                f"leave {open_rows} of 'z' open; differentiate those that hold between states alone"
+                if open_rows
+                else "are not linear in 'z'; make the rest of each the rate of a fast state"
+            )
+            raise InputError(f"The algebraic equations 'alg' {why}.")
+        solved = -ca.solve(slopes, ca.substitute(alg, z, ca.DM.zeros(z.shape)))
+        found, wdef = ca.substitute(found, [z], [solved]), ca.substitute(wdef, z, solved)
+    columns = [*SYMBOLS[:-1]], [*EXPRESSIONS[:-1]]
+    return ca.Function("ode", [*known, w], [*found, wdef], *columns)
 
 
 def _declared(
@@ -337,15 +384,13 @@ def _equations(
     """Return what a component wants: its equations as a function of a model's symbols."""
 
     def equations(s: Symbols) -> Equations:
-        x, u, p = (
-            ca.vertcat(ca.SX(0, 1), *[getattr(s, v.name) for v in table[k]])
-            for k in ("x", "u", "p")
-        )
-        xdot, y, zero = (ca.SX(e) for e in f(s.time, x, u, p))
-        y = y if y.numel() else x
+        columns = [ca.vertcat(ca.SX(0, 1), *[getattr(s, v.name) for v in table[k]]) for k in "xupw"]
+        xdot, y, zero, wdef = (ca.SX(e) for e in f(s.time, *columns))
+        y = y if y.numel() else columns[0]
         kinks = {f"kink_{i}": zero[i] for i in range(zero.numel())}
         return Equations(
             der={state.name: xdot[i] for i, state in enumerate(table["x"])},
+            add={w.name: wdef[i] for i, w in enumerate(table["w"])},
             out={output.name: y[i] for i, output in enumerate(table["y"])},
             switches={"kink": zero[0]} if len(kinks) == 1 else kinks,
         )

@@ -1,4 +1,4 @@
-"""The places of a model where something may be missing: inputs, outputs, rates, parameters.
+"""The places of a model where something may be missing: signals, rates, parameters.
 
 A model with ports is the same model, written so that others may add to it:
 
@@ -7,24 +7,33 @@ A model with ports is the same model, written so that others may add to it:
     true_y    = h_y(...)         an output as the equations have it
     shown_y   = true_y + ...     what the sensor shows of it
     varied_p  = p + ...          what acts in the place of the parameter p
+    true_w    = h_w(...)         an intermediate (a force, a flow) as the equations have it
+    w         = true_w + ...     what acts of it, wherever it acts
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
+import numpy as np
 
-from psa_casadi.component import Balance, Component, Equations, Expression, Symbols
+from psa_casadi.component import Balance, Component, Equations, Expression, OnDemand, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.symbolic import in_turn
 from psa_casadi.units import rate_unit, si_unit
+from psa_casadi.variables import Parameter
 
-Kind = Literal["input", "rate", "output", "parameter"]
+Kind = Literal["input", "rate", "output", "parameter", "intermediate"]
 _PREFIX: dict[Kind, str] = {
     "input": "applied_", "rate": "rate_", "output": "shown_", "parameter": "varied_",
+    "intermediate": "",
 }  # fmt: skip
+#: Name of the term by which `is_place` asks where an intermediate acts.
+_PROBE = "term_of_a_probe"
+#: What these are before an effect adds to them.
+_BEFORE: dict[Kind, str] = {"output": "before its sensor", "intermediate": "by its equation"}
 
 
 @dataclass(frozen=True)
@@ -48,8 +57,8 @@ class Port:
         return f"the {self.kind} {self.variable}"
 
 
-def true_output(name: str) -> str:
-    """Return the name of the sum that holds an output before its sensor."""
+def true_sum(name: str) -> str:
+    """Return the name of the sum that holds an output or an intermediate before its port's."""
     return f"true_{name}"
 
 
@@ -57,10 +66,10 @@ def true_output(name: str) -> str:
 def ports_of(model: Model) -> tuple[Port, ...]:
     """Return the ports of a model: its inputs, the rates of its own physics' states, its outputs.
 
-    A rate that is nothing but another state (the position's is the velocity) is a definition and no
-    physics: it has no port. States of effects have none either.
+    And its intermediates. A rate that is nothing but another state (the position's is the
+    velocity) is a definition and no physics: it has no port, nor has an intermediate that is
+    `kinematic`. States of effects have none either.
     """
-    s = model.structure
     base = [c for c in model.components if c.gain is None]
     states = [q for c in base for q in c.states]
     return (
@@ -68,9 +77,15 @@ def ports_of(model: Model) -> tuple[Port, ...]:
         *(
             Port("rate", q.name, rate_unit(_si(q.unit)))
             for q in states
-            if _is_physics(ca.SX(s.der[q.name]), q.name)
+            if definition_of(model, q.name) is None
         ),
         *(Port("output", o.name, _si(o.unit)) for c in base for o in c.outputs),
+        *(
+            Port("intermediate", w.name, _si(w.unit))
+            for c in base
+            for w in plain(c).balances
+            if w.name not in kinematic(c)
+        ),
     )
 
 
@@ -86,9 +101,121 @@ def parameter_ports(model: Model) -> tuple[Port, ...]:
     return tuple(Port("parameter", p.name, _si(p.unit)) for p in own)
 
 
-def _is_physics(rate: Expression, state: str) -> bool:
-    """Whether a rate is more than a symbol, but for the sum at its port."""
-    return not rate.is_symbolic() or rate.name() == _PREFIX["rate"] + state
+def plain(component: Component) -> Component:
+    """Return a component without the sums that effects add to."""
+    opened = component.equations
+    return opened.component if isinstance(opened, Opened) else component
+
+
+@cache
+@in_turn
+def written(component: Component) -> Equations:
+    """Return a component's equations without ports, in symbols of the names that they have."""
+    return plain(component).equations(OnDemand())
+
+
+@cache
+@in_turn
+def kinematic(component: Component) -> Mapping[str, Mapping[str, float]]:
+    """Return the intermediates that are sums of states times numbers, the largest +-1, by state.
+
+    The stretch of a spring between two bodies, say: a definition. A larger number is a stiffness.
+    """
+    states, found = {q.name for q in component.states}, dict[str, Mapping[str, float]]()
+    for name in [w.name for w in plain(component).balances]:
+        definition = ca.SX(written(component).add[name])
+        symbols = ca.vertcat(ca.SX(0, 1), *ca.symvar(definition))
+        slopes = ca.jacobian(definition, symbols)
+        names = [q.name() for q in ca.symvar(definition)]
+        if names and states.issuperset(names) and slopes.is_constant():
+            numbers = np.array(ca.evalf(ca.densify(slopes))).ravel()
+            if np.max(np.abs(numbers)) == 1.0:
+                found[name] = dict(zip(names, numbers.tolist(), strict=True))
+    return found
+
+
+def definition_of(model: Model, state: str) -> str | None:
+    """Return the state, input or kinematic intermediate that a state's rate is, None of physics."""
+    rate = ca.SX(model.structure.der[state])
+    kept = [n for c in model.components if c.gain is None for n in kinematic(c)]
+    known = (*model.state_names, *model.input_names, *kept)
+    return str(rate.name()) if rate.is_symbolic() and rate.name() in known else None
+
+
+@in_turn
+def is_place(model: Model, port: Port) -> bool:
+    """Whether what may be missing in an intermediate is not the same as in one rate.
+
+    It is where the intermediate only adds to that rate, times a function of parameters.
+    """
+    if port.kind != "intermediate":
+        return False
+    probe = Component(
+        _PROBE, "one more term", "", lambda s: Equations(add={port.balance: getattr(s, _PROBE)}),
+        parameters=(Parameter(_PROBE, 0.0, port.unit, (0.0, 0.0), "the term"),),
+    )  # fmt: skip
+    s = model.with_components((*model.components, probe)).structure
+    by = [ca.jacobian(of, s.symbols[_PROBE]) for of in (s.xdot, s.y)]
+    names = {q.name() for q in ca.symvar(by[0])}
+    once = by[0].nnz() == 1 and not by[1].nnz()
+    return not (once and names <= {q.name for q in s.parameters})
+
+
+@in_turn
+def seen_by(model: Model, port: Port) -> tuple[str, ...]:
+    """Return the states, inputs and kinematic intermediates in what a rate or intermediate is.
+
+    A rate sees its own state, too.
+    """
+    base = [c for c in model.components if c.gain is None]
+    kept = [n for c in base for n in kinematic(c)]
+    terms: dict[str, list[Expression]] = {}
+    for c in base:
+        for group in (written(c).add, written(c).der):
+            for name, term in group.items():
+                terms.setdefault(name, []).append(term)
+    found, waiting = set[str](), [*terms[port.variable]]
+    while waiting:
+        names = {q.name() for q in ca.symvar(ca.SX(waiting.pop()))} - found
+        found |= names
+        stop = {*kept, *model.state_names}
+        waiting += [e for n in names - stop for e in terms.get(n, ())]
+    found |= {port.variable} if port.kind == "rate" else set()
+    order = (*model.state_names, *model.input_names, *kept)
+    return tuple(n for n in order if n in found)
+
+
+@in_turn
+def variables_at(model: Model, port: Port) -> tuple[str, ...]:
+    """Return what a free function at a port is of: no variable is a sum of others times numbers.
+
+    At a rate or an intermediate, what it sees, kinematic intermediates first, and what these are
+    of; at a signal, itself.
+    """
+    if port.kind not in ("rate", "intermediate"):
+        return (port.variable,)
+    kept = {n: of for c in model.components if c.gain is None for n, of in kinematic(c).items()}
+    seen = seen_by(model, port)
+    of = [q for n in seen for q in kept.get(n, ())]
+    found: list[str] = []
+    rows = np.zeros((0, len(model.state_names)))
+    for n in dict.fromkeys((*(n for n in seen if n in kept), *seen, *of)):
+        parts = kept.get(n, {n: 1.0})
+        row = [parts.get(q, 0.0) for q in model.state_names]
+        more = np.vstack([rows, row])
+        if not any(row) or np.linalg.matrix_rank(more) > len(rows):
+            found.append(n)
+            rows = more if any(row) else rows
+    return tuple(found)
+
+
+def _names(component: Component, kind: Kind) -> list[str]:
+    """Return the variables of a component that a kind of port may be of."""
+    groups: dict[Kind, Sequence[Any]] = {
+        "input": component.inputs, "rate": component.states, "output": component.outputs,
+        "parameter": component.parameters, "intermediate": plain(component).balances,
+    }  # fmt: skip
+    return [v.name for v in groups[kind]]
 
 
 def with_ports(model: Model, ports: Iterable[Port] | None = None) -> Model:
@@ -108,29 +235,28 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
     """
     if isinstance(component.equations, Opened):
         ports, component = ports | {*component.equations.ports}, component.equations.component
-    names = {
-        "input": [i.name for i in component.inputs],
-        "rate": [q.name for q in component.states],
-        "output": [o.name for o in component.outputs],
-        "parameter": [p.name for p in component.parameters],
-    }
-    own = [p for p in sorted(ports, key=lambda p: p.balance) if p.variable in names[p.kind]]
+    sorted_ports = sorted(ports, key=lambda p: p.balance)
+    own = [p for p in sorted_ports if p.variable in _names(component, p.kind)]
     if component.gain is not None or not own:
         return component
     acts = "what acts in the place of "
     about = {"input": acts, "rate": "", "output": "what is shown of ", "parameter": acts}
-    balances = []
+    balances = [*component.balances]
     for p in own:
-        if p.kind == "output":
-            true = true_output(p.variable)
-            balances.append(Balance(true, p.unit, f"{p.words} before its sensor"))
-        balances.append(Balance(p.balance, p.unit, about[p.kind] + p.words))
+        if p.kind in _BEFORE:
+            before = f"{p.words} {_BEFORE[p.kind]}"
+            balances.append(Balance(true_sum(p.variable), p.unit, before))
+        if p.kind != "intermediate":
+            balances.append(Balance(p.balance, p.unit, about[p.kind] + p.words))
     return replace(component, equations=Opened(component, tuple(own)), balances=tuple(balances))
 
 
-def state_unit(model: Model, name: str) -> str:
-    """Return the SI unit of a state."""
-    return next(_si(q.unit) for q in model.structure.states if q.name == name)
+def unit_of(model: Model, name: str) -> str:
+    """Return the SI unit of a state, an input or an intermediate."""
+    s = model.structure
+    sums = [w for c in model.components for w in plain(c).balances]
+    signals: list[Any] = [*s.states, *s.inputs, *sums]
+    return next(_si(q.unit) for q in signals if q.name == name)
 
 
 def _si(unit: str) -> str:
@@ -157,9 +283,10 @@ class Opened:
             elif p.kind == "rate":
                 add[p.balance], der[p.variable] = der[p.variable], getattr(s, p.balance)
             else:
-                true = true_output(p.variable)
-                add[true], add[p.balance] = out[p.variable], getattr(s, true)
-                out[p.variable] = getattr(s, p.balance)
+                true, of = true_sum(p.variable), out if p.kind == "output" else add
+                add[true], add[p.balance] = of[p.variable], getattr(s, true)
+                if p.kind == "output":
+                    out[p.variable] = getattr(s, p.balance)
         return replace(plain, der=der, add=add, out=out)
 
 

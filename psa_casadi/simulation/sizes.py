@@ -37,12 +37,14 @@ _LOOK_RTOL = 1e-9
 
 @dataclass(frozen=True)
 class Sizes:
-    """The largest magnitudes of inputs, states, rates and outputs by name, and two times [s]."""
+    """The largest magnitudes of signals and of rates by name, and two times [s].
 
-    inputs: Mapping[str, float]
-    states: Mapping[str, float]
+    `signals` are inputs, states, outputs and intermediates; `rates` those of states and, while the
+    inputs rest, of intermediates.
+    """
+
+    signals: Mapping[str, float]
     rates: Mapping[str, float]
-    outputs: Mapping[str, float]
     sample: float
     duration: float
 
@@ -58,22 +60,29 @@ def sizes_of(
     tables = [states_of(model, e, s, _LOOK_RTOL) for e, s in pairs]
     inputs = [record_inputs(model, e.record, e.record.n) for e in experiments]
     f, p = _rates(model.structure), model.parameter_vector()
-    rates, outputs = [], []
+    found = []
     for e, u, x in zip(experiments, inputs, tables, strict=True):
         time = e.record.time - e.record.time[0]
-        found = f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x)))
-        rates.append(np.array(found[0]).T)
-        outputs.append(np.array(found[1]).T)
+        found.append(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x))))
+    rates, outputs, sums, changes = (
+        [np.array(part).T for part in parts] for parts in zip(*found, strict=True)
+    )
 
     def largest(names: Sequence[str], parts: Sequence[FloatArray]) -> dict[str, float]:
         whole = np.max(np.abs(np.vstack(parts)), axis=0, initial=0.0)
         return {n: float(v) if v > 0 else 1.0 for n, v in zip(names, whole, strict=True)}
 
     return Sizes(
-        inputs=largest(model.input_names, inputs),
-        states=largest(model.state_names, tables),
-        rates=largest(model.state_names, rates),
-        outputs=largest(model.output_names, outputs),
+        signals={
+            **largest(model.input_names, inputs),
+            **largest(model.state_names, tables),
+            **largest(model.output_names, outputs),
+            **largest(_sums(model.structure), sums),
+        },
+        rates={
+            **largest(model.state_names, rates),
+            **largest(_sums(model.structure), changes),
+        },
         sample=float(np.median(np.concatenate([np.diff(e.record.time) for e in experiments]))),
         duration=max(e.record.duration for e in experiments),
     )
@@ -91,7 +100,7 @@ def sized(model: Model, experiments: Sequence[Experiment]) -> Model:
     except PsaError:
         return model
     return model.with_components(
-        resized(c, tuple(found.states[s.name] for s in c.states)) for c in model.components
+        resized(c, tuple(found.signals[s.name] for s in c.states)) for c in model.components
     )
 
 
@@ -109,4 +118,10 @@ def resized(component: Component, sizes: tuple[float, ...]) -> Component:
 @in_turn
 def _rates(structure: Structure) -> ca.Function:
     arguments = [structure.time, structure.x, structure.u, structure.p]
-    return ca.Function("rates", arguments, [structure.xdot, structure.y])
+    sums = ca.vertcat(ca.SX(0, 1), *(structure.sums[n] for n in _sums(structure)))
+    changes = ca.jtimes(sums, structure.x, structure.xdot)
+    return ca.Function("rates", arguments, [structure.xdot, structure.y, sums, changes])
+
+
+def _sums(structure: Structure) -> list[str]:
+    return [b.name for c in structure.components for b in c.balances]

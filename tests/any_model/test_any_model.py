@@ -362,7 +362,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
     ones = dict.fromkeys(("x", "v", "u", "y"), 1.0)
     text = (ROOT / "docs/howto/own_model.md").read_text("utf-8")
     shown = []
-    for effect in effects_of(model, Sizes(ones, ones, ones, ones, sample=1.0, duration=1.0)):
+    for effect in effects_of(model, Sizes(ones, ones, sample=1.0, duration=1.0)):
         kind, c = re.split("_of_|_in_", effect.name)[0], effect.component
         if kind not in shown:
             shown.append(kind)

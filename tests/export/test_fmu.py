@@ -83,7 +83,7 @@ def _seen_late() -> psa.Model:
     """A first-order model whose output is seen through a lag."""
     model = _ode("late", u=_U, p=_P, ode=_P * (_U - _X), y=_X)
     ones = dict.fromkeys((*model.state_names, *model.input_names, *model.output_names), 1.0)
-    sizes = Sizes(ones, ones, ones, ones, sample=0.01, duration=1.0)
+    sizes = Sizes(ones, ones, sample=0.01, duration=1.0)
     lag = next(e for e in effects_of(model, sizes) if e.name.startswith("lag_of_y"))
     return extended(model, [lag]).with_values({f"{lag.name}_time": 0.05})
 

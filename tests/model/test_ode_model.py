@@ -5,13 +5,14 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 import pytest
 from fmpy import read_model_description, simulate_fmu
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
 import psa_casadi as psa
 from psa_casadi.examples.van_der_pol import model as van_der_pol
@@ -126,7 +127,76 @@ def test_a_kink_that_is_named_is_met_with_care_and_is_an_event_of_the_fmu() -> N
     assert not [v for v in variable_table(blind) if v.kind == "indicator"]
 
 
-X, K = ca.SX.sym("x"), ca.SX.sym("k")
+X, K, U = (ca.SX.sym(n) for n in "xku")
+
+
+def _bridge(*, whole: bool) -> psa.Model:
+    """A condenser at one corner of a bridge of resistors: two algebraic currents, or one formula.
+
+    With the voltage U at the bridge, 1 kOhm to each middle, 2 kOhm below each, and R across.
+    """
+    v, a, b, r, c = (ca.SX.sym(n) for n in ("v", "a", "b", "R", "across"))
+    known = {"x": v, "u": U, "p": r, "y": v}
+    values = {"R": 3e3}
+    if whole:  # the middle b follows from a = v
+        middle = (U / 1e3 + v / r) / (1 / 1e3 + 1 / 2e3 + 1 / r)
+        rate = ((U - v) / 1e3 - v / 2e3 - (v - middle) / r) / 1e-6
+        return psa.ode_model({**known, "ode": rate}, name="bridge", outputs=["y"], values=values)
+    equations = [a - v, (U - b) / 1e3 - b / 2e3 + c]
+    rate = ((U - a) / 1e3 - a / 2e3 - c) / 1e-6
+    return psa.ode_model(
+        {**known, "z": [a, b], "alg": equations, "w": c, "wdef": (a - b) / r, "ode": rate},
+        name="bridge", outputs=["y"], values=values, intermediates=["across"],
+    )  # fmt: skip
+
+
+def test_algebraic_equations_are_solved_beside_intermediates() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        at = 0.0, rng.normal(), rng.normal(), rng.uniform(1e2, 1e4)
+        found, expected = (_bridge(whole=q).structure.f(*at)[0] for q in (False, True))
+        assert float(found) == pytest.approx(float(expected), rel=1e-12)
+
+
+def test_a_table_is_the_spline_in_a_file_in_c_and_beyond_its_ends(tmp_path: Path) -> None:
+    points, values = [-1.0, 0.0, 0.5, 2.0], [0.3, 1.0, -0.4, 0.6]
+    x, gain = ca.SX.sym("x"), ca.SX.sym("gain")
+    model = psa.ode_model(
+        {"x": x, "p": gain, "ode": 1.0, "y": psa.table(x, points, [gain, *values[1:]])},
+        name="looked_up", states=[psa.State("x", "1", "x", 1.0, -2.0)], values={"gain": 0.3},
+        outputs=["value"],
+    )  # fmt: skip
+    spline = CubicSpline(points, values)
+    t = np.linspace(0.0, 6.0, 61)
+    inside = np.clip(t - 2.0, -1.0, 2.0)
+    expected = spline(inside) + (t - 2.0 - inside) * spline(inside, 1)
+    psa.save_model(model, tmp_path / "m.json")
+    for m in (model, psa.load_model(tmp_path / "m.json")):
+        np.testing.assert_allclose(
+            psa.run(m, t, np.zeros((61, 0)), np.array([-2.0])).y[:, 0], expected, atol=1e-9
+        )
+    psa.export_fmu(model, tmp_path / "m.fmu")
+    shown = simulate_fmu(str(tmp_path / "m.fmu"), stop_time=6.0, output_interval=0.1)
+    np.testing.assert_allclose(shown["value"], expected, atol=1e-6)
+
+
+def test_a_table_of_two_variables_and_straight_lines() -> None:
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    p, q = [0.0, 0.2, 0.7, 1.0, 1.5], [0.0, 1.0, 3.0, 4.0]
+    values = np.random.default_rng(1).normal(size=(5, 4))
+    at = 0.33, 1.7
+    methods: tuple[Literal["linear", "cubic"], ...] = ("linear", "cubic")
+    for kind in methods:
+        f = ca.Function("f", [x, y], [psa.table(x, p, y, q, values, kind=kind)])
+        expected = RegularGridInterpolator((np.array(p), np.array(q)), values, method=kind)(at)
+        assert float(f(*at)) == pytest.approx(float(expected), rel=1e-12)
+    for wrong in (([0, 0], [1, 2]), ([0, 1], [1, 2, 3]), ([0], [1])):
+        with pytest.raises(psa.InputError, match="points that rise, and a value for each"):
+            psa.table(x, *wrong)
+    with pytest.raises(psa.InputError, match="cubic or linear"):
+        psa.table(x, p, p, kind="spline")
+    with pytest.raises(psa.InputError, match="matrix"):
+        psa.table(x, p, y, q, [1.0, 2.0])
 
 
 def _solved() -> dict[str, Any]:
@@ -147,7 +217,13 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
         lambda: {"x": X, "p": ca.SX.sym("x"), "ode": X}, {}, "a name of its own"),
     "expression for a symbol": (lambda: {"x": 2 * X, "ode": X}, {}, "must be symbols"),
     "two times": (lambda: {"x": X, "t": ca.SX.sym("t", 2), "ode": X}, {}, "time is one symbol"),
-    "algebraic": (lambda: {"x": X, "z": K, "alg": K, "ode": X}, {}, "algebraic equations"),
+    "not linear": (
+        lambda: {"x": X, "z": K, "alg": K**3 - X, "ode": K}, {}, "are not linear in 'z'"),
+    "left open": (lambda: {"x": X, "z": K, "alg": X, "ode": K}, {}, "leave 1 of 'z' open"),
+    "no equations": (lambda: {"x": X, "z": K, "ode": K}, {}, "lacks 'alg'"),
+    "no definition": (lambda: {"x": X, "w": K, "ode": K}, {}, "lacks 'wdef'"),
+    "loop": (
+        lambda: {"x": X, "w": [K, U], "wdef": [U, K + X], "ode": K}, {}, "balances form a loop"),
     "unknown word": (lambda: {"x": X, "ode": X, "rhs": X}, {}, "'rhs', which is not known"),
     "no states": (lambda: {"ode": X}, {}, "lacks 'x'"),
     "no mapping": (lambda: [X], {}, "give a mapping"),

@@ -71,12 +71,8 @@ def test_a_model_of_ones_own_comes_back_exactly(name: str, ported: bool) -> None
 @pytest.mark.parametrize("name", OWN)
 def test_every_effect_at_a_port_comes_back_exactly(name: str) -> None:
     model = OWN[name]()
-    ones: dict[str, Any] = {
-        "inputs": model.input_names, "states": model.state_names, "rates": model.state_names,
-        "outputs": model.output_names,
-    }  # fmt: skip
-    sizes = Sizes(**{k: dict.fromkeys(v, 1.0) for k, v in ones.items()}, sample=1e-3, duration=1.0)
-    effects = effects_of(model, sizes)
+    ones = dict.fromkeys((*model.input_names, *model.state_names, *model.output_names), 1.0)
+    effects = effects_of(model, Sizes(ones, ones, sample=1e-3, duration=1.0))
     assert len(effects) > 10
     whole = extended(model, effects)
     draw = np.random.default_rng(5)

@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.diagnosis import result
+from psa_casadi.diagnosis import corrections, result
 from psa_casadi.diagnosis.held_out import Errors, Gain, Share, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
@@ -104,8 +104,8 @@ def diagnosis(
     intervals = {"k_L": Interval(9.9, 10.1), "tau": Interval(1e-7, 1.0)}
     model = replace(model, provenance=Provenance(free=("k_L", "tau"), intervals=intervals))
     cause = result.Cause("slow_creep", "plant", 0.97,
-                  {"creep_gain": result.Estimate(0.04, "1", (0.037, 0.043)),
-                   "creep_time": result.Estimate(0.3, "s", (0.2, 0.45))},
+                  {"creep_gain": corrections.Estimate(0.04, "1", (0.037, 0.043)),
+                   "creep_time": corrections.Estimate(0.3, "s", (0.2, 0.45))},
                   ("offset_drift",) if verdict == "ambiguous" else (), 0.9,
                   "wait_or_feed_forward",
                   (Size("hold", 4e-8, "m", (3.7e-8, 4.3e-8), 10.0, "s", (0.0, 100.0)),

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.diagnosis.corrections import Estimate
 from psa_casadi.diagnosis.held_out import Errors, Share, StackBudget
-from psa_casadi.diagnosis.result import BlindSpot, Cause, Estimate
+from psa_casadi.diagnosis.result import BlindSpot, Cause
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.identification.identify import StackIdentification

@@ -16,6 +16,7 @@ from psa_casadi.component import (
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, parameter_ports, ports_of, with_ports
+from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.variables import Parameter, State
 
 #: An ordinary size of an effect over what it acts on, and the largest that a fit may reach.
@@ -134,6 +135,11 @@ def extended(base: Model, effects: Iterable[Attached]) -> Model:
     ports = frozenset(p for e in chosen for p in e.ports)
     opened = with_ports(base, ports) if ports else base
     return opened.with_components((*opened.components, *(e.component for e in chosen)))
+
+
+def size_at(port: Port, sizes: Sizes) -> float:
+    """Return the largest magnitude of what a port adds to."""
+    return (sizes.rates if port.kind == "rate" else sizes.signals)[port.variable]
 
 
 def scale_of(name: str, value: float, unit: str, what: str) -> Parameter:

@@ -1,4 +1,4 @@
-"""Parameters that are none: they depend on a state, an input or time."""
+"""Parameters that change, and gains of intermediates: with a state, an input or time."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from psa_casadi.component import Expression, Symbols
 from psa_casadi.diagnosis.generic.attached import Attached, Own, at_port, scale_of
 from psa_casadi.diagnosis.generic.of_signals import ANGLE
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import Port, parameter_ports, state_unit
+from psa_casadi.model.ports import Port, parameter_ports, ports_of, true_sum, unit_of
 from psa_casadi.shapes import ANGLES
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.variables import Parameter
@@ -17,20 +17,21 @@ from psa_casadi.variables import Parameter
 _ORDINARY, _MOST = 0.1, 5.0
 
 
-def parameter_effects(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
-    """Return how every parameter of a model may change with its states, its inputs and time."""
+def changing(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
+    """Return how every parameter and intermediate may change with states, inputs and time."""
     states = [q.name for c in model.components if c.gain is None for q in c.states]
     known = {i.name: i.unit for i in model.structure.inputs}
+    marked = [p for p in ports_of(model) if p.kind == "intermediate"]
     found: list[Attached] = []
-    for port in parameter_ports(model):
-        found += [_with(port, x, state_unit(model, x), sizes.states[x]) for x in states]
-        found += [_with(port, u, unit, sizes.inputs[u]) for u, unit in known.items()]
+    for port in (*parameter_ports(model), *marked):
+        found += [_with(port, x, unit_of(model, x), sizes.signals[x]) for x in states]
+        found += [_with(port, u, unit, sizes.signals[u]) for u, unit in known.items()]
         found.append(_with(port, "time", "s", sizes.duration))
     return tuple(found)
 
 
 def _with(port: Port, x: str, unit: str, size: float) -> Attached:
-    p = port.variable
+    p = port.variable if port.kind == "parameter" else true_sum(port.variable)
 
     def law(s: Symbols, own: Own) -> Expression:
         part = getattr(s, x) / own("range")
@@ -38,7 +39,7 @@ def _with(port: Port, x: str, unit: str, size: float) -> Attached:
         return own("size") * getattr(s, p) * curve
 
     return at_port(
-        port, f"change_of_{p}_with_{x}", law,
+        port, f"change_of_{port.variable}_with_{x}", law,
         gain="size",
         words=(
             "it drifts: ageing, heat, wear" if x == "time" else f"it depends on {x}",

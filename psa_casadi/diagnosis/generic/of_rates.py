@@ -1,4 +1,4 @@
-"""Effects in the rate of a state, and the table of all effects of a model."""
+"""Effects in the rate of a state or an intermediate, and the table of all effects of a model."""
 
 import casadi as ca
 
@@ -12,12 +12,21 @@ from psa_casadi.diagnosis.generic.attached import (
     at_port,
     rounded,
     scale_of,
+    size_at,
     size_of,
 )
-from psa_casadi.diagnosis.generic.of_parameters import parameter_effects
+from psa_casadi.diagnosis.generic.of_parameters import changing
 from psa_casadi.diagnosis.generic.of_signals import ANGLE, bent, beyond, level_of, signal_effects
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import Port, ports_of, state_unit
+from psa_casadi.model.ports import (
+    Port,
+    definition_of,
+    is_place,
+    kinematic,
+    ports_of,
+    seen_by,
+    unit_of,
+)
 from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magnitude
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import rate_unit
@@ -32,25 +41,41 @@ _STILL = 1e-3
 _STIFF, _CORNER = 1e4, 0.005
 
 
-def rate_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
-    """Return the effects in the rate of one state of a model."""
-    state = port.variable
-    found = {q.name() for q in ca.symvar(model.structure.xdot[model.state_names.index(state)])}
-    base = [q.name for c in model.components if c.gain is None for q in c.states]
-    seen = [n for n in base if n in found or n == state]  # what the rate depends on, and itself
-    # a hysteresis works along positions, else along all that is seen
-    ways = [n for n in seen if n != state and _speed(model, n) is not None] or seen
+def sum_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
+    """Return what may be missing in the rate of a state, or in an intermediate.
+
+    Of an intermediate, what is no coordinate may be lost by; a rate is lost by its own state.
+    """
+    own = [port.variable] if port.kind == "rate" else []
+    seen = [n for n in seen_by(model, port) if n not in model.input_names]
+    ways = [n for n in seen if n not in own and not _way(model, n)[1]]
+    losing = own or [n for n in seen if n not in ways]
+    # a hysteresis works along coordinates, else along all that is seen
     return (
-        *(make(model, port, sizes) for make in (_constant, _loss, _friction, _drag)),
+        _constant(model, port, sizes),
+        *(make(model, port, sizes, n) for n in losing for make in (_loss, _friction, _drag)),
         *(make(model, port, sizes, n) for n in seen for make in (_curve, _stop)),
-        *(_hysteresis(model, port, sizes, n) for n in ways),
+        *(_hysteresis(model, port, sizes, n) for n in ways or seen),
     )
 
 
-def _speed(model: Model, state: str) -> str | None:
-    """Return the state that is the rate of another one by definition, None if there is none."""
-    rate = ca.SX(model.structure.der[state])
-    return str(rate.name()) if rate.is_symbolic() and rate.name() in model.state_names else None
+def _way(model: Model, name: str) -> tuple[list[tuple[str, float]], tuple[Port, ...]]:
+    """Return how fast a state or a kinematic intermediate changes: a sum of symbols times numbers.
+
+    And the rates among these. A coordinate has none: all are states.
+    """
+    base = [c for c in model.components if c.gain is None]
+    kept = {n: parts for c in base for n, parts in kinematic(c).items()}
+    ports = {p.variable: p for p in ports_of(model) if p.kind == "rate"}
+    parts = kept.get(name, {name: 1.0})
+    speeds = {q: definition_of(model, q) for q in parts}
+    reads = tuple(ports[q] for q, speed in speeds.items() if speed is None)
+    return [(speeds[q] or ports[q].balance, factor) for q, factor in parts.items()], reads
+
+
+def _name(kind: str, port: Port, q: str) -> str:
+    own = port.kind == "rate" and q == port.variable
+    return f"{kind}_in_{q}" if own else f"{kind}_of_{q}_in_{port.variable}"
 
 
 def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
@@ -63,38 +88,36 @@ def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
             "Q gains size",
             "a residual of the form of a step answer in every record",
         ),
-        parameters=(size_of(port.unit, sizes.rates[port.variable], "constant part of the rate"),),
+        parameters=(size_of(port.unit, size_at(port, sizes), "constant part"),),
     )  # fmt: skip
 
 
-def _loss(model: Model, port: Port, sizes: Sizes) -> Attached:
-    v = port.variable
+def _loss(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
     return at_port(
-        port, f"loss_in_{v}", lambda s, own: -own("size") * getattr(s, v) / own("range"),
+        port, _name("loss", port, v), lambda s, own: -own("size") * getattr(s, v) / own("range"),
         gain="size",
         words=(
-            "it loses in proportion to its state",
+            f"it loses in proportion to {v}",
             "viscous damping, leak, cooling",
             f"Q loses size {v}/range",
             "resonances are lower, and decays faster, at every level alike",
         ),
         parameters=(
-            size_of(port.unit, sizes.rates[v], "loss at the largest state"),
+            size_of(port.unit, size_at(port, sizes), f"loss at the largest {v}"),
             _range(model, sizes, v),
         ),
     )  # fmt: skip
 
 
-def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
-    v = port.variable
-    size = rounded(sizes.states[v])
+def _friction(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
+    size = rounded(sizes.signals[v])
 
     def law(s: Symbols, own: Own) -> Expression:
         state = getattr(s, v)
         return -own("size") * state / ca.sqrt(state**2 + own("width") ** 2)
 
     return at_port(
-        port, f"friction_in_{v}", law,
+        port, _name("friction", port, v), law,
         gain="size",
         words=(
             "dry friction holds against the motion",
@@ -103,9 +126,11 @@ def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
             "what stands still needs a push to move; small motions are missed most",
         ),
         parameters=(
-            size_of(port.unit, sizes.rates[v], "friction, as a rate", positive=True),
+            size_of(
+                port.unit, size_at(port, sizes), "friction, as a rate", positive=port.kind == "rate"
+            ),
             Parameter(
-                "width", 0.02 * size, state_unit(model, v), (5e-4 * size, 0.7 * size),
+                "width", 0.02 * size, unit_of(model, v), (5e-4 * size, 0.7 * size),
                 f"{v} below which it fades", log=True, limit=True
             ),
         ),
@@ -113,24 +138,22 @@ def _friction(model: Model, port: Port, sizes: Sizes) -> Attached:
     )  # fmt: skip
 
 
-def _drag(model: Model, port: Port, sizes: Sizes) -> Attached:
-    v = port.variable
-
+def _drag(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
     def law(s: Symbols, own: Own) -> Expression:
         part = getattr(s, v) / own("range")
         return -own("size") * part * smooth_magnitude(part, _STILL)
 
     return at_port(
-        port, f"drag_in_{v}", law,
+        port, _name("drag", port, v), law,
         gain="size",
         words=(
-            "it loses with the square of its state",
+            f"it loses with the square of {v}",
             "drag of a turbulent flow",
             f"Q loses size r |r|,  r = {v}/range",
             "damping that grows with the level",
         ),
         parameters=(
-            size_of(port.unit, sizes.rates[v], "loss at the largest state"),
+            size_of(port.unit, size_at(port, sizes), f"loss at the largest {v}"),
             _range(model, sizes, v),
         ),
     )  # fmt: skip
@@ -148,9 +171,7 @@ def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
             "resonances move with the level; harmonics",
         ),
         parameters=(
-            size_of(
-                port.unit, sizes.rates[port.variable], "deviation from the line at the range's end"
-            ),
+            size_of(port.unit, size_at(port, sizes), "deviation from the line at the range's end"),
             ANGLE,
             _range(model, sizes, x),
         ),
@@ -159,7 +180,7 @@ def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
 
 
 def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
-    force, size = sizes.rates[port.variable], rounded(sizes.states[x])
+    force, size = size_at(port, sizes), rounded(sizes.signals[x])
 
     def law(s: Symbols, own: Own) -> Expression:
         excess = beyond(getattr(s, x), own("level"), _CORNER * own("range"))
@@ -179,7 +200,7 @@ def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
                 "size", 0.0, port.unit, (0.0, _STIFF * force),
                 "force of the stop, as a rate, at one range beyond it", scale=force,
             ),
-            level_of(0.8, (0.02, 2.0), size, state_unit(model, x)),
+            level_of(0.8, (0.02, 2.0), size, unit_of(model, x)),
             _range(model, sizes, x),
         ),
         probe={"level": tuple(share * size for share in (0.5, 0.7, 0.85, 0.95))},
@@ -191,12 +212,10 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
 
     w = x'/range and r = z, so that the loop's own way is one range where loss and bend are 1.
     """
-    speed, force = _speed(model, x), sizes.rates[port.variable]
-    rates = (p for p in ports_of(model) if p.kind == "rate" and p.variable == x)
-    reads = () if speed else tuple(rates)
+    (parts, reads), force = _way(model, x), size_at(port, sizes)
 
     def law(s: Symbols, own: Own) -> Terms:
-        rate = getattr(s, speed) if speed else getattr(s, reads[0].balance)
+        rate = sum(factor * getattr(s, speed) for speed, factor in parts)
         w, z = rate / own("range"), own("state")
         size = smooth_magnitude(w, _STILL * own("rate") / own("range"))
         power, signed = magnitude_power(z, own("n")), signed_power(z, own("n"))
@@ -221,7 +240,7 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
             Parameter("bend", 0.0, "1", (-500.0, 500.0), "how the loop bends", scale=0.3),
             Parameter("n", 1.0, "1", (0.2, 8.0), "sharpness of the loop's turns", log=True),
             _range(model, sizes, x),
-            scale_of("rate", sizes.rates[x], rate_unit(state_unit(model, x)), f"rate of {x}"),
+            scale_of("rate", sizes.rates[x], rate_unit(unit_of(model, x)), f"rate of {x}"),
         ),
         states=(State("state", "1", "memory of the way", 0.5, memory=True, settles=False),),
         probe={"loss": (0.3, 1.0, 4.0, 16.0)},
@@ -231,15 +250,15 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
 
 
 def _range(model: Model, sizes: Sizes, x: str) -> Parameter:
-    return scale_of("range", sizes.states[x], state_unit(model, x), x)
+    return scale_of("range", sizes.signals[x], unit_of(model, x), x)
 
 
 def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     """Return every generic effect at every port of a model that has no effects yet."""
     found: list[Attached] = []
     for port in ports_of(model):
-        if port.kind == "rate":
-            found += rate_effects(model, port, sizes)
-        else:
+        if port.kind != "rate":
             found += signal_effects(port, sizes)
-    return (*found, *parameter_effects(model, sizes))
+        if port.kind == "rate" or is_place(model, port):
+            found += sum_effects(model, port, sizes)
+    return (*found, *changing(model, sizes))

@@ -1,7 +1,8 @@
 """What may be missing between a signal and the model: at an input (drive) or an output (sensor).
 
-Every effect adds to the port's sum what makes the signal q another one; q is the input as given, or
-the output before its sensor.
+Or within it, at an intermediate. Every effect adds to the port's sum what makes the signal q
+another one; q is the input as given, the output before its sensor, the intermediate by its
+equation.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from psa_casadi.diagnosis.generic.attached import (
     scale_of,
     size_of,
 )
-from psa_casadi.model.ports import Port, true_output
+from psa_casadi.model.ports import Port, true_sum
 from psa_casadi.shapes import ANGLES, pade_section, softplus
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.variables import Parameter, State
@@ -38,29 +39,31 @@ ANGLE = Parameter(
     "angle", 0.0, "rad", (-2.0 * ca.pi, 2.0 * ca.pi), "form of the curve: 0 quadratic, pi/2 cubic",
     scale=0.3,
 )  # fmt: skip
+#: What a signal belongs to.
+_PLACE = {"input": "drive", "output": "sensor", "intermediate": "plant"}
 #: As `Law`, with the signal's value: (symbols, signal, its own by short name) -> term, or both.
 _Law = Callable[[Symbols, Expression, Own], Terms | Expression]
 
 
 def signal_effects(port: Port, sizes: Sizes) -> tuple[Attached, ...]:
-    """Return the effects of an input or an output."""
+    """Return the effects of an input, an output or an intermediate."""
     makers = [_lag, _delay, _bend, _saturation]
-    makers += [_dead_zone] if port.kind == "input" else [_zero, _drift]
+    makers += [_zero, _drift] if port.kind == "output" else [_dead_zone]
     return tuple(make(port, sizes) for make in makers)
 
 
 def _size(port: Port, sizes: Sizes) -> float:
-    return rounded((sizes.inputs if port.kind == "input" else sizes.outputs)[port.variable])
+    return rounded(sizes.signals[port.variable])
 
 
 def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
     """Return an effect of a signal, which its `law` has too; see `at_port`."""
-    signal = port.variable if port.kind == "input" else true_output(port.variable)
+    signal = port.variable if port.kind == "input" else true_sum(port.variable)
     return at_port(
         port,
         f"{kind}_of_{port.variable}",
         lambda s, own: law(s, getattr(s, signal), own),
-        belongs_to="drive" if port.kind == "input" else "sensor",
+        belongs_to=_PLACE[port.kind],
         signal=signal,
         **more,
     )

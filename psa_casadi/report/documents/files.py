@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from psa_casadi.diagnosis.corrections import Estimate
 from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.result import (
@@ -259,7 +260,10 @@ class RecordUsed:
 
 @dataclass(frozen=True)
 class FreeCorrection:
-    """A free function of some variables at a port that would remove most of what is left."""
+    """A free function of some variables at a port that would remove most of what is left.
+
+    Its `equation`, with `parameters`, where few terms say it.
+    """
 
     port: str
     of: str
@@ -267,6 +271,8 @@ class FreeCorrection:
     share: float
     unit: str
     variable: str
+    equation: str = ""
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)

@@ -260,7 +260,9 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         f"that is less than {100.0 * least:.0f} %" + " and much remains" * more
     ),
     "correction": correction,
-    "free": "a free function of {of} in {port}",
+    "free": lambda of, port, equation="": (
+        f"a free function of {of} in {port}" + (f", {equation}" if equation else "")
+    ),
     "would_remove": lambda what, share: (
         f"{raised(str(what))} would remove {100 * share:.0f}% of what is left above the noise."
     ),

@@ -246,10 +246,8 @@ def _further(d: Diagnosis) -> str:
     """Return what to do where no effect of any model explains what is missing."""
     if d.correction is None:
         return "record more of what may matter: another input, level or output"
-    return (
-        f"write the law of {d.correction.of} in {d.correction.port} into the equations, with its"
-        " parameter free, and diagnose again"
-    )
+    law = d.correction.equation or f"the law of {d.correction.of} in {d.correction.port}"
+    return f"write {law} into the equations, with its parameters free, and diagnose again"
 
 
 def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
