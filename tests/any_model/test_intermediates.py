@@ -140,8 +140,8 @@ def grazing(seed: int) -> tuple[psa.Model, dict[str, FloatArray]]:
 def test_a_law_that_no_effect_of_the_table_has_is_told_as_a_formula(tmp_path: Path) -> None:
     model, record = grazing(0)
     without = ("hysteresis", "change", "loss", "curve", "stop", "saturation", "bend", "drag")
-    without = (*without, "friction", "delay", "lag", "dead_zone", "drift", "constant")
-    d = psa.diagnose(model, record, hold="linear", leave_out=without, starts=3)
+    more = ("friction", "delay", "lag", "dead_zone", "drift", "constant")
+    d = psa.diagnose(model, record, hold="linear", leave_out=[*without, *more], starts=3)
     law = d.correction
     assert law is not None
     assert not d.causes
