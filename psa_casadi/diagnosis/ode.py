@@ -57,8 +57,9 @@ _OF_STACKS = frozenset(
 )
 #: Verdicts that leave something open.
 _OPEN = ("unexplained", "partly_explained")
-#: An input that is held is late by half a sampling interval, give or take.
-_HALF = (0.3, 0.7)
+#: An input that is held is late by half a sampling interval, give or take; a fit without that delay
+#: explains as much if it leaves no more than this share of the rms.
+_HALF, _AS_MUCH = (0.3, 0.7), 1.2
 
 
 def diagnose_ode(
@@ -217,8 +218,9 @@ def _held_instead(
         found = _once(refitted(base, others), others, task_of)
     except PsaError:
         return None
-    nats = likelier(found.answer.fit, best.fit)
-    if nats < LIKELIER * (1 + len(found.answer.causes) - len(best.causes)) - LIKELIER * late:
+    nats, more = likelier(found.answer.fit, best.fit), len(found.answer.causes) - len(best.causes)
+    as_much = late and more < 0 and found.answer.fit.rms < _AS_MUCH * best.fit.rms
+    if not as_much and nats < LIKELIER * (1 + more):
         return None
     return found, (note("hold_found", hold=hold, nats=max(nats, 0.0)),)
 

@@ -73,10 +73,9 @@ def experiments_of(
     for s, _ in records:
         begins[s.sha256] = min(s.time[0], begins.get(s.sha256, np.inf))
     found = [
-        replace(
-            e, record=s, known_start=known_start and s.time[0] == begins[s.sha256], remarks=said
-        )
+        replace(e, record=s, known_start=known_start and not later, later_part=later, remarks=said)
         for e, (s, said) in zip(split, records, strict=True)
+        for later in [s.time[0] > begins[s.sha256]]
     ]
     channels = []
     for o in model.structure.outputs:

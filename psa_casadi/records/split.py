@@ -203,6 +203,7 @@ class Experiment:
     channels: tuple[Channel, ...] = (DISPLACEMENT,)
     noise: tuple[float, ...] | None = None
     known_start: bool = False
+    later_part: bool = False
     remarks: tuple[Note | str, ...] = ()
 
     @property

@@ -103,11 +103,12 @@ def resting_states(structure: Structure) -> tuple[str, ...]:
 def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float]) -> Start:
     """Return the start at the declared values and deviations, with derivatives by all states.
 
-    x_0 = declared start + deviation; filters of effects start where they would rest:
+    x_0 = declared start + deviation; filters of effects start where they would rest, from there:
     g(x_s, x_0, u_0, p) = 0 with g their rates.
     """
     s = model.structure
-    x = np.array([q.start + deviations.get(q.name, 0.0) for q in s.states])
+    away = np.array([deviations.get(q.name, 0.0) for q in s.states])
+    x = np.array([q.start for q in s.states]) + away
     p, nx = model.parameter_vector(), len(s.states)
     by_p, by_x = np.zeros((nx, len(p))), np.eye(nx)
     names = resting_states(s)
@@ -128,7 +129,8 @@ def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float])
     own = np.linalg.pinv(slopes[:, resting])
     by_p[resting] = -own @ by_parameter
     by_x[np.ix_(resting, others)] = -own @ slopes[:, others]
-    by_x[np.ix_(resting, resting)] = 0.0
+    by_x[np.ix_(resting, resting)] = np.eye(len(resting))
+    x[resting] += away[resting]
     return Start(x, by_p, by_x)
 
 

@@ -19,7 +19,7 @@ from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.identification.experiments import experiments_of
-from psa_casadi.model.ports import with_ports
+from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import record_inputs
@@ -249,7 +249,7 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
 ) -> None:
     """The program of the page, whose plant has its own equations."""
     monkeypatch.chdir(tmp_path)
-    first, effect, posterior = blocks_in_tests("docs/howto/own_model.md")
+    first, intermediates, effect, posterior = blocks_in_tests("docs/howto/own_model.md")
     names: dict[str, Any] = {}
     _run(first, names)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["motor.html", "motor_with_friction.fmu"]
@@ -267,6 +267,8 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     assert d.explained_share == pytest.approx((base - left) / (base - 2.0), rel=1e-9)
     assert share.interval[0] < share.share < share.interval[1] < share.interval[0] + 0.1
     assert f"friction in speed removes {share.text}." in " ".join(repr(d).split())
+    _run(intermediates, names)
+    assert {p.variable for p in ports_of(names["carts"]) if p.kind == "intermediate"} == {"spring"}
     _run(effect, names)
     assert [c.effect for c in names["worn_result"].causes] == ["brush_drop"]
     _run(posterior, names)

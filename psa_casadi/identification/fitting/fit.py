@@ -578,14 +578,16 @@ def unknowns_around(
 
     Of any model but a stack per experiment the initial states as deviations from the declared
     starts (unless these are known) over their usual sizes, with weak priors: `LINEAR_PRIOR` of
-    these sizes, `memory_prior` for memories of effects.
+    these sizes, `memory_prior` for memories of effects. The filters of effects rest at the start of
+    a record, not of a later part.
     """
     if not is_stack(model):
         memories = {q.name for c in model.effects for q in c.states if q.memory}
         resting, s = {*resting_states(model.structure)}, model.structure
 
         def starts(e: Experiment) -> dict[str, tuple[float, float]]:
-            names = memories if e.known_start else {q.name for q in s.states} - resting
+            moving = set() if e.later_part else resting
+            names = memories if e.known_start else {q.name for q in s.states} - moving
             return {
                 q.name: (
                     nominal_value(q.nominal, model.values),
