@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi.units import FloatArray
+from tests.any_model.own_plants import multisine
 
 Table = dict[str, FloatArray]
 #: A model, a record of its plant, and the plant's parameters.
@@ -204,3 +205,87 @@ def levitated() -> Plant:
     )
     record = {"time": t, "i": current, "gap": gap + 5e-6 * rng.standard_normal(n)}
     return model, record, {"c": 0.0025}
+
+
+def two_bodies() -> psa.Model:
+    """Two carts with a spring and a damper between them, the first one also on a spring."""
+    x1, v1, x2, v2, stretch, slip, spring, held, force = (
+        ca.SX.sym(n) for n in ("x1", "v1", "x2", "v2", "stretch", "slip", "spring", "held", "force")
+    )
+    k, c, m1, m2 = (ca.SX.sym(n) for n in ("k", "c", "m1", "m2"))
+    return psa.ode_model(
+        {
+            "x": [x1, v1, x2, v2], "u": force, "p": [k, c, m1, m2], "y": [x1, x2],
+            "w": [stretch, slip, spring, held],
+            "wdef": [x1 - x2, v1 - v2, k * stretch + c * slip, 400.0 * x1 + 2.0 * v1],
+            "ode": [v1, (force - spring - held) / m1, v2, (spring - 0.5 * v2) / m2],
+        },
+        name="two", outputs=["y1", "y2"],
+        intermediates=[
+            psa.Output("stretch", "m", "stretch of the spring"),
+            psa.Output("slip", "m/s", "rate of the stretch"),
+            psa.Output("spring", "N", "force between the carts"),
+            psa.Output("held", "N", "force of the first spring"),
+        ],
+        parameters=[
+            psa.Parameter("k", 700.0, "N/m", (70.0, 7e3), "stiffness", log=True),
+            psa.Parameter("c", 2.0, "N.s/m", (0.2, 20.0), "damping", log=True),
+            psa.Parameter("m1", 1.7, "kg", (0.17, 17.0), "mass of the first", log=True),
+            psa.Parameter("m2", 1.4, "kg", (0.14, 14.0), "mass of the second", log=True),
+        ],
+    )  # fmt: skip
+
+
+def hardening() -> Plant:
+    """A record of the two carts, with 900 N/m, 3 N.s/m and 1.2e6 N/m3 between 2 and 1.2 kg."""
+    rng, t = np.random.default_rng(0), 2e-3 * np.arange(2000, dtype=np.float64)
+    u = 20.0 * multisine(t, np.linspace(0.5, 12.0, 24, dtype=np.float64), rng)
+
+    def rates(s: float, q: FloatArray) -> list[float]:
+        d, w = q[0] - q[2], q[1] - q[3]
+        spring = 900.0 * d + 1.2e6 * d**3 + 3.0 * w
+        first = (np.interp(s, t, u) - spring - 2.0 * q[1] - 400.0 * q[0]) / 2.0
+        return [q[1], first, q[3], (spring - 0.5 * q[3]) / 1.2]
+
+    q = solve_ivp(rates, (0.0, t[-1]), [0.0] * 4, t_eval=t, rtol=1e-9, atol=1e-11, max_step=2e-3).y
+    noise = 2e-5 * rng.standard_normal((2, len(t)))
+    record = {"time": t, "force": u, "y1": q[0] + noise[0], "y2": q[2] + noise[1]}
+    return two_bodies(), record, {"k": 900.0, "c": 3.0, "m1": 2.0, "m2": 1.2}
+
+
+def grazing(seed: int = 0) -> Plant:
+    """Prey that predators eat, fewer per head the more there are: Holling's second type.
+
+    The model lacks h = 0.02: it has a flow eaten = a x y between the two.
+    """
+    rng, t = np.random.default_rng(seed), 0.05 * np.arange(2000, dtype=np.float64)
+    tones = np.linspace(0.02, 0.6, 12, dtype=np.float64)
+    light, harvest = 1.0 + 0.3 * multisine(t, tones, rng), 0.08 + 0.04 * multisine(t, tones, rng)
+
+    def rates(s: float, q: FloatArray) -> list[float]:
+        x, y = q
+        eaten = 0.05 * x * y / (1.0 + 0.02 * x)
+        grown = np.interp(s, t, light) * x * (1.0 - x / 110.0)
+        return [grown - eaten, 0.25 * eaten - (0.15 + np.interp(s, t, harvest)) * y]
+
+    q = solve_ivp(
+        rates, (0.0, t[-1]), [45.0, 15.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.05
+    ).y
+    prey, hunters = q + np.array([[0.5], [0.15]]) * rng.standard_normal(q.shape)
+    x, y, eaten, *u = (ca.SX.sym(n) for n in ("x", "y", "eaten", "light", "harvest"))
+    a, e, d, k = p = [ca.SX.sym(n) for n in ("a", "e", "d", "k")]
+    rate = [u[0] * x * (1 - x / k) - eaten, e * eaten - (d + u[1]) * y]
+    model = psa.ode_model(
+        {"x": [x, y], "u": u, "p": p, "y": [x, y], "w": eaten, "wdef": a * x * y, "ode": rate},
+        name="grazing",
+        outputs=["prey", "hunters"],
+        states=[psa.State("x", "1", "prey", 45.0, 45.0), psa.State("y", "1", "y", 15.0, 15.0)],
+        parameters=[
+            psa.Parameter("a", 0.04, "1", (0.004, 0.4), "eaten per head", log=True),
+            psa.Parameter("e", 0.2, "1", (0.02, 2.0), "what of it is gained", log=True),
+            psa.Parameter("d", 0.2, "1", (0.02, 2.0), "losses", log=True),
+            psa.Parameter("k", 90.0, "1", (20.0, 900.0), "most that live", log=True),
+        ],
+    )
+    record = {"time": t, "light": light, "harvest": harvest, "prey": prey, "hunters": hunters}
+    return model, record, {"a": 0.05, "e": 0.25, "d": 0.15, "k": 110.0}

@@ -33,6 +33,8 @@ def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
         ("slide, dry friction and slope", hard.slide, "friction_in_v, constant_in_v"),
         ("spring that softens", lambda: (hard.spring(), hard.aged(0), {}), "change_of_k_with_time"),
         ("battery, resistance over charge", lambda: (*hard.battery(), {}), "change_of_R0_with_soc"),
+        ("two bodies, a spring that hardens", hard.hardening, "curve_of_stretch_in_spring"),
+        ("grazing, less per head", hard.grazing, "eaten / (1 + 0.02 x)"),
     ]
     rows = [_plant(progress, *plant) for plant in plants[: 2 if quick else None]]
     tables = [
@@ -64,7 +66,8 @@ def _plant(progress: Progress, name: str, made: Callable[[], hard.Plant], hidden
 
 
 def _names(d: psa.Diagnosis) -> str:
-    return ", ".join(f"{c.effect} {c.confidence:.2f}" for c in d.causes) or "-"
+    law = "-" if d.correction is None else d.correction.equation or d.correction.name
+    return ", ".join(f"{c.effect} {c.confidence:.2f}" for c in d.causes) or law
 
 
 def _seconds(begin: float) -> str:
