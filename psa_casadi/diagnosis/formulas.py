@@ -46,6 +46,7 @@ _OF_SIGNAL, _OF_STATES = 5, 3
 _STEEP = (0.3, 1.0, 3.0)
 #: A column of which the fitted parameters leave no more than this share tells nothing of its own.
 _LEFT = 1e-3
+#: Courses along which terms are chosen, evaluations of every fit.
 _ROUNDS, _EVALUATIONS = 3, 25
 
 

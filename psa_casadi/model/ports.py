@@ -136,8 +136,9 @@ def kinematic(component: Component) -> Mapping[str, Mapping[str, float]]:
 
 def definition_of(model: Model, state: str) -> str | None:
     """Return the state, input or kinematic intermediate that a state's rate is, None of physics."""
-    rate = ca.SX(model.structure.der[state])
-    kept = [n for c in model.components if c.gain is None for n in kinematic(c)]
+    base = [c for c in model.components if c.gain is None]
+    rate = next(ca.SX(written(c).der[state]) for c in base if state in written(c).der)
+    kept = [n for c in base for n in kinematic(c)]
     known = (*model.state_names, *model.input_names, *kept)
     return str(rate.name()) if rate.is_symbolic() and rate.name() in known else None
 

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from fmpy import simulate_fmu
@@ -51,6 +52,7 @@ def test_the_places_of_intermediates() -> None:
     assert variables_at(model, ports["y1"]) == ("y1",)
     opened = with_ports(model)
     at = 0.0, [0.1, 0.2, -0.3, 0.4], [1.5], model.parameter_vector()
+    assert ports_of(opened) == ports_of(model)
     for plain, same in zip(model.structure.f(*at), opened.structure.f(*at), strict=True):
         np.testing.assert_allclose(np.array(same), np.array(plain), rtol=1e-15)
 
@@ -85,3 +87,14 @@ def test_a_law_that_no_effect_of_the_table_has_is_told_as_a_formula(tmp_path: Pa
         start_values={"x": 45.0, "y": 15.0},
     )  # fmt: skip
     assert np.std(ran["prey"] - record["prey"]) < 0.03 * np.ptp(record["prey"])
+
+
+def test_a_rate_that_is_an_input_or_a_flow() -> None:
+    """An input is a definition, with ports beside it or not; a flow is physics."""
+    x, y, u, flow = (ca.SX.sym(n) for n in ("x", "y", "u", "flow"))
+    model = psa.ode_model(
+        {"x": [x, y], "u": u, "w": flow, "wdef": u * x - y, "ode": [u, flow]}, name="filled"
+    )
+    found = ports_of(model)
+    assert [p.variable for p in found if p.kind == "rate"] == ["y"]
+    assert ports_of(with_ports(model)) == found
