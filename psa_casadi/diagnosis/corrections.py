@@ -280,7 +280,7 @@ class FreeFunction(Correction):
     Along all records it adds `added` (n,) in the port's `unit`; that follows the `variable`, of
     these the one that tells most of it, with the values `along` (n,). `model` holds it. Where few
     terms of a library predict as well as a polynomial, it is their sum: `equation`, with
-    `parameters` in SI units. `fitted` is the hypothesis that has it.
+    `parameters` in SI units. `fitted` is the `Formula` that it was told of.
     """
 
     of: str

@@ -102,8 +102,7 @@ def formula_of(
     port = next(p for p in ports_of(base) if p.words == told.port)
     place = place_of(base, port, _sizes(base, of, task.experiments))
     task.progress(f"a formula in {port.words}")
-    free = Formula(told.fitted, told.fitted.causes[-1], tuple(place.polynomial()))
-    found = formula(of, free, place, task.experiments, scale, task.limits.price)
+    found = formula(of, told.fitted, place, task.experiments, scale, task.limits.price)
     if found is None:
         return None
     rows = zip(found.hypothesis.errors, told.held, strict=True)
@@ -157,7 +156,7 @@ def _told(
         along=values[name],
         added=added,
         model=model_of(base, h.fit, [*effects, Attached(found.component, port)], experiments),
-        fitted=h,
+        fitted=found,
     )
 
 

@@ -134,12 +134,17 @@ def kinematic(component: Component) -> Mapping[str, Mapping[str, float]]:
     return found
 
 
+def kinematics(model: Model) -> dict[str, Mapping[str, float]]:
+    """Return the `kinematic` intermediates of a model's own physics."""
+    base = [c for c in model.components if c.gain is None]
+    return {n: parts for c in base for n, parts in kinematic(c).items()}
+
+
 def definition_of(model: Model, state: str) -> str | None:
     """Return the state, input or kinematic intermediate that a state's rate is, None of physics."""
     base = [c for c in model.components if c.gain is None]
     rate = next(ca.SX(written(c).der[state]) for c in base if state in written(c).der)
-    kept = [n for c in base for n in kinematic(c)]
-    known = (*model.state_names, *model.input_names, *kept)
+    known = (*model.state_names, *model.input_names, *kinematics(model))
     return str(rate.name()) if rate.is_symbolic() and rate.name() in known else None
 
 
@@ -168,18 +173,17 @@ def seen_by(model: Model, port: Port) -> tuple[str, ...]:
 
     A rate sees its own state, too.
     """
-    base = [c for c in model.components if c.gain is None]
-    kept = [n for c in base for n in kinematic(c)]
+    base, kept = [c for c in model.components if c.gain is None], kinematics(model)
     terms: dict[str, list[Expression]] = {}
     for c in base:
         for group in (written(c).add, written(c).der):
             for name, term in group.items():
                 terms.setdefault(name, []).append(term)
     found, waiting = set[str](), [*terms[port.variable]]
+    stop = {*kept, *model.state_names}
     while waiting:
         names = {q.name() for q in ca.symvar(ca.SX(waiting.pop()))} - found
         found |= names
-        stop = {*kept, *model.state_names}
         waiting += [e for n in names - stop for e in terms.get(n, ())]
     found |= {port.variable} if port.kind == "rate" else set()
     order = (*model.state_names, *model.input_names, *kept)
@@ -195,8 +199,7 @@ def variables_at(model: Model, port: Port) -> tuple[str, ...]:
     """
     if port.kind not in ("rate", "intermediate"):
         return (port.variable,)
-    kept = {n: of for c in model.components if c.gain is None for n, of in kinematic(c).items()}
-    seen = seen_by(model, port)
+    kept, seen = kinematics(model), seen_by(model, port)
     of = [q for n in seen for q in kept.get(n, ())]
     found: list[str] = []
     rows = np.zeros((0, len(model.state_names)))

@@ -22,7 +22,7 @@ from psa_casadi.model.ports import (
     Port,
     definition_of,
     is_place,
-    kinematic,
+    kinematics,
     ports_of,
     seen_by,
     unit_of,
@@ -64,10 +64,8 @@ def _way(model: Model, name: str) -> tuple[list[tuple[str, float]], tuple[Port, 
 
     And the rates among these. A coordinate has none: all are states.
     """
-    base = [c for c in model.components if c.gain is None]
-    kept = {n: parts for c in base for n, parts in kinematic(c).items()}
     ports = {p.variable: p for p in ports_of(model) if p.kind == "rate"}
-    parts = kept.get(name, {name: 1.0})
+    parts = kinematics(model).get(name, {name: 1.0})
     speeds = {q: definition_of(model, q) for q in parts}
     reads = tuple(ports[q] for q, speed in speeds.items() if speed is None)
     return [(speeds[q] or ports[q].balance, factor) for q, factor in parts.items()], reads
