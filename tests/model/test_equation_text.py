@@ -153,10 +153,10 @@ HOSTILE = {
 
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_hostile_text_is_refused_at_once(case: str) -> None:
-    began = time.process_time()
+    began = time.thread_time()
     with pytest.raises(psa.InputError, match=r"'own\.a\.equations\.der\.x' ") as told:
         read(HOSTILE[case])
-    assert time.process_time() - began < 1.0
+    assert time.thread_time() - began < 1.0
     assert all(len(p) < 700 for p in told.value.problems)
 
 
