@@ -108,7 +108,7 @@ def held_out_excess(
         for part, floor, mine in zip(parts, noise, own, strict=True)
         if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
     ]
-    found = _within(colour, len(fit.theta), limits) if all(own) else Excess()
+    found = held_out_within(colour, len(fit.theta), limits) if all(own) else Excess()
     worst = max(beyond, default=0.0)
     if worst > max(limits.unseen_ratio_of_records, found.factor):
         found = Excess(worst, limits.unseen_alarm)
@@ -116,7 +116,8 @@ def held_out_excess(
     return found if size > knowable_of(fit, experiments, limits) else Excess()
 
 
-def _within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:
+def held_out_within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:
+    """Return by which factor innovations exceed those of the fitted samples, k of them spent."""
     squares = np.sort(colour.ahead**2)[:-_STRAY]
     learnt = colour.learnt**2
     n, m, power = len(learnt), len(squares), rms(colour.learnt) ** 2

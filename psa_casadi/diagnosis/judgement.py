@@ -9,7 +9,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
-from psa_casadi.diagnosis.confirmation import too_few_held_out
+from psa_casadi.diagnosis.confirmation import held_out_within, too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, best_of, estimates
 from psa_casadi.diagnosis.families import SUREST, Family, Shown, families, place_and_kind
 from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
@@ -489,8 +489,18 @@ class ModelJudge(Judge):
         return best if law is None else replace(law, open_to=best.open_to)
 
     def unseen(self, step: Step) -> tuple[Note, float] | None:
-        """Return which output's held-out samples are unlike the fitted ones."""
-        for o, noise in zip(step.fit.channels, self._noise(step)[1], strict=True):
+        """Return which output's held-out samples are unlike the fitted ones.
+
+        Without causes these leave noise of any colour, and the innovations are compared.
+        """
+        rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.own, strict=True)
+        for o, noise, own in rows:
+            if not step.view.of.causes and not any(e.held_out_whole for e in self.experiments):
+                found = held_out_within(own, len(step.fit.theta), self.limits)
+                if found:
+                    told = note("held_out_unlike", output=o.column, ratio=found.factor)
+                    return told, found.p_value
+                continue
             held = any(e.at(o.number, e.held_out).any() for e in self.experiments)
             rms = missed_rms(self.experiments, step.view.of.shown, o.number)
             least = self.limits.unseen_ratio_of_records * float(np.hypot(noise, o.straight))

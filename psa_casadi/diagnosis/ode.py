@@ -1,8 +1,8 @@
 """Diagnose any model: fit it, search generic effects at its ports, judge."""
 
-from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from psa_casadi.diagnosis.judgement import ModelJudge
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
-from psa_casadi.diagnosis.search.hypothesis import hypothesis
+from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.rivals import fit_rivals
 from psa_casadi.diagnosis.task import Method, Tried
@@ -29,20 +29,18 @@ from psa_casadi.identification.experiments import (
     undecided,
 )
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
-from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.parts import (
+from psa_casadi.identification.inputs import (
     LIKELIER,
-    begun,
-    cut,
-    follows,
-    from_starts,
     held_as,
     held_otherwise,
     likelier,
     other_hold,
+    read_like,
     refitted,
 )
+from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
+from psa_casadi.identification.noise_found import noise_found
+from psa_casadi.identification.parts import Made, begun, cut, follows, ways
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
@@ -99,53 +97,43 @@ def diagnose_ode(
         parts = cut(given, length), cut(held, length)
         return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
 
-    free_choice = undecided(records, hold)
-    base, runs, _, said = from_starts(
-        model, given, made, free_of(model, free), undecided=free_choice, starts=starts
-    )
-    if base.interrupted:
-        raise KeyboardInterrupt
-    table = _table(base, runs, effects, leave_out, [f"zero_of_{n}" for n in shifted])
-    so_far = [base]
-
-    def task_of(names: Collection[str], experiments: tuple[Experiment, ...]) -> Task:
-        chosen = tuple(table[n].component for n in names)
-        method, pack = Method(without=_OF_STACKS), Pack()
-        return Task(experiments, chosen, pack, method, progress, so_far.append, watch)
-
-    def judged(names: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
-        known, notes = _search(base, runs, partial(task_of, names), told=not free_choice)
-        whole = held_as(made(None), known.task.experiments[0].record.hold)
-        if len(runs) > len(whole):
-            known = _of_whole(known, task_of(names, whole)) or known
-        fit_rivals(known)
-        progress("judging")
-        return ModelJudge(known, base.model, table, whole), notes
-
-    own = {c.name for c in effects}
-    fixed = [n for n, e in table.items() if n in own or e.component.kind != "changing gain"]
-    try:
-        judge, notes = judged(fixed)
-        if judge.verdict in _OPEN and len(fixed) < len(table):
-            progress("searching again, with parameters that change")
-            other, more = judged(table)
-            if _better(other, judge):
-                judge, notes = other, more
-        found = judge.conclude()
-    except KeyboardInterrupt:
-        best = so_far[-1]
-        attached = [table[c.name] for c in best.model.effects]
-        cut_off = model_of(base.model, best, attached, runs, interrupted=True)
-        raise DiagnosisInterrupted(cut_off) from None
-    noise = noise_found(found.extended_fit, found.experiments, (*given, *held))
+    known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]
+    for base, runs, _, told in ways(
+        model, given, made, free_of(model, free), undecided=not known_hold, starts=starts
+    ):
+        if base.interrupted:
+            raise KeyboardInterrupt
+        table = _table(base, runs, effects, leave_out, of_zeros)
+        way = _Way(base, runs, told, table, made, known_hold, progress, watch, [base])
+        with way.kept_at_interrupt():
+            judge, notes = way.searched({c.name for c in effects})
+        if judge.verdict not in _OPEN and follows(judge.final.fit, judge.experiments):
+            break
+    with way.kept_at_interrupt():
+        answer = judge.conclude()
+    noise = noise_found(answer.extended_fit, answer.experiments, (*given, *held))
     codes = {n.code for n in notes}
     remarks = (
-        *(n for n in said if n.code not in codes),
+        *(n for n in way.said if n.code not in codes),
         *notes,
         *judge.known.remarks,
-        *told_of_columns(model, runs),
+        *_entering(judge.final.view.of),
+        *told_of_columns(model, judge.experiments),
     )
-    return found.with_noise(noise, remarks)
+    return answer.with_noise(noise, remarks)
+
+
+def _entering(of: Hypothesis) -> tuple[Note, ...]:
+    """Return where noise enters a model, as far as it does not come from its sensors."""
+    rows = [(f.column, own) for f, own in zip(of.fit.channels, of.own, strict=True)]
+    return tuple(
+        note(
+            "noise_enters", output=column, place=w.place, rate=w.rate, rms=(w.rms, w.unit),
+            time=w.time, nats=own.gained,
+        )
+        for column, own in rows
+        if (w := own.entering) is not None
+    )  # fmt: skip
 
 
 def _given(
@@ -163,13 +151,82 @@ def _given(
     return given, [] if none else given_to(model, holdout, hold, len(given) + 1)
 
 
+@dataclass(frozen=True)
+class _Way:
+    """A search from one fit, of whole records or of their parts (`runs`), and what was `said`.
+
+    `made` gives the whole records; somebody has `told` what inputs do between samples, or not.
+    `so_far` gets every fit that is better than those before it.
+    """
+
+    base: Fit
+    runs: tuple[Experiment, ...]
+    said: tuple[Note, ...]
+    table: Mapping[str, Attached]
+    made: Made
+    told: bool
+    progress: Callable[[str], None]
+    watch: Callable[[Tried], None]
+    so_far: list[Fit]
+
+    def searched(self, own: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
+        """Return the judge of what is found; parameters may change where the rest leaves much."""
+        fixed = [
+            n for n, e in self.table.items() if n in own or e.component.kind != "changing gain"
+        ]
+        judge, notes = self._judged(fixed)
+        if len(fixed) < len(self.table) and (judge.verdict in _OPEN or _coloured(judge)):
+            self.progress("searching again, with parameters that change")
+            other, more = self._judged(self.table)
+            if _better(other, judge):
+                return other, more
+        return judge, notes
+
+    @contextmanager
+    def kept_at_interrupt(self) -> Iterator[None]:
+        """Raise DiagnosisInterrupted with the best model so far at a keyboard interrupt."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            best = self.so_far[-1]
+            attached = [self.table[c.name] for c in best.model.effects]
+            model = model_of(self.base.model, best, attached, self.runs, interrupted=True)
+            raise DiagnosisInterrupted(model) from None
+
+    def _judged(self, names: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
+        task_of = partial(self._task, names)
+        known, notes = _search(self.base, self.runs, task_of, told=self.told)
+        hold = known.task.experiments[0].record.hold
+        whole = read_like(self.made(None), hold, self.said)
+        if len(self.runs) > len(whole):
+            known = _of_whole(known, task_of(whole)) or known
+        fit_rivals(known)
+        self.progress("judging")
+        return ModelJudge(known, self.base.model, self.table, whole), notes
+
+    def _task(self, names: Collection[str], experiments: tuple[Experiment, ...]) -> Task:
+        chosen = tuple(self.table[n].component for n in names)
+        method = Method(without=_OF_STACKS)
+        return Task(
+            experiments, chosen, Pack(), method, self.progress, self.so_far.append, self.watch
+        )
+
+
 def _better(new: ModelJudge, old: ModelJudge) -> bool:
     """Whether parameters that change explain more, and with no more causes."""
+    if old.verdict == "adequate":
+        return new.verdict != "adequate"
     if "unexplained" in (new.verdict, old.verdict):
         return new.verdict != "unexplained"
     now, before = new.last.view.of, old.last.view.of
     fewer = len(now.causes) <= len(before.causes)
     return fewer and new.known.scale.evidence(now) > old.known.scale.evidence(before)
+
+
+def _coloured(judge: ModelJudge) -> bool:
+    """Whether a base that lacks nothing leaves noise that is not white."""
+    own = judge.first.view.of.own
+    return judge.verdict == "adequate" and any(c.autoregression.size for c in own)
 
 
 _Tasks = Callable[[tuple[Experiment, ...]], Task]

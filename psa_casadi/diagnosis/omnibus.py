@@ -11,8 +11,9 @@ from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.notes import Note, note
 from psa_casadi.units import FloatArray
 
-#: Neighbours correlate, the spectrum has a line, the residual or its size follows the drive.
-Seen = Literal["correlation", "line", "drive", "size"]
+#: Neighbours correlate, the spectrum has a line, the residual or its size follows the drive, or
+#: the residual what some effect would add.
+Seen = Literal["correlation", "line", "drive", "size", "effect"]
 
 _LAGS = 25
 #: So many times more rarely a correlation counts beside a residual's own colour.

@@ -19,6 +19,21 @@ _SHARP, _DAMPED = 0.95, 0.1
 _UNEVEN = 8.0
 
 
+@dataclass(frozen=True)
+class Entering:
+    """Where noise enters a model: at an input, or in the `rate` of a state, with its rms [unit].
+
+    `time` is that of its correlation [s], 0 where it is white; infinite for a walk, whose rms is
+    that of what it moves by from the beginning to the end of a record.
+    """
+
+    place: str
+    rate: bool
+    unit: str
+    rms: float
+    time: float
+
+
 @dataclass(frozen=True, eq=False)
 class OwnColour:
     """The noise that a residual would be if it were nothing else: an autoregression of order p.
@@ -29,7 +44,9 @@ class OwnColour:
     likelihood `lost` nats. `residuals` are those of all fitted samples, where the parameters have
     followed the colour; `runs` are the numbers of these between gaps. Where the parameters stay as
     they were fitted, `learnt` (n,) and `ahead` (m,) are the innovations in fitted and in held-out
-    samples.
+    samples. Where noise that is `entering` the model is likelier, by what is `gained` [nats], they
+    are those of that noise; `entered` is the residual, which the parameters have followed, and the
+    colour of it.
     """
 
     autoregression: FloatArray
@@ -41,6 +58,9 @@ class OwnColour:
     ahead: FloatArray
     spread: FloatArray | None
     lost: float
+    entering: Entering | None = None
+    gained: float = 0.0
+    entered: tuple[FloatArray, Colour] | None = None
 
     def nats(self, straight: float = 0.0) -> float:
         """Ln of the likelihood, up to a constant, less p/2 ln n for p coefficients.
@@ -48,7 +68,7 @@ class OwnColour:
         What is `straight` is not told of an output and adds to the level.
         """
         level = float(np.hypot(self.level, straight))
-        return _nats(self.samples, level, self.autoregression.size) - self.lost
+        return _nats(self.samples, level, self.autoregression.size) - self.lost + self.gained
 
     @property
     def colour(self) -> Colour:
@@ -56,6 +76,11 @@ class OwnColour:
         each = (self.autoregression,) * len(self.runs)
         level = max(self.level, 1e-15)
         return Colour(each, level, self.runs, begins=False, spread=self.spread)
+
+    @property
+    def tested(self) -> tuple[FloatArray, Colour]:
+        """What is tested for what is not noise, and the colour that it has."""
+        return self.entered or (self.residuals, self.colour)
 
 
 def own_colour(
@@ -77,12 +102,8 @@ def own_colour(
     """
     error = np.concatenate(errors)
     used, held = (np.concatenate(rows).astype(np.bool_) for rows in (fitted, judged))
-    begins = np.cumsum([0, *(len(e) for e in errors[:-1])])
     runs = tuple(stop - start for rows in fitted for start, stop in runs_of(rows))
-    for most in _ORDERS[::-1]:
-        at = _ends(used, begins, most)
-        if len(at) >= _EACH * most:
-            break
+    at, begins, most = windows(fitted)
     columns = np.zeros((len(error), jacobian.shape[1]))
     columns[used] = jacobian
     rate, first = np.concatenate(rates), used.copy()
@@ -125,6 +146,25 @@ def own_colour(
     return max(even, jittering, key=lambda found: found[0].nats())[0]
 
 
+def windows(fitted: Sequence[BoolArray]) -> tuple[IndexArray, IndexArray, int]:
+    """Return the ends of all windows without gaps in all records that are longer than an order.
+
+    And where the records begin, and that order, the highest one that so many windows can tell.
+    """
+    used = np.concatenate(fitted).astype(np.bool_)
+    begins = np.cumsum([0, *(len(rows) for rows in fitted[:-1])])
+    for most in _ORDERS[::-1]:
+        at = _ends(used, begins, most)
+        if len(at) >= _EACH * most:
+            break
+    return at, begins, most
+
+
+def price_of(order: int, samples: int) -> float:
+    """Return what so many coefficients cost the likelihood of samples [nats] (Schwarz)."""
+    return 0.5 * order * float(np.log(samples + 2.0))
+
+
 def _jitter(new: FloatArray, rates: FloatArray, at: IndexArray) -> tuple[FloatArray, float]:
     """Return the spread sqrt(1 + c r^2) of noise at the rate r (n,), and what it costs [nats].
 
@@ -133,7 +173,7 @@ def _jitter(new: FloatArray, rates: FloatArray, at: IndexArray) -> tuple[FloatAr
     power = float(np.mean(rates[at] ** 2)) if len(at) else 0.0
     squares = rates**2 / max(power, 1e-300)
     ratio, gain = growth(new**2, squares[at]) if power > 0 else (0.0, 0.0)
-    price = 0.5 * float(np.log(len(new) + 2.0))
+    price = price_of(1, len(new))
     if gain < price + _UNEVEN:
         return np.ones_like(rates), 0.0
     spread = np.sqrt(1.0 + ratio * squares)
@@ -141,7 +181,7 @@ def _jitter(new: FloatArray, rates: FloatArray, at: IndexArray) -> tuple[FloatAr
 
 
 def _nats(samples: int, level: float, order: int) -> float:
-    return -samples * float(np.log(max(level, 1e-300))) - 0.5 * order * float(np.log(samples + 2.0))
+    return -samples * float(np.log(max(level, 1e-300))) - price_of(order, samples)
 
 
 def _autoregression(left: FloatArray, at: IndexArray, most: int) -> FloatArray:

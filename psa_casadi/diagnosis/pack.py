@@ -9,6 +9,8 @@ from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.colour import Colour, noise_rms
 from psa_casadi.diagnosis.noise import knowable_of, known_colour
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
+from psa_casadi.diagnosis.own_colour import OwnColour
+from psa_casadi.diagnosis.process_noise import entering
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
 from psa_casadi.errors import PsaError
@@ -29,7 +31,13 @@ _SHARP, _WIDTHS = 0.05, 2.0
 
 @dataclass(frozen=True)
 class Pack:
-    """Any model: several inputs and outputs, of which nothing else is known."""
+    """Any model: several inputs and outputs, of which nothing else is known.
+
+    Where noise of some colour tells the residual of its base, it `asks_effects` for what one of
+    them would lower.
+    """
+
+    asks_effects: bool = True
 
     def fast(self, experiments: Sequence[Experiment]) -> bool:
         """Return whether the device may ring within a record's band."""
@@ -94,6 +102,20 @@ class Pack:
         """Return whether what a memory adds (n,) is more than a static curve of an input."""
         return True
 
+    def entering(
+        self, fit: Fit, experiments: Sequence[Experiment], shown: Sequence[FloatArray],
+        own: tuple[OwnColour, ...],
+    ) -> tuple[OwnColour, ...]:  # fmt: skip
+        """Return the noise of every channel, where it enters the model if that is likelier."""
+        return tuple(
+            entering(
+                fit, experiments,
+                [e.errors(f.number, y[:, k]) for e, y in zip(experiments, shown, strict=True)],
+                k, colour,
+            )
+            for k, (f, colour) in enumerate(zip(fit.channels, own, strict=True))
+        )  # fmt: skip
+
     def ended(self, fit: Fit, experiments: Sequence[Experiment]) -> Fit:
         """Return a fit at its end, with the noise that it leaves of every output."""
         return relevelled(fit, experiments, every=True)[0]
@@ -102,6 +124,8 @@ class Pack:
 @dataclass(frozen=True)
 class StackPack(Pack):
     """A stack: one voltage, a displacement and columns beside it."""
+
+    asks_effects: bool = False
 
     def fast(self, experiments: Sequence[Experiment]) -> bool:
         """Return whether a stack may ring within a record's band."""
@@ -199,6 +223,13 @@ class StackPack(Pack):
         curves = np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
         static = independent(without(curves, basis)).T @ target
         return float(static @ static) < limits.static * float(target @ target)
+
+    def entering(
+        self, fit: Fit, experiments: Sequence[Experiment], shown: Sequence[FloatArray],
+        own: tuple[OwnColour, ...],
+    ) -> tuple[OwnColour, ...]:  # fmt: skip
+        """Return the noise as it is: that of any colour is the sensor's."""
+        return own
 
     def ended(self, fit: Fit, experiments: Sequence[Experiment]) -> Fit:
         """Return the fit as it is: levels of columns are those of the base."""

@@ -111,12 +111,9 @@ def screen(
     if colour is None:
         every = independent(np.hstack([basis, without(columns, basis)]))
         colour = colour_of(without(fit.residuals, every), lengths, known, every)
-    beside, further = further_columns(fit, trials), []
-    for f, more in zip(fit.further, beside, strict=True):  # what neither fit nor direction explains
-        fitted = independent(f.jacobian)
-        every = independent(np.hstack([f.basis, fitted, without(more, fitted)]))
-        further.append(colour_of(without(f.residuals, every), f.lengths, None, every))
-    colour = replace(colour, further=tuple(further))
+    beside = further_columns(fit, trials)
+    if not colour.further:
+        colour = replace(colour, further=_further(fit, beside))
     white_basis = independent(whitened_jacobian(fit, colour))
     residual = without(whitened_residuals(fit, colour), white_basis)
     whole = colour.whiten_all(columns, beside)
@@ -149,6 +146,16 @@ def screen(
         )
     scores.sort(key=lambda s: -s.decrease)
     return Screening(tuple(scores), _threshold(gram, seen, limits.false_alarm), colour)
+
+
+def _further(fit: Fit, beside: Sequence[FloatArray]) -> tuple[Colour, ...]:
+    """Return the colours of what neither fit nor directions explain of the further columns."""
+    found = []
+    for f, more in zip(fit.further, beside, strict=True):
+        fitted = independent(f.jacobian)
+        every = independent(np.hstack([f.basis, fitted, without(more, fitted)]))
+        found.append(colour_of(without(f.residuals, every), f.lengths, None, every))
+    return tuple(found)
 
 
 def _of_span(own: Sequence[Direction], span: Span, t: FloatArray) -> Score:

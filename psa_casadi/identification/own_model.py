@@ -15,7 +15,7 @@ from psa_casadi.identification.experiments import (
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, refuse_unfit
 from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.parts import cut, from_starts
+from psa_casadi.identification.parts import cut, ways
 from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
@@ -57,7 +57,7 @@ def identify_ode(
     given = given_to(model, records, hold)
     shifted = known_zeros(model, zeros)
     progress("fitting from several starts")
-    best, runs, outcomes, said = from_starts(
+    *_, (best, runs, outcomes, said) = ways(
         model, given,
         lambda length: experiments_of(
             model, cut(given, length), judged=False, zeros=shifted, known_start=known_start

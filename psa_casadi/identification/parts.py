@@ -9,22 +9,20 @@ them. Where it follows the whole records so, they are whole again, from a better
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.fitting.further import Further
+from psa_casadi.identification.inputs import read_like, read_otherwise
 from psa_casadi.identification.multistart import levelled, search_starts
-from psa_casadi.identification.refitting import POLISH, refit, relevelled, weighted
+from psa_casadi.identification.refitting import POLISH, weighted
 from psa_casadi.identification.result import MISSED, StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise import first_order_noise
-from psa_casadi.records.signals import Hold, Signals
+from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized
 from psa_casadi.simulation.stepper import SimulationError
@@ -42,10 +40,6 @@ _SHORT = (4, 2, 1)
 _FORGOTTEN, _END = 0.1, 0.1
 #: An error at the beginning of a part grows to so many times its size in it, at most.
 _GROWTH = 1000.0
-#: Nats by which held inputs are likelier than lines, or lines than held ones: a cause's price.
-LIKELIER = 8.0
-#: Order of the autoregression of a residual.
-_ORDER = 8
 
 #: The experiments of records in parts of so many samples, or whole.
 Made = Callable[[int | None], tuple[Experiment, ...]]
@@ -53,7 +47,7 @@ Made = Callable[[int | None], tuple[Experiment, ...]]
 Found = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note, ...]]
 
 
-def from_starts(
+def ways(
     model: Model,
     given: Sequence[Signals],
     made: Made,
@@ -62,14 +56,15 @@ def from_starts(
     undecided: bool,
     starts: int,
     progress: Progress = silent,
-) -> Found:
-    """Return the best fit of a search from several starts, of whole records or of their parts.
+) -> Iterator[Found]:
+    """Yield the best fit of whole records, and that of parts where these may be better.
 
     `made` turns the records that were `given` into experiments, `cut` into parts or not. Where it
-    is `undecided` what inputs do between samples, it is what is likelier. Raises SimulationError
-    where neither whole records nor parts can be simulated.
+    is `undecided` what inputs do between samples, it is what is likelier. Whole records are left
+    out where they cannot be simulated or an error grows too much in them, but where parts are no
+    better. Raises SimulationError where neither whole records nor parts can be simulated.
     """
-    runs, lost = made(None), None
+    runs, lost, usable = made(None), None, False
     try:
         best, whole, outcomes = search_starts(
             sized(model, runs), runs, free, starts=starts, progress=progress
@@ -77,88 +72,36 @@ def from_starts(
     except SimulationError as error:
         lost = error
     else:
-        if best.interrupted or (follows(best, whole, _NEAR) and _forgets(best, whole)):
-            return _held_or_not(best, whole, outcomes, undecided and not best.interrupted)
-    if lost is not None or not follows(best, whole):
-        progress("fitting parts of the records")
-        found = _in_parts(model, given, made, free, undecided, starts, progress)
-        if found is not None and (lost or len(found[1]) > len(whole) or _nearer(found[0], best)):
-            return found
-    if lost is not None:
+        done = best.interrupted or follows(best, whole)
+        done = done or (follows(best, whole, _NEAR) and _forgets(best, whole))
+        usable = done or not _grows(best, whole)
+        if usable:
+            yield _as_read(best, whole, outcomes, undecided)
+        if done:
+            return
+    progress("fitting parts of the records")
+    found = _in_parts(model, given, made, free, undecided, starts, progress)
+    if found is not None and (lost or len(found[1]) > len(whole) or _nearer(found[0], best)):
+        yield found
+    elif lost is not None:
         raise lost
-    return _held_or_not(best, whole, outcomes, undecided)
+    elif not usable:
+        yield _as_read(best, whole, outcomes, undecided)
 
 
-def _held_or_not(
+def _as_read(
     best: Fit, whole: tuple[Experiment, ...], outcomes: tuple[StartOutcome, ...], undecided: bool
 ) -> Found:
-    if undecided and (other := held_otherwise(best, whole)):
-        best, whole, said = other
-        return best, whole, outcomes, (said,)
-    return best, whole, outcomes, ()
+    if best.interrupted:
+        return best, whole, outcomes, ()
+    best, whole, said = read_otherwise(best, whole, undecided=undecided)
+    return best, whole, outcomes, said
 
 
 def _nearer(one: Fit, other: Fit) -> bool:
     """Whether a fit leaves less of the outputs than another one, in the geometric mean."""
     pairs = zip(one.channels, other.channels, strict=True)
     return sum(float(np.log(a.rms / max(b.rms, 1e-300))) for a, b in pairs if a.rms > 0) < 0.0
-
-
-def held_otherwise(
-    of: Fit, experiments: Sequence[Experiment]
-) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
-    """Return the fit with inputs the other way between samples, where that is `LIKELIER`.
-
-    All inputs of all records are held, or none is.
-    """
-    hold = other_hold(experiments)
-    others = held_as(experiments, hold)
-    try:
-        found = refitted(of, others)
-    except PsaError:
-        return None
-    nats = likelier(found, of)
-    if nats < LIKELIER:
-        return None
-    best, again = relevelled(found, others, every=True)
-    return best, again, note("hold_found", hold=hold, nats=nats)
-
-
-def likelier(new: Fit, old: Fit) -> float:
-    """Return by how many nats a fit is likelier than another one of the same readings.
-
-    sum_j n_j ln(w_j/w'_j), w the rms of what an autoregression leaves of an output's residual: half
-    a sample shows at jumps, whatever slow structure the model misses.
-    """
-    pairs = zip(old.channels, new.channels, strict=True)
-    return sum(a.residuals.size * float(np.log(_innovation(a) / _innovation(b))) for a, b in pairs)
-
-
-def other_hold(experiments: Sequence[Experiment]) -> Hold:
-    """Return what inputs are not between samples."""
-    return "linear" if any(e.record.hold == "zero" for e in experiments) else "zero"
-
-
-def refitted(of: Fit, others: Sequence[Experiment]) -> Fit:
-    """Fit other experiments of as many records from where a fit stands, or from its values alone.
-
-    Raises SimulationError.
-    """
-    try:
-        return refit(of, weighted(of, others), sigma=of.sigma, tolerance=1e-6)
-    except PsaError:
-        return search_starts(of.model, weighted(of, others), of.unknowns.names, starts=1)[0]
-
-
-def _innovation(o: Further) -> float:
-    """Return the rms of what an autoregression leaves of an output's residual, in its unit."""
-    windows = [sliding_window_view(p, _ORDER + 1) for p in o.parts if p.size > _ORDER]
-    if not windows:
-        return max(o.rms, 1e-300)
-    *past, now = np.vstack(windows).T
-    weights, *_ = np.linalg.lstsq(np.transpose(past), now, rcond=1e-12)
-    left = now - np.transpose(past) @ weights
-    return max(float(np.sqrt(np.mean(left**2))), o.straight, 1e-300)
 
 
 def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED) -> bool:
@@ -187,14 +130,12 @@ def _in_parts(
     if shortest is None:
         return None
     (best, parts, outcomes), length = shortest
-    said: tuple[Note, ...] = ()
-    if undecided and (other := held_otherwise(best, parts)):
-        best, parts, told = other
-        said = (told,)
-        whole = made
-        made = lambda n: held_as(whole(n), told.values["hold"])  # noqa: E731
+    best, parts, said = read_otherwise(best, parts, undecided=undecided)
+    hold = parts[0].record.hold
     progress("fitting longer parts")
-    best, parts, reached = _longest(best, parts, made, length, max(s.n for s in given))
+    best, parts, reached = _longest(
+        best, parts, lambda n: read_like(made(n), hold, said), length, max(s.n for s in given)
+    )
     if reached is not None:
         if _forgets(best, parts):
             return None
@@ -242,11 +183,6 @@ def _longest(
             break
         best, parts, reached = again, longer, double
     return best, parts, reached
-
-
-def held_as(experiments: Sequence[Experiment], hold: Hold) -> tuple[Experiment, ...]:
-    """Return experiments whose inputs are held, or straight lines."""
-    return tuple(replace(e, record=replace(e.record, hold=hold)) for e in experiments)
 
 
 def cut(given: Sequence[Signals], length: int | None) -> list[Signals]:

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, residual_colour, rms
@@ -26,7 +27,15 @@ from psa_casadi.diagnosis.omnibus import Omnibus
 from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
-from psa_casadi.diagnosis.screening import Score, Screening, estimated, evidence, occam, screen
+from psa_casadi.diagnosis.screening import (
+    Score,
+    Screening,
+    estimated,
+    evidence,
+    occam,
+    screen,
+    whitened_residuals,
+)
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -165,14 +174,20 @@ def hypothesis(
     return Hypothesis(tuple(causes), fit, shown, held_rms, train_rms, whole, tuple(colours), final)
 
 
-def root_of(base: Fit, experiments: Sequence[Experiment]) -> Hypothesis:
+def noisy(of: Hypothesis, task: Task) -> Hypothesis:
+    """Return a hypothesis with noise that enters its model, if that is likelier."""
+    own = task.pack.entering(of.fit, task.experiments, of.shown, of.own)
+    return replace(of, own=own)
+
+
+def root_of(base: Fit, task: Task) -> Hypothesis:
     """Return a base fit as the hypothesis without causes. Raises SimulationError."""
-    root = hypothesis((), base, experiments, final=True)
+    root = hypothesis((), base, task.experiments, final=True)
     if root is None:
         raise SimulationError(
             "The fitted base cannot be simulated over the whole records; start from a model."
         )
-    return root
+    return noisy(root, task)
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,9 +346,32 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     screening = _screened(fit, kept, task)
     residuals, colour, own = [f.residuals for f in fit.channels], screening.colour, False
     if not of.causes:  # is there anything but noise of some colour?
-        residuals, colour, own = [c.residuals for c in of.own], of.colour, True
+        own, tested = True, [c.tested for c in of.own]
+        residuals, (colour, *beside) = [r for r, _ in tested], [c for _, c in tested]
+        colour = replace(colour, further=tuple(beside))
     test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=own)
+    coloured = own and any(c.autoregression.size for c in of.own)
+    if coloured and kept and task.pack.asks_effects and not test.alarm:
+        test = _asked(fit, kept, colour, test, task.limits)
     return View(of, tuple(kept), screening, test, task.pack)
+
+
+def _asked(
+    fit: Fit, trials: Sequence[Direction], colour: Colour, test: Omnibus, limits: Thresholds
+) -> Omnibus:
+    """Return the test with what an effect would lower beside noise of that colour, if it alarms.
+
+    The best direction of effects with m weights removes chi^2 of m noise variances, with
+    Bonferroni's correction for the number of directions.
+    """
+    screening = screen(fit, trials, colour.lengths, colour=colour, limits=limits)
+    best, count = screening.scores[0], len(screening.scores)
+    freedom = max(1, len(best.direction.effect.linear))
+    p = min(1.0, count * float(scipy.special.chdtrc(freedom, best.decrease)))
+    share = best.decrease * colour.level**2 / float(np.sum(whitened_residuals(fit, colour) ** 2))
+    size = float(np.sqrt(min(share, 1.0))) * fit.rms
+    asked = replace(test, p_value=p, seen="effect", size=size)
+    return asked if asked.alarm else test
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:

@@ -16,6 +16,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     examine,
     held_out_confirms,
     hypothesis,
+    noisy,
     root_of,
     scale_of,
 )
@@ -52,7 +53,7 @@ class Known:
 
     def __init__(self, base: Fit, task: Task) -> None:
         self.base, self.task = base, task
-        root = root_of(base, task.experiments)
+        root = root_of(base, task)
         first = examine(root, task)
         self.trials = first.trials
         own = scale_of(root, first.screening.colour, task.limits, task.experiments)
@@ -62,6 +63,7 @@ class Known:
         self.fitted: dict[Names, tuple[str, ...]] = {}
         self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.noises: dict[tuple[Hypothesis, Hypothesis], bool] = {}
+        self.entered: dict[Hypothesis, Hypothesis] = {}
         self.tell(root, "finished")
 
     @property
@@ -104,7 +106,8 @@ class Known:
         old = self.found.get(found.names)
         if old is None or self.replaces(found, old):
             causes = found.causes if old is None else old.causes
-            self.found[found.names] = kept = replace(found, causes=causes)
+            kept = replace(found, causes=causes)
+            self.found[found.names] = kept if causes else noisy(kept, self.task)
             self.tell(kept, "finished" if kept.final else "fitted")
 
     def replaces(self, found: Hypothesis, old: Hypothesis) -> bool:
@@ -248,12 +251,20 @@ class Known:
         if (h, before) not in self.noises:
             least = self.task.limits.price
             held = self.scale.held
-            found = h.beyond_noise(before, held, least) > least
+            new = self.noisy(h) if any(c.entering for c in before.own) else h
+            found = new.beyond_noise(before, held, least) > least
             if found and before.own[0].autoregression.size:
                 led = as_led(h, cause, self.task.experiments)
-                found = led is None or h.beyond_noise(led, held, least) > least
+                led = led and (self.noisy(led) if new is not h else led)
+                found = led is None or new.beyond_noise(led, held, least) > least
             self.noises[h, before] = found
         return self.noises[h, before]
+
+    def noisy(self, h: Hypothesis) -> Hypothesis:
+        """Return a hypothesis with noise that enters its model, if that is likelier."""
+        if h not in self.entered:
+            self.entered[h] = noisy(h, self.task)
+        return self.entered[h]
 
     def little(self, h: Hypothesis, before: Hypothesis) -> bool:
         """Whether a further cause removes no more than the form of the others may miss.

@@ -101,7 +101,7 @@ def steps_of(found: Known, task: Task) -> list[Step]:
 
 def unsearched(base: Fit, task: Task) -> list[Step]:
     """Return the one step of a base fit that is not worth a search."""
-    view = examine(root_of(base, task.experiments), task)
+    view = examine(root_of(base, task), task)
     return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
 

@@ -95,4 +95,20 @@ def _noise_kind(
     return _EACH[kind](where=where[0] + others, unit=unit, at=at, **figures)
 
 
-NOISE: Mapping[str, Callable[..., str]] = {"noise_kind": _noise_kind}
+def _noise_enters(
+    output: str, place: str, rate: bool, rms: tuple[float, str], time: float, nats: float
+) -> str:
+    """Return where noise enters a model."""
+    walks = time == float("inf")
+    when = "white" if time == 0.0 else f"correlated over {quantity(time, 's')}"
+    size = f"{quantity(*rms)} {'from the beginning to the end' if walks else f'rms, {when}'}"
+    where = f"a load in the rate of {place}" if rate else f"noise at the input {place}"
+    return (
+        f"What is left of '{output}' is likelier {where} ({size}{'; a walk' if walks else ''}) than"
+        f" noise of its sensor, by {nats:.0f} nats: nothing is missing that the inputs tell."
+    )
+
+
+NOISE: Mapping[str, Callable[..., str]] = {
+    "noise_kind": _noise_kind, "noise_enters": _noise_enters,
+}  # fmt: skip

@@ -48,6 +48,7 @@ _SEEN = {
     "line": "its spectrum has a line",
     "drive": "it depends on voltage, rate or time",
     "size": "the size depends on voltage, rate or time",
+    "effect": "something follows what an effect would add",
 }
 _LACKING = {
     "hold": "a hold of several seconds, which separates creep and drift",
@@ -362,6 +363,11 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         f"The inputs are {'held' if hold == 'zero' else 'straight lines'} between samples, which"
         f" explains the records better (ln of the likelihood higher by {nats:.0f}). Nobody said so;"
         f" if you know better, say --hold {'linear' if hold == 'zero' else 'zero'}."
+    ),
+    "inputs_smoothed": lambda inputs, nats: (
+        f"The readings of {listing(inputs)} are noisy, and the noise is not what drove the device:"
+        " the records are explained better by the readings smoothed (ln of the likelihood higher"
+        f" by {nats:.0f}), which the fit uses. Smooth them in your own simulation as well."
     ),
     # the fit
     "in_parts": lambda parts, lasts: (
