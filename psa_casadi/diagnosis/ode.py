@@ -40,7 +40,7 @@ from psa_casadi.identification.inputs import (
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
 from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.parts import Made, begun, cut, follows, ways
+from psa_casadi.identification.parts import Made, begun, cut, follows, forgets, settled, ways
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
@@ -91,7 +91,6 @@ def diagnose_ode(
     """
     given, held = _given(model, records, holdout, hold)
     shifted = known_zeros(model, zeros)
-    progress("fitting from several starts")
 
     def made(length: int | None) -> tuple[Experiment, ...]:
         parts = cut(given, length), cut(held, length)
@@ -99,7 +98,13 @@ def diagnose_ode(
 
     known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]
     for base, runs, _, told in ways(
-        model, given, made, free_of(model, free), undecided=not known_hold, starts=starts
+        model,
+        given,
+        made,
+        free_of(model, free),
+        undecided=not known_hold,
+        starts=starts,
+        progress=progress,
     ):
         if base.interrupted:
             raise KeyboardInterrupt
@@ -107,7 +112,7 @@ def diagnose_ode(
         way = _Way(base, runs, told, table, made, known_hold, progress, watch, [base])
         with way.kept_at_interrupt():
             judge, notes = way.searched({c.name for c in effects})
-        if judge.verdict not in _OPEN and follows(judge.final.fit, judge.experiments):
+        if _settled(judge):
             break
     with way.kept_at_interrupt():
         answer = judge.conclude()
@@ -174,12 +179,12 @@ class _Way:
         fixed = [
             n for n, e in self.table.items() if n in own or e.component.kind != "changing gain"
         ]
-        judge, notes = self._judged(fixed)
+        judge, notes, first = self._judged(fixed)
         if len(fixed) < len(self.table) and (judge.verdict in _OPEN or _coloured(judge)):
             self.progress("searching again, with parameters that change")
-            other, more = self._judged(self.table)
+            other, more, _ = self._judged(self.table, first)
             if _better(other, judge):
-                return other, more
+                return other, (*notes, *more)
         return judge, notes
 
     @contextmanager
@@ -193,16 +198,23 @@ class _Way:
             model = model_of(self.base.model, best, attached, self.runs, interrupted=True)
             raise DiagnosisInterrupted(model) from None
 
-    def _judged(self, names: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
-        task_of = partial(self._task, names)
-        known, notes = _search(self.base, self.runs, task_of, told=self.told)
+    def _judged(
+        self, names: Collection[str], before: Known | None = None
+    ) -> tuple[ModelJudge, tuple[Note, ...], Known]:
+        task_of, notes = partial(self._task, names), tuple[Note, ...]()
+        if before is None:
+            searched, notes = _search(self.base, self.runs, task_of, told=self.told)
+        else:
+            searched = best_first(before.base, task_of(before.task.experiments), before)
+            searched.task.keep(searched.answer.fit)
+        known = searched
         hold = known.task.experiments[0].record.hold
         whole = read_like(self.made(None), hold, self.said)
         if len(self.runs) > len(whole):
             known = _of_whole(known, task_of(whole)) or known
         fit_rivals(known)
         self.progress("judging")
-        return ModelJudge(known, self.base.model, self.table, whole), notes
+        return ModelJudge(known, self.base.model, self.table, whole), notes, searched
 
     def _task(self, names: Collection[str], experiments: tuple[Experiment, ...]) -> Task:
         chosen = tuple(self.table[n].component for n in names)
@@ -221,6 +233,14 @@ def _better(new: ModelJudge, old: ModelJudge) -> bool:
     now, before = new.last.view.of, old.last.view.of
     fewer = len(now.causes) <= len(before.causes)
     return fewer and new.known.scale.evidence(now) > old.known.scale.evidence(before)
+
+
+def _settled(judge: ModelJudge) -> bool:
+    """Whether parts of records would tell no more than a search in them."""
+    if judge.verdict not in _OPEN:
+        return settled(judge.final.fit, judge.experiments)
+    best = judge.last.fit, judge.experiments
+    return forgets(*best) and (bool(judge.kept) or follows(*best, near=True))
 
 
 def _coloured(judge: ModelJudge) -> bool:

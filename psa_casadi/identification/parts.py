@@ -30,7 +30,7 @@ from psa_casadi.units import FloatArray
 
 #: A model follows an output where it misses less than this share of its standard deviation; one
 #: that forgets its start is not lost where it comes so near.
-_FOLLOWED, _NEAR = 0.05, 0.25
+_FOLLOWED, _NEAR = 0.05, 0.5
 #: Samples of a part at least, and parts at most.
 _FEWEST, _MOST = 16, 128
 #: Lengths of short parts that are tried, over the shortest.
@@ -72,8 +72,7 @@ def ways(
     except SimulationError as error:
         lost = error
     else:
-        done = best.interrupted or follows(best, whole)
-        done = done or (follows(best, whole, _NEAR) and _forgets(best, whole))
+        done = best.interrupted or settled(best, whole)
         usable = done or not _grows(best, whole)
         if usable:
             yield _as_read(best, whole, outcomes, undecided)
@@ -104,8 +103,9 @@ def _nearer(one: Fit, other: Fit) -> bool:
     return sum(float(np.log(a.rms / max(b.rms, 1e-300))) for a, b in pairs if a.rms > 0) < 0.0
 
 
-def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED) -> bool:
+def follows(of: Fit, experiments: Sequence[Experiment], *, near: bool = False) -> bool:
     """Whether a model follows every output of the records, but for a small share or its noise."""
+    share = _NEAR if near else _FOLLOWED
     for o in of.channels:
         shown = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
         noise = np.concatenate(
@@ -137,7 +137,7 @@ def _in_parts(
         best, parts, lambda n: read_like(made(n), hold, said), length, max(s.n for s in given)
     )
     if reached is not None:
-        if _forgets(best, parts):
+        if forgets(best, parts):
             return None
         lasts = reached * float(np.median([s.sample_time for s in given]))
         said = (*said, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
@@ -227,12 +227,19 @@ def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[FloatArray]:
         yield np.maximum([np.max(q, axis=1) for q in spans], 1e-300)
 
 
+def settled(of: Fit, experiments: Sequence[Experiment]) -> bool:
+    """Whether a model follows the records, or comes near and forgets how they began."""
+    if follows(of, experiments):
+        return True
+    return follows(of, experiments, near=True) and forgets(of, experiments)
+
+
 def _grows(of: Fit, parts: Sequence[Experiment]) -> bool:
     """Whether an error at the beginning of a part grows too much in it."""
     return any(np.max(whole / first) > _GROWTH for first, whole, _ in _influences(of, parts))
 
 
-def _forgets(of: Fit, parts: Sequence[Experiment]) -> bool:
+def forgets(of: Fit, parts: Sequence[Experiment]) -> bool:
     """Whether the outputs depend less and less on the states that records began with.
 
     What is left of the influence at the end of a record is the product of what is in its parts.

@@ -58,13 +58,16 @@ _BETTER, _RINGING = 0.95, 0.4
 _PACE = 2
 
 
-def best_first(base: Fit, task: Task) -> Known:
+def best_first(base: Fit, task: Task, before: Known | None = None) -> Known:
     """Return what a search from a base fit finds. Raises SimulationError where that one fails.
 
     Where its work goes beyond the method's budget it begins nothing more, and says what it left.
+    A search `before` of the same base with fewer effects has fitted hypotheses that are used again.
     """
     with counted() as work:
         search = _Search(base, task, work)
+        if before is not None:
+            search.go_on(before)
         try:
             search.run()
         except KeyboardInterrupt:
@@ -83,6 +86,18 @@ class _Search:
         self.done: set[tuple[str, Names]] = set()
         self.sets_of: Hypothesis | None = None
         self.shaken: dict[Names, Fit] = {}
+        self.tried: set[tuple[Fit, str]] = set()
+
+    def go_on(self, before: Known) -> None:
+        """Take over what a search with fewer effects has fitted, and what it has tried."""
+        for h in before.found.values():
+            if h.causes:
+                self.known.note(h)
+        self.tried = {
+            (h.fit, n) for h in before.found.values() for n in before.fitted.get(h.names, ())
+        }
+        ended = [h.names for h in before.found.values() if h.causes and h.final]
+        self.done |= {(what, names) for what in ("base again", "challenged") for names in ended}
 
     def run(self) -> None:
         for _ in range(_VISITS):
@@ -223,7 +238,10 @@ class _Search:
         """Fit with one more cause, from the hypothesis, afresh, and the leading ones to the end."""
         task, experiments = self.task, self.task.experiments
         leading = [s for s in view.leading() if self.known.different(s[0].direction.effect, h)]
+        leading = [s for s in leading if (h.fit, s[0].direction.effect.name) not in self.tried]
         names = [scores[0].direction.effect.name for scores in leading]
+        if not names:
+            return
         self.tell(h, f"fitting {', '.join(names)}")
         for found in side_by_side(lambda s: with_cause(h, experiments, s), leading[:_PACE]):
             self.known.note(found)

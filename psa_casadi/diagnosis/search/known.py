@@ -249,16 +249,23 @@ class Known:
         that back.
         """
         if (h, before) not in self.noises:
-            least = self.task.limits.price
-            held = self.scale.held
-            new = self.noisy(h) if any(c.entering for c in before.own) else h
-            found = new.beyond_noise(before, held, least) > least
+            found = self.exceeds(h, before)
             if found and before.own[0].autoregression.size:
                 led = as_led(h, cause, self.task.experiments)
-                led = led and (self.noisy(led) if new is not h else led)
-                found = led is None or new.beyond_noise(led, held, least) > least
+                found = led is None or self.exceeds(h, led)
             self.noises[h, before] = found
         return self.noises[h, before]
+
+    def exceeds(self, h: Hypothesis, before: Hypothesis) -> bool:
+        """Whether a hypothesis exceeds another one of which what it leaves may be noise.
+
+        Where noise enters that one's model, it may enter this one's.
+        """
+        least, held = self.task.limits.price, self.scale.held
+        if h.beyond_noise(before, held, least) > least:
+            return True
+        entered = any(c.entering for c in before.own)
+        return entered and self.noisy(h).beyond_noise(before, held, least) > least
 
     def noisy(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with noise that enters its model, if that is likelier."""

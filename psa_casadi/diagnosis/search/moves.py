@@ -213,7 +213,7 @@ def _copies(h: Hypothesis, less: Hypothesis, known: Known, task: Task) -> list[C
     below `NEAR` might explain the data as well; a fit much worse than its copy was lost.
     """
     pairs = zip(h.predicted, less.predicted, task.experiments, strict=True)
-    added = np.concatenate([(p - q)[e.used] for p, q, e in pairs])
+    added = np.concatenate([(p - q)[e.at(h.fit.channels[0].number)] for p, q, e in pairs])
     table = [e for e in task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
     power, found = copies(less.fit, added, trials, known.scale.colour, task.limits)

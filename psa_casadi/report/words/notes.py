@@ -384,7 +384,8 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     "own_undetermined": "'{name}' is not determined by these records.",
     "on_bound": "'{name}' sits on a bound of its range; its interval means nothing.",
     "output_missed": (
-        "'{output}' is missed by {ratio:.2g} times its noise: the model lacks something, so that"
+        "'{output}' is missed by {ratio:.2g} times its noise: the model lacks something, or a"
+        " load acts at random, so that"
         " the values bend to it, and their errors are too small; psa diagnose looks for the cause."
     ),
     "output_not_followed": (

@@ -1,7 +1,8 @@
 """Models that are no stacks: plants that are hard, and public nonlinear benchmarks.
 
-The public records are not in the project: `--folder` holds DATA_EMPS.mat and DATA_EMPS_PULSES.mat
-(Janot, Gautier and Brunot 2019), as nonlinearbenchmark.org gives them; what is not there is said.
+The public records are not in the project: `--folder` holds the files of EMPS (Janot, Gautier and
+Brunot 2019), Silverbox (Wigren and Schoukens 2013) and F-16 (Noel and Schoukens 2017), as
+nonlinearbenchmark.org gives them; what is not there is said.
 Each model is the plain one that an engineer begins with.
 """
 
@@ -131,10 +132,81 @@ def emps(*paths: Path) -> tuple[psa.Model, Table, Table]:
     return model, fitted, test
 
 
+def silverbox(path: Path) -> tuple[psa.Model, Table, Table]:
+    """An electronic oscillator with a cubic spring: the line alone [V]; the test is the arrow."""
+    x, v, u, gain, damping, stiffness = (ca.SX.sym(n) for n in ("x", "v", "u", "b", "d", "k"))
+    model = psa.ode_model(
+        {
+            "x": [x, v], "u": u, "p": [gain, damping, stiffness], "y": x,
+            "ode": [v, gain * u - damping * v - stiffness * x],
+        },
+        name="silverbox",
+        states=[psa.State("x", "V", "deflection", 0.1), psa.State("v", "V/s", "speed", 40.0)],
+        inputs=[psa.Input("u", "V", "force")],
+        outputs=[psa.Output("y", "V", "deflection")],
+        parameters=[
+            psa.Parameter("b", 1e5, "1/s^2", (1e4, 1e7), "gain", log=True),
+            psa.Parameter("d", 20.0, "1/s", (1.0, 500.0), "damping", log=True),
+            psa.Parameter("k", 2e5, "1/s^2", (2e4, 2e6), "stiffness", log=True),
+        ],
+    )  # fmt: skip
+    rows, step = np.genfromtxt(path, delimiter=",", skip_header=1), 2**14 / 1e7
+
+    def table(begin: int, count: int) -> Table:
+        u, y = rows[begin : begin + count, :2].T
+        return {"time": step * np.arange(count), "u": u, "y": y}
+
+    return model, table(42_000, 8192), table(0, 40_500)
+
+
+def f16(*paths: Path) -> tuple[psa.Model, Table, Table]:
+    """The wing of an F-16 with its payload: three linear modes, three accelerations [m/s^2]."""
+    q, v, u = ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.sym("force")
+    f, z, shares = ca.SX.sym("f", 3), ca.SX.sym("z", 3), ca.SX.sym("g", 3, 3)
+    rates = u - 2.0 * z * (2.0 * np.pi * f) * v - (2.0 * np.pi * f) ** 2 * q
+    model = psa.ode_model(
+        {
+            "x": ca.vertcat(q, v), "u": u, "p": ca.vertcat(f, z, ca.vec(shares)),
+            "ode": ca.vertcat(v, rates), "y": shares @ rates,
+        },
+        name="f16",
+        states=[
+            *(psa.State(f"q{k}", "N.s^2", "deflection", 0.01) for k in range(3)),
+            *(psa.State(f"v{k}", "N.s", "speed", 0.5) for k in range(3)),
+        ],
+        inputs=[psa.Input("force", "N", "force")],
+        outputs=[psa.Output(f"a{k + 1}", "m/s^2", "acceleration") for k in range(3)],
+        parameters=[
+            *(psa.Parameter(f"f{k}", f, "Hz", (2.0, 15.0), "frequency", log=True)
+              for k, f in enumerate((5.2, 7.3, 9.2))),
+            *(psa.Parameter(f"z{k}", 0.02, "1", (0.001, 0.3), "damping ratio", log=True)
+              for k in range(3)),
+            *(psa.Parameter(f"g{j}{k}", 0.01, "1/kg", (-1.0, 1.0), "share", scale=0.01)
+              for k in range(3) for j in range(3)),
+        ],
+    )  # fmt: skip
+
+    def table(path: Path) -> Table:
+        rows = np.genfromtxt(path, delimiter=",", skip_header=1)[8192 : 8192 + 4096, [0, 2, 3, 4]]
+        time = np.arange(len(rows)) / 400.0
+        return {"time": time, **dict(zip(("force", "a1", "a2", "a3"), rows.T, strict=True))}
+
+    fitted, test = map(table, paths)
+    return model, fitted, test
+
+
 #: Name, files, what makes model and records, and figures of others on the same test.
 PUBLIC = (
     (
         "EMPS, viscous friction alone [m]", ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"), emps,
         "dynoNet 0.00264",
+    ),
+    (
+        "Silverbox, a line, one multisine; arrow [V]", ("SNLS80mV.csv",), silverbox,
+        "dynoNet 0.00122 (multisine)",
+    ),
+    (
+        "F-16, three modes, level 5; level 6 [m/s^2]",
+        ("F16Data_FullMSine_Level5.csv", "F16Data_FullMSine_Level6_Validation.csv"), f16, "",
     ),
 )  # fmt: skip
