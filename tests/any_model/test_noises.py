@@ -14,14 +14,23 @@ TIME = np.linspace(0.0, 60.0, 1500)
 STIFFNESS, DAMPING = 10.0, 0.8
 
 
-def mass() -> psa.Model:
+def mass(*, speed: bool = False) -> psa.Model:
     x, v, u, k, d = (ca.SX.sym(n) for n in ("x", "v", "force", "k", "d"))
     return psa.ode_model(
-        {"x": [x, v], "u": u, "p": [k, d], "y": x, "ode": [v, u - k * x - d * v]},
+        {
+            "x": [x, v],
+            "u": u,
+            "p": [k, d],
+            "y": [x, v] if speed else x,
+            "ode": [v, u - k * x - d * v],
+        },
         name="mass",
         states=[psa.State("x", "m", "position", 0.1), psa.State("v", "m/s", "speed", 0.3)],
         inputs=[psa.Input("force", "N", "force over 1 kg")],
-        outputs=[psa.Output("position", "m", "position")],
+        outputs=[
+            psa.Output("position", "m", "position"),
+            *([psa.Output("speed", "m/s", "speed")] if speed else []),
+        ],
         parameters=[
             psa.Parameter("k", 8.0, "N/m", (1.0, 100.0), "stiffness", log=True),
             psa.Parameter("d", 1.0, "N.s/m", (0.05, 10.0), "damping", log=True),
@@ -92,6 +101,7 @@ def test_a_random_load_is_told_with_its_place_and_size(seed: int) -> None:
     assert "is likelier" in str(told)
 
 
+@pytest.mark.slow
 def test_noise_that_is_read_at_an_input_is_told_there() -> None:
     rng = np.random.default_rng(13)
     u = force(rng)
@@ -102,8 +112,24 @@ def test_noise_that_is_read_at_an_input_is_told_there() -> None:
     assert smoothed or [n.values["place"] for n in entering(d)] == ["force"]
 
 
+@pytest.mark.slow
 def test_friction_is_named_beside_a_random_load() -> None:
     rng = np.random.default_rng(14)
     u = force(rng)
     d = psa.diagnose(mass(), record(u, moved(u + 0.05 * followed(rng, 0.99), 0.3), rng))
     assert [c.effect for c in d.causes] == ["friction_in_v"]
+
+
+@pytest.mark.slow
+def test_friction_is_named_beside_outliers_of_one_output() -> None:
+    """Samples that are masked in one output count in the others."""
+    rng = np.random.default_rng(15)
+    u = force(rng)
+    y = moved(u, 0.3)
+    speed = np.gradient(y, TIME)
+    y = y + np.where(rng.random(y.size) < 0.01, np.std(y) * rng.standard_normal(y.size), 0.0)
+    own = record(u, y, rng)
+    own["speed"] = speed + 0.02 * np.std(speed) * rng.standard_normal(y.size)
+    d = psa.diagnose(mass(speed=True), own)
+    assert "friction_in_v" in [c.effect for c in d.causes]
+    assert any("spikes" in str(n) for n in d.remarks)
