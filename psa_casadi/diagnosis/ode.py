@@ -40,7 +40,7 @@ from psa_casadi.identification.inputs import (
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
 from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.parts import Made, begun, cut, follows, forgets, settled, ways
+from psa_casadi.identification.parts import NEAR, Made, begun, cut, follows, forgets, settled, ways
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
@@ -240,7 +240,7 @@ def _settled(judge: ModelJudge) -> bool:
     if judge.verdict not in _OPEN:
         return settled(judge.final.fit, judge.experiments)
     best = judge.last.fit, judge.experiments
-    return forgets(*best) and (bool(judge.kept) or follows(*best, near=True))
+    return forgets(*best) and (bool(judge.kept) or follows(*best, NEAR))
 
 
 def _coloured(judge: ModelJudge) -> bool:

@@ -29,8 +29,8 @@ from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
 #: A model follows an output where it misses less than this share of its standard deviation; one
-#: that forgets its start is not lost where it comes so near.
-_FOLLOWED, _NEAR = 0.05, 0.5
+#: that forgets its start is not lost where it comes so near; beyond the last it shows nothing.
+_FOLLOWED, NEAR, _LOST = 0.05, 0.5, 0.7
 #: Samples of a part at least, and parts at most.
 _FEWEST, _MOST = 16, 128
 #: Lengths of short parts that are tried, over the shortest.
@@ -61,8 +61,9 @@ def ways(
 
     `made` turns the records that were `given` into experiments, `cut` into parts or not. Where it
     is `undecided` what inputs do between samples, it is what is likelier. Whole records are left
-    out where they cannot be simulated or an error grows too much in them, but where parts are no
-    better. Raises SimulationError where neither whole records nor parts can be simulated.
+    out where they cannot be simulated, an error grows too much in them or the fit shows nothing of
+    an output, but where parts are no better. Raises SimulationError where neither whole records
+    nor parts can be simulated.
     """
     runs, lost, usable = made(None), None, False
     try:
@@ -73,7 +74,7 @@ def ways(
         lost = error
     else:
         done = best.interrupted or settled(best, whole)
-        usable = done or not _grows(best, whole)
+        usable = done or (follows(best, whole, _LOST) and not _grows(best, whole))
         if usable:
             yield _as_read(best, whole, outcomes, undecided)
         if done:
@@ -103,9 +104,8 @@ def _nearer(one: Fit, other: Fit) -> bool:
     return sum(float(np.log(a.rms / max(b.rms, 1e-300))) for a, b in pairs if a.rms > 0) < 0.0
 
 
-def follows(of: Fit, experiments: Sequence[Experiment], *, near: bool = False) -> bool:
+def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED) -> bool:
     """Whether a model follows every output of the records, but for a small share or its noise."""
-    share = _NEAR if near else _FOLLOWED
     for o in of.channels:
         shown = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
         noise = np.concatenate(
@@ -231,7 +231,7 @@ def settled(of: Fit, experiments: Sequence[Experiment]) -> bool:
     """Whether a model follows the records, or comes near and forgets how they began."""
     if follows(of, experiments):
         return True
-    return follows(of, experiments, near=True) and forgets(of, experiments)
+    return follows(of, experiments, NEAR) and forgets(of, experiments)
 
 
 def _grows(of: Fit, parts: Sequence[Experiment]) -> bool:
