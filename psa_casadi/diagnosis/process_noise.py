@@ -102,12 +102,14 @@ def entering(
     states = len(fit.model.state_names) - sum(len(c.states) for c in fit.model.effects)
     tried = _tried(parts[0], used[0], len(fit.model.input_names) + states)
     few, seen = _first(parts, used)
+    if not tried.place.size or not few:
+        return own
     chosen = _found(few, seen, tried, prior).nats(np.flatnonzero(np.concatenate(seen)))
     tried = tried.beside(int(np.argmax(chosen)))
     found = _found(parts, used, tried, prior)
     best = int(np.argmax(found.nats(at)))
     gained = float(found.nats(at)[best]) - price_of(_ORDER, len(at)) - own.nats()
-    if gained < _LIKELIER:
+    if not gained > _LIKELIER:
         return own
     one, level = tried.only(best), rms(found.white[at, best])
     held = [e.at(number, e.held_out) for e in experiments]
@@ -177,6 +179,8 @@ def _linear(
     block = np.zeros((n - 1, nx + 2 * m, nx + 2 * m))
     block[:, :nx, : nx + m] = 0.5 * (moved[1:] + moved[:-1]) * np.diff(t)[:, None, None]
     block[:, nx : nx + m, nx + m :] = np.eye(m)
+    if not np.isfinite(block).all():
+        raise KeyError(e.record.name)
     over = scipy.linalg.expm(block)[:, :nx].transpose(0, 2, 1)
     after = over[:, nx + m :].copy()
     after[:, :held] = 0.0
@@ -202,7 +206,7 @@ class _Found:
         level = np.sqrt(np.mean(self.white[at] ** 2, axis=0))
         lost = np.sum(np.log(self.spread[at]), axis=0)
         nats: FloatArray = -len(at) * np.log(np.maximum(level, 1e-300)) - lost
-        return nats
+        return np.where(np.isfinite(nats), nats, -np.inf)
 
 
 def _found(
@@ -290,7 +294,7 @@ def _tried(of: _Linear, used: BoolArray, count: int) -> _Noises:
         np.repeat(places, len(time)), np.ones(places.size * time.size), np.tile(time, len(places))
     )
     _, size = _filtered(of, used, grid, seen=False)
-    power = np.mean(size**2 - 1.0, axis=0)
+    power = np.nan_to_num(np.mean(size**2 - 1.0, axis=0), posinf=0.0)
     there = power > 1e-12 * np.max(power)
     return _Noises(
         np.repeat(grid.place[there], len(_RATIOS)), (_RATIOS / power[there, None]).ravel(),

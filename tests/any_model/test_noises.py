@@ -80,6 +80,21 @@ def test_coloured_noise_of_a_sensor_is_noise(correlation: float) -> None:
     assert not entering(d)
 
 
+def test_an_output_that_no_state_reaches_may_have_noise_of_a_colour() -> None:
+    x, given, gain = (ca.SX.sym(n) for n in ("x", "u", "gain"))
+    model = psa.ode_model(
+        {"x": x, "u": given, "p": gain, "ode": given - x, "y": gain * given},
+        name="follower", inputs=["u"], outputs=["y"],
+        parameters=[psa.Parameter("gain", 1.0, "1", (0.1, 10.0), "gain", log=True)],
+    )  # fmt: skip
+    rng = np.random.default_rng(9)
+    u = force(rng)
+    y = 2.0 * u + 0.02 * followed(rng, 0.95)
+    d = psa.diagnose(model, {"time": TIME, "u": u, "y": y})
+    assert d.verdict == "adequate"
+    assert not entering(d)
+
+
 def test_outliers_in_held_out_samples_are_noise() -> None:
     rng = np.random.default_rng(8)
     u = force(rng)
