@@ -33,7 +33,7 @@ _RATIOS, _TIMES = 10.0 ** np.arange(-1.0, 6.5), np.array([0.0, 0.003, 0.03, 0.3,
 #: Then factors of both around the best one.
 _FINER = 10.0 ** np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
 #: Samples that choose, at most, and nats by which noise must be likelier than an autoregression.
-_CHOOSING, _LIKELIER = 1000, 8.0
+_CHOOSING, _LIKELIER = 2000, 8.0
 #: Price of a place, a ratio and a time.
 _ORDER = 3
 

@@ -168,7 +168,10 @@ def traced_by_theta(
     start_slopes = unknowns.place_slopes(theta, index)[0]
     by_theta = np.vstack([np.zeros((count, unknowns.size)), start_slopes])
     by_theta[:count, :count] = slopes
-    flat = found.sensitivity.reshape(-1, len(by_theta)) @ by_theta  # one product, not one a sample
+    with np.errstate(all="ignore"):  # what is not finite is seen by the fit
+        flat = (
+            found.sensitivity.reshape(-1, len(by_theta)) @ by_theta
+        )  # one product for all samples
     return Traced(found.y, flat.reshape(*found.y.shape, unknowns.size), found.way)
 
 
