@@ -290,18 +290,20 @@ class Objective:
         beside = further_of(self._of[1], parts)
         used, samples = self._used, len(self._target)
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
-        more = [b.jacobian / b.level for b in beside]
-        given = (-b.residuals / b.level for b in beside)
-        residual = np.concatenate([(y - self._target) * self._share, *given, theta * self._prior])
-        jacobian = np.empty((len(residual), len(theta)))
-        first = 0
-        for part, u in zip(parts, used, strict=True):  # no copy but this one
-            last = first + int(np.count_nonzero(u))
-            np.compress(u, part.jacobian, axis=0, out=jacobian[first:last])
-            first = last
-        jacobian[:samples] *= self._share[:, None]
-        jacobian[samples:] = np.vstack([*more, np.diag(self._prior)])
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left
+            more = [b.jacobian / b.level for b in beside]
+            given = (-b.residuals / b.level for b in beside)
+            residual = np.concatenate(
+                [(y - self._target) * self._share, *given, theta * self._prior]
+            )
+            jacobian = np.empty((len(residual), len(theta)))
+            first = 0
+            for part, u in zip(parts, used, strict=True):  # no copy but this one
+                last = first + int(np.count_nonzero(u))
+                np.compress(u, part.jacobian, axis=0, out=jacobian[first:last])
+                first = last
+            jacobian[:samples] *= self._share[:, None]
+            jacobian[samples:] = np.vstack([*more, np.diag(self._prior)])
             finite = np.isfinite(residual @ residual + np.vdot(jacobian, jacobian))
             far = _DIVERGED * self._reach * np.sqrt(samples)
             near = np.linalg.norm(residual[:samples]) < far
