@@ -100,7 +100,7 @@ def entering(
         return own
     prior, (at, _, _) = fit.unknowns.prior[: columns.shape[1]], windows(used)
     states = len(fit.model.state_names) - sum(len(c.states) for c in fit.model.effects)
-    tried = _tried(parts[0], used[0], len(fit.model.input_names) + states)
+    tried = _tried(parts[0], len(fit.model.input_names) + states)
     few, seen = _first(parts, used)
     if not tried.place.size or not few:
         return own
@@ -228,13 +228,10 @@ def _found(
     return _Found(white, spread, moves)
 
 
-def _filtered(
-    of: _Linear, used: BoolArray, noises: _Noises, *, seen: bool = True
-) -> tuple[FloatArray, FloatArray]:
+def _filtered(of: _Linear, used: BoolArray, noises: _Noises) -> tuple[FloatArray, FloatArray]:
     """Return innovations (n, b, rows) over their standard deviations (n, b), and these.
 
-    The sensor's noise is 1. What is not `seen` tells the filter nothing: the deviations are those
-    of a simulation.
+    The sensor's noise is 1. Without `used` samples the deviations are those of a simulation.
     """
     (n, nx), size, count = of.c.shape, len(noises.place), of.rows.shape[1]
     with np.errstate(divide="ignore"):
@@ -250,7 +247,7 @@ def _filtered(
         gain = p @ c
         variance = gain @ c + 1.0
         spread[k] = np.sqrt(variance)
-        if used[k] and seen:
+        if used[k]:
             error = of.rows[k] - np.einsum("i,bij->bj", c, x)
             white[k] = error / spread[k][:, None]
             x += (gain / variance[:, None])[:, :, None] * error[:, None, :]
@@ -284,7 +281,7 @@ def _first(
     return few, seen
 
 
-def _tried(of: _Linear, used: BoolArray, count: int) -> _Noises:
+def _tried(of: _Linear, count: int) -> _Noises:
     """Return noises of the first places, and of all powers and times.
 
     A power is told by the effect on the output.
@@ -293,7 +290,7 @@ def _tried(of: _Linear, used: BoolArray, count: int) -> _Noises:
     grid = _Noises(
         np.repeat(places, len(time)), np.ones(places.size * time.size), np.tile(time, len(places))
     )
-    _, size = _filtered(of, used, grid, seen=False)
+    _, size = _filtered(of, np.zeros(len(of.c), dtype=np.bool_), grid)
     power = np.nan_to_num(np.mean(size**2 - 1.0, axis=0), posinf=0.0)
     there = power > 1e-12 * np.max(power)
     return _Noises(

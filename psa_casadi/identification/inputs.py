@@ -67,16 +67,7 @@ def _smoothed_instead(
     noisy = tuple(dict.fromkeys(n for _, names in pairs for n in names))
     if not noisy:
         return None
-    others = tuple(e for e, _ in pairs)
-    try:
-        found = refitted(of, others)
-    except PsaError:
-        return None
-    nats = likelier(found, of)
-    if nats < LIKELIER:
-        return None
-    best, again = relevelled(found, others, every=True)
-    return best, again, note("inputs_smoothed", inputs=noisy, nats=nats)
+    return _instead(of, tuple(e for e, _ in pairs), "inputs_smoothed", inputs=noisy)
 
 
 def _smoothed(e: Experiment, names: Sequence[str]) -> tuple[Experiment, list[str]]:
@@ -107,7 +98,13 @@ def held_otherwise(
     All inputs of all records are held, or none is.
     """
     hold = other_hold(experiments)
-    others = held_as(experiments, hold)
+    return _instead(of, held_as(experiments, hold), "hold_found", hold=hold)
+
+
+def _instead(
+    of: Fit, others: Sequence[Experiment], code: str, **values: Any
+) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
+    """Return the fit of other experiments and its note, where it is `LIKELIER`."""
     try:
         found = refitted(of, others)
     except PsaError:
@@ -116,7 +113,7 @@ def held_otherwise(
     if nats < LIKELIER:
         return None
     best, again = relevelled(found, others, every=True)
-    return best, again, note("hold_found", hold=hold, nats=nats)
+    return best, again, note(code, **values, nats=nats)
 
 
 def likelier(new: Fit, old: Fit) -> float:
