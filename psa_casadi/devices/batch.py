@@ -27,7 +27,7 @@ from typing import Any
 
 from psa_casadi.component import Component
 from psa_casadi.devices.device import make_ready
-from psa_casadi.devices.executors import Executor, Processes, outcomes
+from psa_casadi.devices.executors import Executor, outcomes
 from psa_casadi.devices.jobs import (
     DeviceOutcome,
     DeviceTask,
@@ -42,6 +42,7 @@ from psa_casadi.files import atomic_path, atomic_write, make_folder
 from psa_casadi.interruption import interruptible_work
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding
+from psa_casadi.processes import Processes
 from psa_casadi.progress import Progress, on_a_terminal, silent
 from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
 from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of

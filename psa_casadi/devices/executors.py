@@ -2,32 +2,25 @@
 
 An executor is any object with `submit(function, argument)` that returns a future with
 `add_done_callback`, `result` and `cancel`: those of `concurrent.futures`, a client of Dask,
-mpi4py's. `Processes` is one, too. Unlike the executor of the standard library it needs no guard
-around the main program, and a process that dies takes one device with it instead of all.
+mpi4py's. `psa_casadi.processes.Processes` is one, too: of it, a process that dies takes one device
+with it instead of all.
 """
 
 import asyncio
-import os
-import pickle
 import queue
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
-from typing import IO, Any, Protocol, cast
+from typing import Any, Protocol, cast
 
-from psa_casadi.children import Child, end_with_parent, kill, started_python
 from psa_casadi.devices.device import stop, work_on
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.files import abandon, answer_requests_to_end
 from psa_casadi.interruption import raise_if_stopped
-from psa_casadi.simulation.side_by_side import VARIABLE
+from psa_casadi.processes import ONE_THREAD
 
-#: The linear algebra libraries have one thread in a process that works on a device.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 #: The address that starts a cluster on this machine.
 LOCAL = "local"
 #: Time [s] that a scheduler may take to answer, and between two looks whether the run is to end.
@@ -36,7 +29,7 @@ _PATIENCE, _LOOK = 20, 0.2
 #: memory back at once (MALLOC_TRIM_THRESHOLD_) and looks at its stack 100 times a second; the first
 #: costs a device a quarter of its time, and nobody reads the second.
 _OURS = {
-    "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
+    "distributed.nanny.pre-spawn-environ": ONE_THREAD,
     "distributed.worker.profile.enabled": False,
 }
 #: What Dask logs, with tracebacks, of a scheduler that is lost; the work that is lost tells it.
@@ -48,66 +41,6 @@ class Executor(Protocol):
 
     def submit(self, function: Callable[..., Any], argument: Any, /) -> Any:
         """Take the call of a function with an argument."""
-
-
-class Processes:
-    """An executor of `count` processes of this package, each with one thread."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self._pool = ThreadPoolExecutor(count, thread_name_prefix="psa device")
-        self._own, self._held, self._ended = threading.local(), ExitStack(), False
-
-    def submit(self, function: Callable[[Any], Any], argument: Any, /) -> "Future[Any]":
-        """Let the next free process call a function, which it can import, with an argument."""
-        return self._pool.submit(self._called, function, argument)
-
-    def end(self) -> None:
-        """Kill the processes, and leave out what has not begun."""
-        self._ended = True
-        self._held.close()
-        self._pool.shutdown(cancel_futures=True)
-        self._held.close()
-
-    def _called(self, function: Callable[[Any], Any], argument: Any) -> Any:
-        if not hasattr(self._own, "child"):  # the process of this thread
-            started = started_python(
-                "psa_casadi.devices.executors", directory=None, **{VARIABLE: "1"}, **_ONE_THREAD
-            )
-            self._own.child = self._held.enter_context(started)
-            if self._ended:
-                kill(self._own.child)
-        child = cast("Child", self._own.child)
-        try:
-            pickle.dump((function, argument), cast("IO[bytes]", child.stdin))
-            cast("IO[bytes]", child.stdin).flush()
-            return pickle.load(cast("IO[bytes]", child.stdout))
-        except (EOFError, OSError, pickle.UnpicklingError):
-            del self._own.child
-            code = child.wait()
-            said = "" if child.stderr is None else child.stderr.read().decode(errors="replace")
-            how = f"signal {-code}" if code < 0 else f"exit code {code}"
-            raise MachineError(
-                f"The process that worked on this device ended ({how}): killed, out of memory, or"
-                f" crashed. The next run tries it again.{said[-500:]}"
-            ) from None
-
-
-def main() -> None:
-    """Call functions with arguments that come on standard input, pickled, until it ends."""
-    end_with_parent()
-    answer_requests_to_end()
-    calls, results = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    silent = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(silent, stream)  # what a library prints is no result
-    try:
-        while True:
-            function, argument = pickle.load(calls)
-            pickle.dump(function(argument), results)
-            results.flush()
-    except EOFError:
-        abandon()
 
 
 def outcomes(
@@ -219,7 +152,3 @@ async def _reach(distributed: Any, address: str) -> None:
     security = distributed.Security().get_connection_args("client")
     way = await distributed.comm.connect(address, timeout=_PATIENCE, **security)
     await way.close()
-
-
-if __name__ == "__main__":
-    main()

@@ -19,9 +19,10 @@ import pytest
 import psa_casadi as psa
 from psa_casadi import children
 from psa_casadi.devices import device, executors
-from psa_casadi.devices.executors import Processes, outcomes
+from psa_casadi.devices.executors import outcomes
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, jobs_given
 from psa_casadi.interruption import raise_if_stopped
+from psa_casadi.processes import Processes
 from psa_casadi.report.documents.files import identification_file
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.strict_json import json_text
