@@ -143,13 +143,14 @@ class FmuUsed:
     """An imported FMU by the name of its file and the SHA-256 of that.
 
     `parameters` are the names in there of those that the component declares, `values` numbers of
-    further ones.
+    further ones. `interface` is that by which it is run as a whole, "" if its equations are used.
     """
 
     file: str
     sha256: str
     parameters: tuple[str, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
+    interface: Literal["", "model exchange", "co-simulation"] = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +158,8 @@ class Foreign:
     """A compiled function `name` that equations call, and its derivative: an imported FMU.
 
     It has no formula, so that nothing is printed of it. `addresses` returns where the two are in
-    this process; what is compiled of a model calls them there. `fmu` is what they are of.
+    this process; what is compiled of a model calls them there. `fmu` is what they are of. One that
+    is run as a whole (`Component.played`) has no function.
     """
 
     name: str
@@ -195,7 +197,7 @@ class Component:
 
     `home` is the module of a component that is not of this package (`own_effects`). `balances` are
     sums of its own that others may add to, beside those of every model. `foreign` is what its
-    equations call that is no formula.
+    equations call that is no formula; `played` is what is run as a whole in their place.
     """
 
     name: str
@@ -228,6 +230,7 @@ class Component:
     home: str = ""
     balances: tuple[Balance, ...] = ()
     foreign: Foreign | None = None
+    played: Any = None
 
     @property
     def from_residual(self) -> bool:

@@ -73,12 +73,15 @@ def ways(
     except SimulationError as error:
         lost = error
     else:
-        done = best.interrupted or settled(best, whole)
+        whole_only = model.structure.played is not None  # it begins in one state
+        done = best.interrupted or whole_only or settled(best, whole)
         usable = done or (follows(best, whole, _LOST) and not _grows(best, whole))
         if usable:
             yield _as_read(best, whole, outcomes, undecided)
         if done:
             return
+    if model.structure.played is not None and lost:
+        raise lost
     progress("fitting parts of the records")
     found = _in_parts(model, given, made, free, undecided, starts, progress)
     if found is not None and (lost or len(found[1]) > len(whole) or _nearer(found[0], best)):

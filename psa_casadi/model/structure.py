@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import casadi as ca
 
@@ -149,6 +150,11 @@ class Structure:
         """The compiled functions that the equations call: of imported FMUs."""
         found = {c.foreign.name: c.foreign for c in self.components if c.foreign}
         return tuple(found.values())
+
+    @cached_property
+    def played(self) -> Any:
+        """What is run as a whole in the place of equations: an FMU. None without one."""
+        return next((c.played for c in self.components if c.played is not None), None)
 
     def jacobian(self, of: Expression, by: Expression) -> Expression:
         """Return casadi's Jacobian, by columns where equations call what has forward derivatives.

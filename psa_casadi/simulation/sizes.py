@@ -13,7 +13,7 @@ from psa_casadi.model.compose import Model, Structure
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import begun
-from psa_casadi.simulation.stepper import run
+from psa_casadi.simulation.stepper import Steps, run
 from psa_casadi.symbolic import in_turn
 from psa_casadi.units import FloatArray
 
@@ -23,12 +23,16 @@ _STEPS, _MEAN_STEPS = 3000, 200
 
 def states_of(model: Model, e: Experiment, start: Mapping[str, float], rtol: float) -> FloatArray:
     """Return all states (n, nx) of one experiment. Raises PsaError."""
+    return _course(model, e, start, rtol).x
+
+
+def _course(model: Model, e: Experiment, start: Mapping[str, float], rtol: float) -> Steps:
     t, u = e.record.time - e.record.time[0], record_inputs(model, e.record, e.record.n)
     x0 = begun(model, t, u, start).x
     return run(
         model, t, u, x0, rtol=rtol, hold=e.record.hold,
         steps_limit=_STEPS, steps_most=_MEAN_STEPS * e.record.n,
-    ).x  # fmt: skip
+    )  # fmt: skip
 
 
 #: Tolerance of the first look at a model whose states' sizes are not known.
@@ -57,14 +61,15 @@ def sizes_of(
     """Return the sizes of a model's signals in experiments. Raises PsaError."""
     given = starts or [{} for _ in experiments]
     pairs = zip(experiments, given, strict=True)
-    tables = [states_of(model, e, s, _LOOK_RTOL) for e, s in pairs]
+    courses = [_course(model, e, s, _LOOK_RTOL) for e, s in pairs]
+    tables, outputs = [c.x for c in courses], [c.y for c in courses]
     inputs = [record_inputs(model, e.record, e.record.n) for e in experiments]
     f, p = _rates(model.structure), model.parameter_vector()
     found = []
     for e, u, x in zip(experiments, inputs, tables, strict=True):
         time = e.record.time - e.record.time[0]
         found.append(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x))))
-    rates, outputs, sums, changes = (
+    rates, sums, changes = (
         [np.array(part).T for part in parts] for parts in zip(*found, strict=True)
     )
 
@@ -120,7 +125,7 @@ def _rates(structure: Structure) -> ca.Function:
     arguments = [structure.time, structure.x, structure.u, structure.p]
     sums = ca.vertcat(ca.SX(0, 1), *(structure.sums[n] for n in _sums(structure)))
     changes = ca.jtimes(sums, structure.x, structure.xdot)
-    return ca.Function("rates", arguments, [structure.xdot, structure.y, sums, changes])
+    return ca.Function("rates", arguments, [structure.xdot, sums, changes])
 
 
 def _sums(structure: Structure) -> list[str]:

@@ -95,7 +95,8 @@ def _library(structure: Structure) -> ctypes.CDLL:
 
 def make_ready(model: Model) -> None:
     """Compile the stepper of a model; else its first `run` does."""
-    _library(model.structure)
+    if model.structure.played is None:
+        _library(model.structure)
 
 
 def run(
@@ -130,6 +131,12 @@ def run(
     times that do not increase, or numbers that are not finite.
     """
     s, n, nx, count = model.structure, len(t), len(model.state_names), len(unknowns)
+    if s.played is not None:
+        found_so: Steps = s.played.run(
+            model, t, u, x0, rtol=rtol, hold=hold, unknowns=unknowns, s0=s0, outputs=outputs,
+            values=values,
+        )  # fmt: skip
+        return found_so
     own = values or model.values
     if z0 is None:
         z0 = np.array([q.start for q in s.sampled])
@@ -144,10 +151,11 @@ def run(
         "z": np.empty((n, len(s.sampled))), "y": np.empty((n, len(s.outputs))),
         "which": which_of(model, unknowns), "outputs": np.array(rows, np.int32),
         "dy": np.empty((n, len(rows), count)),
-        "work": np.empty((_STAGES + 3) * nx * max(count, 1)),
+        "work": np.empty((_STAGES + 3) * max(1, nx) * max(count, 1)),
     }  # fmt: skip
     _check(model, arrays, hold)
-    arrays["x0"] = arrays["x0"] if nx else np.zeros(1)  # C has one unused state
+    if not nx:  # C has one unused state
+        arrays |= {"x0": np.zeros(1), "s0": np.zeros((1, count))}
     count_run(differentiated=count > 0)
     request = _Run(
         samples=n, zero_order_hold=int(hold == "zero"), rtol=rtol, max_step=max_step,

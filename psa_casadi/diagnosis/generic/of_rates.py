@@ -253,10 +253,10 @@ def _range(model: Model, sizes: Sizes, x: str) -> Parameter:
 
 def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     """Return every generic effect at every port of a model that has no effects yet."""
-    found: list[Attached] = []
+    found, imported = list[Attached](), bool(model.structure.foreign)
     for port in ports_of(model):
         if port.kind != "rate":
-            found += signal_effects(port, sizes)
+            found += signal_effects(port, sizes, imported=imported)
         if port.kind == "rate" or is_place(model, port):
             found += sum_effects(model, port, sizes)
     return (*found, *changing(model, sizes))

@@ -13,6 +13,8 @@ import casadi as ca
 
 from psa_casadi.component import Expression, Symbols
 from psa_casadi.diagnosis.generic.attached import (
+    LARGEST,
+    ORDINARY,
     Attached,
     Own,
     Terms,
@@ -45,10 +47,14 @@ _PLACE = {"input": "drive", "output": "sensor", "intermediate": "plant"}
 _Law = Callable[[Symbols, Expression, Own], Terms | Expression]
 
 
-def signal_effects(port: Port, sizes: Sizes) -> tuple[Attached, ...]:
-    """Return the effects of an input, an output or an intermediate."""
+def signal_effects(port: Port, sizes: Sizes, *, imported: bool = False) -> tuple[Attached, ...]:
+    """Return the effects of an input, an output or an intermediate.
+
+    Those of an `imported` FMU have a gain, which parameters need not have there, and a backlash.
+    """
     makers = [_lag, _delay, _bend, _saturation]
     makers += [_zero, _drift] if port.kind == "output" else [_dead_zone]
+    makers += [_gain, _backlash] if imported else []
     return tuple(make(port, sizes) for make in makers)
 
 
@@ -112,6 +118,54 @@ def _delay(port: Port, sizes: Sizes) -> Attached:
             for name in ("a1", "b1", "a2", "b2")
         ),
         finite_step=_STEPS,
+    )  # fmt: skip
+
+
+def _gain(port: Port, sizes: Sizes) -> Attached:
+    return _made(
+        port, "gain", lambda s, q, own: own("size") * q,
+        gain="size",
+        words=(
+            "its gain is another one",
+            "amplifier, scale of a sensor, a wrong unit",
+            "Q = (1 + size) q",
+            "a residual that is the signal's share, at every level and frequency alike",
+        ),
+        parameters=(
+            Parameter("size", 0.0, "1", (-LARGEST, LARGEST), "change of the gain", scale=ORDINARY),
+        ),
+    )  # fmt: skip
+
+
+def _backlash(port: Port, sizes: Sizes) -> Attached:
+    size = _size(port, sizes)
+
+    def law(s: Symbols, q: Expression, own: Own) -> Terms:
+        behind = q - own("state")
+        pushed = beyond(behind, own("width"), own("corner"))
+        return {"state": pushed / own("floor")}, -own("gain") * behind
+
+    words = "width over which the corner is rounded, a scale only"
+    return _made(
+        port, "backlash", law,
+        gain="gain",
+        words=(
+            "it follows with a backlash",
+            "play of a joint; Krasnoselskii and Pokrovskii, Systems with Hysteresis, 1989",
+            "Q = q - gain (q - z),  z follows q where it is further than width away",
+            "loops of one width, however slow the signal, and flat tops at its turns",
+        ),
+        parameters=(
+            Parameter("gain", 0.0, "1", (0.0, 1.0), "share that has the backlash", scale=0.1),
+            Parameter(
+                "width", 0.05 * size, port.unit, (1e-3 * size, 0.7 * size), "half the backlash",
+                log=True,
+            ),
+            scale_of("corner", 2e-3 * size, port.unit, words),
+            scale_of("floor", 0.2 * sizes.sample, "s", "time in which it is pushed"),
+        ),
+        states=(State("state", port.unit, "what follows", size, memory=True, settles=False),),
+        probe={"width": tuple(share * size for share in (0.02, 0.06, 0.2))},
     )  # fmt: skip
 
 

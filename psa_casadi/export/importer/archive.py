@@ -12,6 +12,8 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Self
 
@@ -100,6 +102,30 @@ def unpack(path: Path, folder: Path) -> None:
         raise InputError(f"{path}: cannot be unpacked ({str(error)!a}).") from error
 
 
+#: Types whose values are no numbers.
+_NO_NUMBERS = ("String", "Binary", "Clock")
+
+
+@dataclass(frozen=True)
+class Element:
+    """One number of a variable: an element of an array, or all there is of a scalar.
+
+    `place` is its place among the `count` values of the variable, whose starts are `starts`.
+    """
+
+    variable: str
+    type: str
+    reference: int
+    place: int
+    count: int
+    starts: tuple[float, ...]
+
+    @property
+    def real(self) -> bool:
+        """Whether it is a floating point number."""
+        return self.type in ("Real", "Float64", "Float32")
+
+
 class Archive:
     """An unpacked FMU; a context manager that removes the files.
 
@@ -107,8 +133,9 @@ class Archive:
 
     `version` is 2 or 3, `description` fmpy's record of the XML. `references`, `nominals` and
     `bounds` map the names of variables to value references, nominal values, and the least and the
-    greatest value, infinite where there is no bound. `step_size` is that of the default experiment
-    [s], 1 ms if there is none.
+    greatest value, infinite where there is no bound. `elements` are the numbers of all variables:
+    an array `A` has `A[1,1]`, `A[1,2]` and so on; `variables` are fmpy's records. `step_size` is
+    that of the default experiment [s], 1 ms if there is none.
 
     Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0, or must not be unpacked.
     """
@@ -159,9 +186,26 @@ class Archive:
             self.nominals[v.name] = 1.0 if v.nominal is None else float(v.nominal)
             low = -math.inf if v.min is None else float(v.min)
             self.bounds[v.name] = (low, math.inf if v.max is None else float(v.max))
+        self.variables = {v.name: v for v in self.description.modelVariables}
+        self.elements = dict(self._elements())
         experiment = self.description.defaultExperiment
         self.step_size = float(getattr(experiment, "stepSize", None) or 1e-3)
         self._states = [str(u.variable.derivative.name) for u in self.description.derivatives]
+
+    def _elements(self) -> Iterator[tuple[str, Element]]:
+        """Yield the numbers of all variables by name."""
+        for v in self.description.modelVariables:
+            if v.type in _NO_NUMBERS:
+                continue
+            shape = [_size(d) for d in v.dimensions]
+            count, said = math.prod(shape), str(v.start if v.start is not None else "").split()
+            starts = [_number(word) for word in said] or [0.0]
+            starts = starts if len(starts) == count else starts[:1] * count
+            places = product(*(range(1, size + 1) for size in shape))
+            for k, place in enumerate(places):
+                name = f"{v.name}[{','.join(map(str, place))}]" if shape else v.name
+                row = v.name, v.type, int(v.valueReference), k, count, tuple(starts)
+                yield str(name), Element(*row)
 
     def __enter__(self) -> Self:
         return self
@@ -208,3 +252,14 @@ class Archive:
         for path in sorted((self.directory / "binaries").rglob("*")):
             if path.is_file() and path.suffix in (".so", ".dll", ".dylib"):
                 yield path
+
+
+def _size(dimension: Any) -> int:
+    """Return the size of a dimension: its number, or the start of what sets it."""
+    said = dimension.start if dimension.variable is None else dimension.variable.start
+    return int(said or 0)
+
+
+def _number(word: str) -> float:
+    """Return a start value; a Boolean is 0 or 1."""
+    return float({"true": "1", "false": "0"}.get(word.lower(), word))

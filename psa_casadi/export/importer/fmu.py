@@ -5,10 +5,11 @@ and many instances of a library that is loaded once.
 """
 
 import ctypes
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import chdir
 from copy import copy
 from ctypes import c_double, c_uint
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -46,6 +47,7 @@ class Fmu(Archive):
     def __init__(self, path: Path, unpacked: Path | None = None) -> None:
         super().__init__(path, unpacked)
         self._loaded: dict[int, Any] = {}
+        self._groups: dict[tuple[str, ...], list[_Group]] = {}
 
     @property
     def library(self) -> ctypes.CDLL:
@@ -80,6 +82,27 @@ class Fmu(Archive):
             ) from error
         return self._loaded[interface]
 
+    def groups(self, names: tuple[str, ...]) -> list["_Group"]:
+        """Return the numbers of these names by the calls that get or set them."""
+        if names not in self._groups:
+            self._groups[names] = list(self._grouped(names))
+        return self._groups[names]
+
+    def _grouped(self, names: tuple[str, ...]) -> Iterator["_Group"]:
+        calls = {"Enumeration": "Integer" if self.version == 2 else "Int64"}
+        rows: dict[str, dict[int, list[int]]] = {}
+        for row, name in enumerate(names):
+            e = self.elements[name]
+            rows.setdefault(calls.get(e.type, e.type), {}).setdefault(e.reference, []).append(row)
+        for kind, variables in rows.items():
+            order, places, starts = list[int](), list[int](), list[float]()
+            for of in variables.values():
+                order += of
+                places += [len(starts) + self.elements[names[row]].place for row in of]
+                starts += self.elements[names[of[0]]].starts
+            references = (c_uint * len(variables))(*variables)
+            yield _Group(kind, references, order, places, tuple(starts))
+
     def open(self, interface: int, **options: Any) -> "Instance":
         """Return an instance; raises FmuError if the FMU refuses, InputError as `loaded`."""
         return Instance(self, interface, **options)
@@ -97,6 +120,21 @@ class Fmu(Archive):
         if interface == MODEL_EXCHANGE:
             instance.require("EnterContinuousTimeMode")
         return instance
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Numbers that one call gets or sets: those of variables of a type.
+
+    They are the `rows` among the names that were asked for, and the `places` among the values of
+    the call; `starts` are all of these.
+    """
+
+    type: str
+    references: Any
+    rows: list[int]
+    places: list[int]
+    starts: tuple[float, ...]
 
 
 class Instance:
@@ -181,14 +219,23 @@ class Instance:
         return (c_uint * len(names))(*(self.fmu.references[n] for n in names))
 
     def get(self, names: Sequence[str]) -> FloatArray:
-        """Return the values of variables."""
-        read = self.fmi.getReal if self.fmu.version == 2 else self.fmi.getFloat64
-        return np.array(read(self.references(names)))
+        """Return the values of variables whose type is a number, and of elements of arrays."""
+        found = np.empty(len(names))
+        for g in self.fmu.groups(tuple(names)):
+            sizes = () if self.fmu.version == 2 else (len(g.starts),)
+            values = getattr(self.fmi, f"get{g.type}")(g.references, *sizes)
+            found[g.rows] = np.array(values, dtype=float)[g.places]
+        return found
 
     def set(self, values: Mapping[str, float]) -> None:
-        """Set variables."""
-        write = self.fmi.setReal if self.fmu.version == 2 else self.fmi.setFloat64
-        write(self.references(list(values)), list(values.values()))
+        """Set variables; elements of arrays that are not given are set to their starts."""
+        given = np.array(list(values.values()), dtype=float)
+        for g in self.fmu.groups(tuple(values)):
+            every = np.array(g.starts)
+            every[g.places] = given[g.rows]
+            real = g.type in ("Real", "Float64", "Float32")
+            whole = every if real else [int(v) for v in np.rint(every)]
+            getattr(self.fmi, f"set{g.type}")(g.references, whole)
 
     def step(self, point: float, size: float) -> None:
         """Do one communication step."""

@@ -3,18 +3,27 @@
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, Expression, FmuUsed, Symbols
+from psa_casadi.component import Component, Equations, Expression, FmuUsed, Foreign, Symbols
 from psa_casadi.errors import InputError, Problems, PsaError, quoted
-from psa_casadi.export.importer.fmu import Fmu
-from psa_casadi.export.importer.imported import Imported, Selected, digest_of, imported_of, opened
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
+from psa_casadi.export.importer.imported import (
+    TIME_EVENT,
+    Imported,
+    Selected,
+    digest_of,
+    imported_of,
+    opened,
+)
+from psa_casadi.export.importer.played import Played, PlayedEquations
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
@@ -24,6 +33,10 @@ Free = Sequence[str] | Mapping[str, tuple[float, float] | Parameter]
 #: A range whose ends differ by this factor is searched on a logarithmic scale.
 _DECADE = 10.0
 _REALS = ("Real", "Float64")
+FmuInterface = Literal["model exchange", "co-simulation"]
+_NAMES: dict[int, FmuInterface] = {
+    MODEL_EXCHANGE: "model exchange", CO_SIMULATION: "co-simulation",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -37,90 +50,110 @@ class Read:
     parameters: tuple[Parameter, ...]
 
 
-def read_variables(fmu: Fmu, free: Free | None, values: Mapping[str, float]) -> Read:
-    """Return the variables of an FMU; see `fmu_model`. Raises InputError with every mistake."""
+def read_variables(
+    fmu: Fmu, free: Free | None, values: Mapping[str, float], *, whole: bool = False
+) -> Read:
+    """Return the variables of an FMU; see `fmu_model`. Raises InputError with every mistake.
+
+    Of one that is run as a `whole` there are no states, numbers of every type, and elements of
+    arrays.
+    """
     problems = Problems()
-    _refuse_unfit(fmu, problems)
-    problems.raise_if_any()
     table = {v.name: v for v in fmu.description.modelVariables}
-    for name in [n for n in values if n not in table or table[n].causality != "parameter"]:
+    rows = {n: table[e.variable] for n, e in fmu.elements.items()}
+    inputs, outputs = (
+        {n: v for n, v in rows.items() if v.causality == causality and n not in values}
+        for causality in ("input", "output")
+    )
+    if not whole:
+        outputs = {n: v for n, v in outputs.items() if v.type in _REALS}
+    begun = _begun(fmu) if whole else set[str]()
+    own = {n for n, v in rows.items() if v.causality == "parameter"} | begun
+    fixed = own | {n for n, v in rows.items() if v.causality == "input"}
+    for name in [n for n in values if n not in fixed]:
         problems.add(f"`values` has '{name}', which is no parameter of {fmu.path.name}.")
-    inputs = [v for v in table.values() if v.causality == "input"]
-    outputs = [v for v in table.values() if v.causality == "output" and v.type in _REALS]
-    wanted = _free(fmu, free, table, problems)
+    wanted = _free(fmu, free, own, problems)
     problems.raise_if_any()
-    parameters = [_parameter(table[n], given, values, problems) for n, given in wanted.items()]
+    parameters = [
+        _parameter(n, fmu, rows[n], given, values, problems) for n, given in wanted.items()
+    ]
     problems.raise_if_any()
-    states = [table[n] for n in fmu.states()]
-    taken = [v.name for v in (*inputs, *outputs)]
+    states = [] if whole else [table[n] for n in fmu.states()]
+    taken = [*inputs, *outputs]
+    nominals = {n: fmu.nominals[e.variable] for n, e in fmu.elements.items()}
     read = Read(
         selected=Selected(
             states=tuple(v.name for v in states),
-            rates=tuple(str(u.variable.name) for u in fmu.description.derivatives),
-            inputs=tuple(v.name for v in inputs),
-            outputs=tuple(v.name for v in outputs),
+            rates=tuple(str(u.variable.name) for u in fmu.description.derivatives[: len(states)]),
+            inputs=tuple(inputs),
+            outputs=tuple(outputs),
             parameters=tuple(wanted),
             fixed=tuple((n, float(v)) for n, v in values.items() if n not in wanted),
         ),
         states=tuple(
-            State(_name(v.name, taken, "_state"), *_said(v), fmu.nominals[v.name]) for v in states
+            State(_name(v.name, taken, "_state"), *_said(v, v.name), nominals[v.name])
+            for v in states
         ),
         inputs=tuple(
-            Input(_name(v.name), *_said(v), _number(v.start), fmu.nominals[v.name]) for v in inputs
+            Input(_name(n), *_said(v, n), _start(fmu, n), nominals[n]) for n, v in inputs.items()
         ),
-        outputs=tuple(Output(plain_name(v.name), *_said(v), fmu.nominals[v.name]) for v in outputs),
+        outputs=tuple(Output(plain_name(n), *_said(v, n), nominals[n]) for n, v in outputs.items()),
         parameters=tuple(parameters),
     )
     declared: Iterable[Any] = (*read.states, *read.inputs, *read.outputs, *read.parameters)
     every = [v.name for v in declared]
     for name in sorted({n for n in every if every.count(n) > 1}):
         problems.add(f"Two variables of the FMU become '{name}' here; rename one in its model.")
+    if not read.outputs:
+        problems.add(f"{fmu.path.name} has no output that is a number; nothing can be compared.")
     problems.raise_if_any()
     return read
 
 
-def _refuse_unfit(fmu: Fmu, problems: Problems) -> None:
-    """Note why an FMU is no ordinary differential equation x' = f(t, x, u, p)."""
+def _begun(fmu: Fmu) -> set[str]:
+    """Return the variables with a start value of their own that are no parameters."""
+    return {
+        n
+        for n, e in fmu.elements.items()
+        for v in [fmu.variables[e.variable]]
+        if e.real and v.initial == "exact" and v.causality in ("local", "output")
+    }
+
+
+def _no_equations(fmu: Fmu) -> Iterator[str]:
+    """Yield why an FMU is no ordinary differential equation x' = f(t, x, u, p)."""
     exchange, name = fmu.description.modelExchange, fmu.path.name
     if exchange is None:
-        problems.add(
-            f"{name} has no model exchange: its equations cannot be asked for. Export it for model"
-            " exchange from the tool that made it."
-        )
+        yield f"{name} has no model exchange"
         return
     if exchange.modelIdentifier != fmu.identifier:
-        problems.add(
-            f"{name} has one binary for each interface; export it for model exchange only."
-        )
+        yield f"{name} has one binary for each interface"
     if exchange.canBeInstantiatedOnlyOncePerProcess:
-        problems.add(
-            f"{name} gives one instance for each process; derivatives by parameters need several."
-        )
+        yield f"{name} gives one instance for each process"
     if fmu.indicator_count():
-        problems.add(
-            f"{name} has {fmu.indicator_count()} event indicators: it switches at events, over"
-            " which no derivative leads. Export it with smooth equations, without events."
-        )
+        yield f"{name} has {fmu.indicator_count()} event indicators"
     for v in fmu.description.modelVariables:
         if v.causality == "input" and (v.type not in _REALS or v.dimensions):
-            problems.add(f"{name}: the input '{v.name}' is no real number but {v.type}.")
-        elif v.causality == "output" and v.dimensions:
-            problems.add(f"{name}: the output '{v.name}' is an array; give one output for each.")
+            yield f"{name}: the input '{v.name}' is no real number"
+    outputs = [v for v in fmu.description.modelVariables if v.causality == "output"]
+    if any(v.dimensions for v in outputs) or not any(v.type in _REALS for v in outputs):
+        yield f"{name} has outputs that are no real numbers"
 
 
 def _free(
-    fmu: Fmu, free: Free | None, table: Mapping[str, Any], problems: Problems
+    fmu: Fmu, free: Free | None, numbers: Iterable[str], problems: Problems
 ) -> dict[str, tuple[float, float] | Parameter]:
     """Return the parameters to identify with their bounds: those given, else the FMU's."""
-    own = {v.name for v in table.values() if v.causality == "parameter" and v.type in _REALS}
-    bounded = {n for n in own if math.isfinite(math.hypot(*fmu.bounds[n]))}
+    own = {n for n in numbers if fmu.elements[n].real}
+    limits = {n: fmu.bounds[fmu.elements[n].variable] for n in own}
+    bounded = {n for n in own if math.isfinite(math.hypot(*limits[n]))}
     if free is None:
         if not bounded:
             problems.add(
                 f"No parameter of {fmu.path.name} has a least and a greatest value; name those to"
                 f" identify with bounds, free={{name: (low, high)}}; it has {quoted(sorted(own))}."
             )
-        return {n: fmu.bounds[n] for n in table if n in bounded}
+        return {n: limits[n] for n in fmu.elements if n in bounded}
     given = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
     found: dict[str, tuple[float, float] | Parameter] = {}
     for name, bounds in given.items():
@@ -134,11 +167,13 @@ def _free(
                 f"'{name}' has no bounds in {fmu.path.name}; give {{'{name}': (low, high)}}."
             )
         else:
-            found[name] = fmu.bounds[name] if bounds is None else bounds
+            found[name] = limits[name] if bounds is None else bounds
     return found
 
 
 def _parameter(
+    name: str,
+    fmu: Fmu,
     variable: Any,
     given: tuple[float, float] | Parameter,
     values: Mapping[str, float],
@@ -147,16 +182,16 @@ def _parameter(
     if isinstance(given, Parameter):
         return given
     low, high = (float(b) for b in given)
-    value = float(values.get(variable.name, _number(variable.start)))
+    value = float(values.get(name, _start(fmu, name)))
     if not low <= value <= high or low == high:
         problems.add(
-            f"'{variable.name}' is {value:g} in the FMU, outside [{low:g}, {high:g}]; give wider"
+            f"'{name}' is {value:g} in the FMU, outside [{low:g}, {high:g}]; give wider"
             " bounds, or another value in `values`."
         )
     log = low > 0 and high >= _DECADE * low
     scale = None if value else 0.1 * (high - low)
-    unit, words = _said(variable)
-    return Parameter(_name(variable.name), value, unit, (low, high), words, log=log, scale=scale)
+    unit, words = _said(variable, name)
+    return Parameter(_name(name), value, unit, (low, high), words, log=log, scale=scale)
 
 
 def plain_name(name: str) -> str:
@@ -173,10 +208,10 @@ def _name(name: str, taken: Iterable[str] = (), suffix: str = "_of_fmu") -> str:
     return plain + "_of_fmu" if plain == "time" else plain
 
 
-def _said(variable: Any) -> tuple[str, str]:
+def _said(variable: Any, name: str) -> tuple[str, str]:
     """Return unit and description; "1" where this package does not know it or it is no SI unit."""
     said = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
-    words = str(variable.description or variable.name)
+    words = str(variable.description or name)
     try:
         unit = parse_unit(said)
     except InputError:
@@ -184,8 +219,9 @@ def _said(variable: Any) -> tuple[str, str]:
     return said if unit.ratio == 1 and not unit.offset else "1", words
 
 
-def _number(start: Any) -> float:
-    return float(start) if start not in (None, "") else 0.0
+def _start(fmu: Fmu, name: str) -> float:
+    element = fmu.elements[name]
+    return element.starts[element.place]
 
 
 #: Points at which it is looked whether a rate is another state, and nothing else.
@@ -198,55 +234,124 @@ def fmu_model(
     free: Free | None = None,
     values: Mapping[str, float] | None = None,
     name: str | None = None,
+    interface: FmuInterface | None = None,
 ) -> Model:
-    """Return the model x' = f(t, x, u, p), y = h(t, x, u, p) of a model-exchange FMU (FMI 2, 3).
+    """Return an FMU (FMI 2, 3) as a model to simulate, identify and diagnose.
 
-    `psa.identify`, `psa.diagnose` and `psa.run` take it like an `ode_model`; its inputs, outputs
-    and the rates of its states are ports to which effects attach. The FMU's binary computes f and
-    h. Derivatives by x and u are the FMU's directional derivatives where it has them, else central
-    differences; those by p are central differences of instances initialised with other values.
+    One of model exchange without events is x' = f(t, x, u, p), y = h(t, x, u, p), like an
+    `ode_model`: its inputs, outputs and the rates of its states are ports to which effects attach.
+    Its binary computes f and h in this process. Derivatives by x and u are the FMU's directional
+    derivatives where it has them, else central differences; those by p are central differences of
+    instances initialised with other values. The states start where the FMU starts.
+
+    Any other one is run as a whole, in processes of its own: by co-simulation, or by model exchange
+    with its events (fmpy's CVode) where it has no other interface. Its inputs and outputs are the
+    ports; derivatives are differences of runs, side by side, 0.1 % of a parameter apart. It begins
+    in its start values at the beginning of each record. Between communication points, which are the
+    samples or closer, an input is a straight line where the FMU takes input derivatives, else its
+    mean over the step. Numbers of every type are inputs and outputs, elements of arrays too.
 
     `free` says which parameters are identified: {name: (low, high)}, {name: Parameter}, or names
-    whose least and greatest values the FMU declares; by default all that have both. A range of a
-    decade or more above 0 is searched on a logarithmic scale. `values` are numbers of parameters in
-    the place of the FMU's. The states start where the FMU starts at its own values.
+    whose least and greatest values the FMU declares; by default all parameters that have both. Of
+    one run as a whole, start values of its variables can be named, too. A range of a decade or more
+    above 0 is searched on a logarithmic scale. `values` are numbers of parameters in the place of
+    the FMU's, and of inputs that no record has, which stay there. `interface` is "model exchange"
+    or "co-simulation", by default the first one if it has no events, else the second.
 
     Inputs, outputs and their names are those of the FMU, its units are kept where they are SI
     units, else they are "1"; nothing is converted. A name that is no identifier is written with
     underscores: `body.phi[1]` is `body_phi_1`; a state that is an output too is NAME_state.
 
-    The FMU is unpacked and its binary runs in this process, without protection: load none that you
-    would not run. The model is not exported, as it has no equations to print; MODEL.json names the
-    FMU's file and its SHA-256. Two models of one FMU share instances.
+    The binary runs without protection: load none that you would not run. The model is not exported,
+    as it has no equations to print; MODEL.json names the FMU's file and its SHA-256. Two models of
+    one FMU share instances.
 
-    Raises InputError for a file that is no such FMU, has no binary for this machine, events, inputs
-    that are no real numbers, or only one instance for each process, and for wrong names or bounds.
+    Raises InputError for a file that is no FMU, has no binary for this machine or not that
+    interface, and for wrong names or bounds.
     """
     file = Path(path)
     digest = digest_of(file)
     fmu = opened(file.resolve(), digest)
-    read = read_variables(fmu, free, values or {})
-    imported = imported_of(fmu, digest, read.selected, _sizes(read))
-    own = name or plain_name(str(fmu.description.modelName))
-    component = Component(
+    if interface is None and not [*_no_equations(fmu)]:
+        with suppress(_TimeEventError):
+            return _of_equations(fmu, file, digest, free, values or {}, name)
+    chosen = _interface(fmu, interface)
+    if interface == "model exchange" and not [*_no_equations(fmu)]:
+        with suppress(_TimeEventError):
+            return _of_equations(fmu, file, digest, free, values or {}, name)
+    read = read_variables(fmu, free, values or {}, whole=True)
+    s, own = read.selected, [p.name for p in read.parameters]
+    played = Played(
+        str(file.resolve()), digest, chosen, s.inputs, s.outputs,
+        tuple(zip(own, s.parameters, strict=True)), s.fixed,
+    )  # fmt: skip
+    used = FmuUsed(file.name, digest, s.parameters, dict(s.fixed), _NAMES[chosen])
+    foreign = Foreign(f"fmu_{digest[:16]}", _no_function, used)
+    equations = PlayedEquations(tuple(o.name for o in read.outputs))
+    return compose([_component(fmu, read, equations, foreign, name, played)], name=_own(fmu, name))
+
+
+def _interface(fmu: Fmu, wanted: FmuInterface | None) -> int:
+    """Return how an FMU is run as a whole. Raises InputError."""
+    there = [_NAMES[k] for k in fmu.interfaces()]
+    if wanted is not None and wanted not in there:
+        raise InputError(f"{fmu.path.name} has no {wanted}, only {quoted(there)}; choose that.")
+    chosen = CO_SIMULATION if (wanted or there[0]) == _NAMES[CO_SIMULATION] else MODEL_EXCHANGE
+    if chosen == CO_SIMULATION:
+        fmu.loaded(chosen)  # raises where there is no binary
+    return chosen
+
+
+def _no_function() -> tuple[int, int]:
+    return 0, 0
+
+
+def _own(fmu: Fmu, name: str | None) -> str:
+    return name or plain_name(str(fmu.description.modelName))
+
+
+def _component(
+    fmu: Fmu, read: Read, equations: Callable[[Symbols], Equations], foreign: Foreign,
+    name: str | None, played: Played | None = None,
+) -> Component:  # fmt: skip
+    own = _own(fmu, name)
+    return Component(
         name=own,
         description=str(fmu.description.description or f"the FMU '{own}'"),
-        source=f"{file.name}, sha256 {digest}",
-        equations=_FmuEquations(imported, read, _definitions(imported, read)),
+        source=f"{foreign.fmu.file}, sha256 {foreign.fmu.sha256}",
+        equations=equations,
         parameters=read.parameters,
         states=read.states,
         inputs=read.inputs,
         outputs=read.outputs,
-        foreign=imported.foreign,
+        foreign=foreign,
+        played=played,
     )
-    names = read.selected.parameters
-    declared = {n: p.value for n, p in zip(names, read.parameters, strict=True)}
+
+
+class _TimeEventError(Exception):
+    """An FMU has events at times, which is seen when it is initialised only."""
+
+
+def _of_equations(
+    fmu: Fmu, file: Path, digest: str, free: Free | None, values: Mapping[str, float],
+    name: str | None,
+) -> Model:  # fmt: skip
+    """Return the model of an FMU whose equations are asked for."""
+    read = read_variables(fmu, free, values)
+    imported = imported_of(fmu, digest, read.selected, _sizes(read))
+    declared = {n: p.value for n, p in zip(read.selected.parameters, read.parameters, strict=True)}
     try:
         with imported.initialised(declared) as instance:
             starts = instance.vector("GetContinuousStates", len(read.states)).tolist()
     except PsaError as error:
+        if str(error) == TIME_EVENT:
+            raise _TimeEventError from error
         raise InputError(f"{fmu.path}: cannot be initialised ({error}); check `values`.") from error
-    model = compose([component], name=own)
+    equations = _FmuEquations(imported, read, _definitions(imported, read))
+    model = compose(
+        [_component(fmu, read, equations, imported.foreign, name)], name=_own(fmu, name)
+    )
     return model.with_starts(dict(zip((s.name for s in read.states), starts, strict=True)))
 
 
@@ -270,7 +375,10 @@ def component_again(
             f" {len(parameters)} declared; declare each."
         )
     free = dict(zip(used.parameters, parameters, strict=True))
-    return fmu_model(file, free=free, values=used.values, name=name).components[0]
+    chosen = fmu_model(
+        file, free=free, values=used.values, name=name, interface=used.interface or None
+    )
+    return chosen.components[0]
 
 
 def _sizes(read: Read) -> tuple[float, ...]:

@@ -25,6 +25,8 @@ from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError, Instan
 from psa_casadi.simulation.compiler import shared_library
 
 _PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))
+#: What is said of an FMU with events at times.
+TIME_EVENT = "the FMU announces an event at a time of its own"
 #: As often an FMU may ask for another update of its discrete states after initialization.
 _UPDATES = 100
 #: Functions of `psa_imported` by version: name of a field, name in the standard.
@@ -149,7 +151,7 @@ class Imported:
             if not again:
                 break
         if instance.next_event_time is not None:
-            raise FmuError("the FMU announces an event at a time of its own")
+            raise FmuError(TIME_EVENT)
         instance.require("EnterContinuousTimeMode")
         return instance
 

@@ -1,0 +1,285 @@
+"""An FMU as a whole in the middle of a model: only what goes in and what comes out is known.
+
+    u -- effects of inputs --> applied u -- FMU(p) --> y -- effects of outputs --> shown y
+
+Effects are CasADi's as everywhere, with exact derivatives. Those of the FMU by its parameters, and
+by those of effects at its inputs, are differences of whole runs, side by side in processes: one run
+for each, and none for effects of outputs. What was run once is not run again.
+"""
+
+import atexit
+import hashlib
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.errors import InputError, MachineError
+from psa_casadi.export.importer.play import Run, play
+from psa_casadi.interruption import raise_if_stopped
+from psa_casadi.model.compose import Model, Structure
+from psa_casadi.model.ports import Opened, ported
+from psa_casadi.processes import Processes
+from psa_casadi.simulation.side_by_side import threads
+from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.stepper import SimulationError, Steps, run
+from psa_casadi.symbolic import in_turn
+from psa_casadi.units import FloatArray
+from psa_casadi.variables import Input, Output
+
+#: Step of a difference over the usual size of a parameter: far above what a solver with a tolerance
+#: of 1e-6 errs by, and small enough for a slope that is right to a thousandth.
+_STEP = 1e-3
+#: Runs that are kept, and how long [s] until it is looked whether the work is to end.
+_KEPT, _LOOK = 512, 0.1
+#: What a model has in the place of an FMU: outputs that are played to it, inputs that it gives.
+_PLAYED, _GIVEN = "played_", "given_"
+
+
+@dataclass(frozen=True)
+class Played:
+    """An FMU that is run as a whole: its file, and its variables in the order of the model's.
+
+    `parameters` are by the model's names; `fixed` are values of further ones.
+    """
+
+    file: str
+    digest: str
+    interface: int
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    parameters: tuple[tuple[str, str], ...]
+    fixed: tuple[tuple[str, float], ...]
+
+    def outputs_of(
+        self, wanted: Sequence[tuple[Mapping[str, float], FloatArray]], t: FloatArray, hold: str
+    ) -> list[FloatArray]:
+        """Return the outputs (n, ny) for values of parameters and inputs (n, nu), by processes.
+
+        Raises SimulationError with what the FMU said.
+        """
+        runs = [
+            Run(
+                self.file, self.digest, self.interface, self.inputs, self.outputs,
+                {**dict(self.fixed), **{n: values[own] for own, n in self.parameters}}, t, u, hold,
+            )
+            for values, u in wanted
+        ]  # fmt: skip
+        return _RUNS.of(runs)
+
+    def run(
+        self, model: Model, t: FloatArray, u: FloatArray, x0: FloatArray, *, rtol: float,
+        hold: str, unknowns: Sequence[str | int], s0: FloatArray | None,
+        outputs: Sequence[str] | None, values: Mapping[str, float] | None = None,
+    ) -> Steps:  # fmt: skip
+        """Run a model with this FMU in it; see `stepper.run`.
+
+        States are those of effects. They begin as far from rest as `x0` is from the rest that
+        `begun` finds without the FMU.
+        """
+        own = dict(values or model.values)
+        inner = inner_of(model).with_values(own)
+        asked = list(model.output_names if outputs is None else outputs)
+        away, names = x0 - begun(model, t, u, {}).x, inner.output_names
+        states = dict(zip(model.state_names, away.tolist(), strict=True))
+        count, given = len(unknowns), [_GIVEN + n for n in model.input_names]
+
+        def around(y: FloatArray, shown: Sequence[str], by: Sequence[str | int]) -> Steps:
+            """Return a run of the effects alone, with outputs (n, ny) of the FMU."""
+            whole = np.hstack([u, y])
+            begin = begun(inner, t, whole, states)
+            columns = [
+                begin.by_parameter[:, inner.parameter_names.index(q)]
+                if isinstance(q, str)
+                else begin.by_start[:, q]
+                for q in by
+            ]
+            slopes = np.array(columns).reshape(len(by), len(x0)).T
+            return run(
+                inner, t, whole, begin.x, rtol=rtol, hold=hold, unknowns=by, s0=slopes,
+                outputs=shown,
+            )  # fmt: skip
+
+        silent = np.zeros((len(t), len(self.outputs)))
+        before = around(silent, given, unknowns)
+        applied = before.y[:, [names.index(n) for n in given]]
+        as_given = bool(np.array_equal(applied, u))
+        moved = [
+            k
+            for k, q in enumerate(unknowns)
+            if q in dict(self.parameters) or np.any(before.sensitivity[:, :, k])
+        ]
+        steps = [_step(inner, unknowns[k], own) for k in moved]
+        wanted = [(own, applied)]
+        for k, h in zip(moved, steps, strict=True):
+            q, by = unknowns[k], before.sensitivity[:, :, k]
+            new = {**own, q: own[q] + h} if isinstance(q, str) else own
+            wanted.append((new, applied + h * by))
+        plain, *others = self.outputs_of(wanted, t, hold if as_given else "linear")
+        found = around(plain, asked, unknowns)
+        rows = [names.index(n) for n in asked]
+        sensitivity = found.sensitivity.copy()
+        for k, h, other in zip(moved, steps, others, strict=True):
+            changed = around(other, asked, ()).y[:, rows]
+            sensitivity[:, :, k] += (changed - found.y[:, rows]) / h
+        every = [names.index(n) for n in model.output_names]
+        return replace(
+            found, y=found.y[:, every], sensitivity=sensitivity.reshape(len(t), len(rows), count)
+        )
+
+
+def _step(model: Model, unknown: str | int, values: Mapping[str, float]) -> float:
+    """Return the step of a difference, away from the nearer bound."""
+    if not isinstance(unknown, str):
+        return _STEP * float(model.state_nominals()[unknown])
+    p, value = model.parameter(unknown), values[unknown]
+    size = _STEP * p.typical(values)
+    return -size if value + size > p.bounds[1] else size
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedEquations:
+    """The equations of an FMU that is run as a whole: none. Its outputs are 0 here."""
+
+    outputs: tuple[str, ...]
+
+    def __call__(self, s: Symbols) -> Equations:
+        """Return the equations."""
+        return Equations(out={n: ca.SX(0) for n in self.outputs})
+
+
+@dataclass(frozen=True, eq=False)
+class _InnerEquations:
+    """Outputs that are played to a model, and the inputs as they are applied."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def __call__(self, s: Symbols) -> Equations:
+        given: dict[str, Expression] = {_GIVEN + n: getattr(s, n) for n in self.inputs}
+        shown = {n: getattr(s, _PLAYED + n) for n in self.outputs}
+        return Equations(out={**shown, **given})
+
+
+def inner_of(model: Model) -> Model:
+    """Return a model without its FMU, whose outputs are inputs `played_y` instead.
+
+    It has outputs `given_u`: the inputs that the FMU gets. Raises InputError where effects lead
+    from its outputs to its inputs.
+    """
+    inner = model.with_components(_inner(c) if c.played else c for c in model.components)
+    if _loops(inner.structure):
+        raise InputError(
+            "An effect at an input of the FMU depends on an output of it; only effects before it"
+            " and behind it can be simulated."
+        )
+    return inner
+
+
+@cache
+def _inner(component: Component) -> Component:
+    opened = component.equations if isinstance(component.equations, Opened) else None
+    inputs, outputs = component.inputs, component.outputs
+    plain = replace(
+        opened.component if opened else component,
+        equations=_InnerEquations(tuple(i.name for i in inputs), tuple(o.name for o in outputs)),
+        inputs=(*inputs, *(Input(_PLAYED + o.name, o.unit, o.description) for o in outputs)),
+        outputs=(*outputs, *(Output(_GIVEN + i.name, i.unit, i.description) for i in inputs)),
+        foreign=None,
+        played=None,
+    )
+    return ported(plain, frozenset(opened.ports)) if opened else plain
+
+
+@cache
+@in_turn
+def _loops(structure: Structure) -> bool:
+    """Whether what is given to an FMU depends on what is played of it, states in between or not."""
+    played = [i for i in structure.inputs if i.name.startswith(_PLAYED)]
+    reached = ca.vertcat(*(structure.symbols[i.name] for i in played))
+    for _ in structure.states:
+        new = [
+            q
+            for q, rate in zip(ca.vertsplit(structure.x), ca.vertsplit(structure.xdot), strict=True)
+            if ca.depends_on(rate, reached)
+        ]
+        reached = ca.vertcat(reached, *new)
+    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
+    return bool(rows and reached.numel() and ca.depends_on(structure.y[rows], reached))
+
+
+class _Runs:
+    """Runs of FMUs in processes; those that were are kept, and `count` is how many there were."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._kept: OrderedDict[str, FloatArray | str] = OrderedDict()
+        self._processes: Processes | None = None
+        self._lock = threading.Lock()
+
+    def of(self, runs: Iterable[Run]) -> list[FloatArray]:
+        """Return the outputs of runs. Raises SimulationError."""
+        given = list(runs)
+        keys = {_key(r): r for r in given}
+        with self._lock:
+            new = {k: self._submitted(r) for k, r in keys.items() if k not in self._kept}
+            found: dict[str, FloatArray | str] = {k: self._kept[k] for k in keys if k not in new}
+        try:
+            for key, future in new.items():
+                found[key] = _result(future)
+        except KeyboardInterrupt:
+            self.end()
+            raise
+        with self._lock:
+            for key in new:
+                self._kept[key] = found[key]
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        results = [found[_key(r)] for r in given]
+        for result in results:
+            if isinstance(result, str):
+                raise SimulationError(f"The FMU could not be simulated: {result}")
+        return [r for r in results if not isinstance(r, str)]
+
+    def _submitted(self, wanted: Run) -> "Future[Any]":
+        self.count += 1
+        if self._processes is None:
+            self._processes = Processes(threads())
+            atexit.register(self.end)
+        return self._processes.submit(play, wanted)
+
+    def end(self) -> None:
+        """End the processes."""
+        if self._processes is not None:
+            self._processes.end()
+            self._processes = None
+
+
+def _result(future: "Future[Any]") -> FloatArray | str:
+    while True:
+        with suppress(TimeoutError):
+            try:
+                found: FloatArray | str = future.result(timeout=_LOOK)
+                return found if isinstance(found, str) or np.isfinite(found).all() else "not finite"
+            except MachineError as error:
+                return str(error)
+        raise_if_stopped()
+
+
+def _key(of: Run) -> str:
+    told = repr((of.file, of.digest, of.interface, of.inputs, of.outputs, of.values, of.hold))
+    content = hashlib.sha256(told.encode())
+    content.update(np.ascontiguousarray(of.t).tobytes())
+    content.update(np.ascontiguousarray(of.u).tobytes())
+    return content.hexdigest()
+
+
+_RUNS = _Runs()
