@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.importer.fmu_model import fmu_model
     from psa_casadi.export.importer.model_with_fmu import load_model
+    from psa_casadi.export.importer.start_values import save_start_values
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp import export_ssp
     from psa_casadi.faces import diagnose, identify
@@ -147,6 +148,7 @@ _HOMES = {
     "export.modelica.package": "export_modelica",
     "export.ssp": "export_ssp",
     "export.importer.fmu_model": "fmu_model",
+    "export.importer.start_values": "save_start_values",
     "export.check.check": "CheckReport check_fmu",
     "errors": "InputError MachineError PsaError",
 }
@@ -158,7 +160,8 @@ __all__ = [
     "two_clocks", "BASE", "SIMPLIFIED", "COMPONENTS", "EFFECTS", "Component", "Equations",
     "Symbols", "own_effects", "patched_model", "STACKS", "stack_model", "Model", "compose",
     "PARTS", "part_model", "compensator_for", "controller_for", "margins_of", "System", "connect",
-    "nanopositioner", "ode_model", "table", "fmu_model", "Input", "Output", "Parameter",
+    "nanopositioner", "ode_model", "table", "fmu_model",
+    "save_start_values", "Input", "Output", "Parameter",
     "Publication", "State", "load_model", "save_model", "Trajectory", "simulate", "simulate_record",
     "simulate_many", "memory_after", "settled_at", "run", "Identification",
     "identify", "sample", "Posterior", "diagnose", "Diagnosis", "StackDiagnosis",

@@ -157,14 +157,15 @@ class FmuUsed:
 class Foreign:
     """A compiled function `name` that equations call, and its derivative: an imported FMU.
 
-    It has no formula, so that nothing is printed of it. `addresses` returns where the two are in
-    this process; what is compiled of a model calls them there. `fmu` is what they are of. One that
-    is run as a whole (`Component.played`) has no function.
+    It has no formula, so that nothing is printed of it. `place` is its file, `addresses` returns
+    where the two are in this process; what is compiled of a model calls them there. `fmu` is what
+    they are of. One that is run as a whole (`Component.played`) has no function.
     """
 
     name: str
     addresses: Callable[[], tuple[int, int]]
     fmu: FmuUsed
+    place: str = ""
 
 
 @dataclass(frozen=True, eq=False)

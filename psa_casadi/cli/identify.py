@@ -10,7 +10,7 @@ from psa_casadi.cli.failures import kept
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell_written, width, working
+from psa_casadi.cli.screen import show, tell, tell_written, width, working
 from psa_casadi.cli.steps import IDENTIFY
 from psa_casadi.files import atomic_write
 
@@ -43,7 +43,8 @@ def identify(
 
     Options:
         model: MODEL.json whose values the fits start from, or a model of your own.
-        output: MODEL.json to write.
+        output: MODEL.json to write; of an FMU also NAME.fmu, the FMU with these start values, or
+            NAME.ssv, a parameter set of SSP.
         method: How the parameters are found.
         profile: Parameter whose profile likelihood is wanted; may be repeated.
         json: JSON file of parameters and records to write.
@@ -114,6 +115,15 @@ def _refuse_beside_paper(
             given.add(f"--method paper {sentence}")
 
 
+def _save(model: psa.Model, output: Path) -> None:
+    """Write MODEL.json, or start values for what is run elsewhere."""
+    if output.suffix.lower() not in (".fmu", ".ssv"):
+        psa.save_model(model, output)
+        return
+    for said in psa.save_start_values(model, output):
+        tell(f"Note: {said}")
+
+
 def _finish(
     found: "psa.Identification",
     outputs: dict[str, Path | None],
@@ -133,7 +143,7 @@ def _finish(
     done: list[Path] = []
     try:
         if output is not None:
-            psa.save_model(found.model, output)
+            _save(found.model, output)
             done.append(output)
         names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
         profiles = [profile(found.fit, found.experiments, n, progress=progress) for n in names]
@@ -146,7 +156,7 @@ def _finish(
         ended = found.interrupted
     except KeyboardInterrupt:
         if output is not None and output not in done:
-            psa.save_model(found.model, output)
+            _save(found.model, output)
             done.append(output)
         ended = True
     if not ended:

@@ -22,23 +22,32 @@ class Fitting:
     """How a model of one's own is fitted: words of `psa.identify(model, records)`.
 
     Options:
+        fmu: FMU of any tool, in the place of --model.
         free: Parameter of a model of your own to fit, by default all that may be; repeat the option
-            for several.
+            for several. Of an FMU whose description has no bounds for it, with these:
+            NAME=LOW:HIGH.
+        value: Value of a parameter of an FMU in the place of its own, NAME=VALUE, or of an input
+            that no record has; repeat the option for several.
         zeros: Output of a model of your own whose zero is unknown in each record; repeat the option
             for several.
         hold: What the inputs of a model of your own do between samples, by default linear.
         known_start: The records of a model of your own begin at its declared states.
     """
 
+    fmu: Path | None = None
     free: list[str] | None = None
+    value: list[str] | None = None
     zeros: list[str] | None = None
     hold: Literal["linear", "zero"] | None = None
     known_start: bool = False
 
     @property
     def words(self) -> dict[str, Any]:
-        """The words that were given."""
-        return {name: value for name, value in asdict(self).items() if value}
+        """The words that were given, without what says which model it is."""
+        every = {n: v for n, v in asdict(self).items() if v and n not in ("fmu", "value")}
+        if self.free:
+            every["free"] = [text.partition("=")[0] for text in self.free]
+        return every
 
 
 def own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | None:
@@ -46,7 +55,13 @@ def own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | 
 
     A model that cannot be made ends the command.
     """
-    found = None if path is None else _model(given, path)
+    if fitting.fmu is not None and path is not None:
+        given.add("--fmu and --model are both given; leave one of them out.")
+    found = None if (place := fitting.fmu or path) is None else _model(given, place, fitting)
+    if found is None or not found.structure.foreign:
+        bounds = [text for text in fitting.free or () if "=" in text]
+        for text in [*bounds, *(fitting.value or ())]:
+            given.add(f"'{text}' is said of an FMU; add --fmu FILE.fmu.")
     if found is None:
         for name in fitting.words:
             option = name.replace("_", "-")
@@ -54,19 +69,34 @@ def own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | 
     return found
 
 
-def _model(given: Given, path: Path) -> psa.Model | None:
+def _model(given: Given, path: Path, fitting: Fitting) -> psa.Model | None:
     from psa_casadi.simulation.start import is_stack
 
     match = _PYTHON.fullmatch(str(path))
     if match is not None:
         return _made(Path(match["file"]), match["name"] or "")
-    if path.suffix.lower() == ".fmu":
-        return psa.fmu_model(path)
+    if path.suffix.lower() == ".fmu" or fitting.fmu:
+        return _imported(given, path, fitting)
     try:
         model = psa.load_model(path, given.own)
     except InputError:  # which is told where a stack's file is read
         return None
     return None if is_stack(model) else model
+
+
+def _imported(given: Given, path: Path, fitting: Fitting) -> psa.Model | None:
+    """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
+    free: dict[str, tuple[float, float] | None] = {}
+    for text in fitting.free or ():
+        name, equals, bounds = text.partition("=")
+        low, _, high = bounds.partition(":")
+        try:
+            free[name.strip()] = (float(low), float(high)) if equals else None
+        except ValueError:
+            given.add(f"--free is '{text}'; give NAME=LOW:HIGH, such as --free mass=0.1:10.")
+    values = given.numbers("--value", fitting.value)
+    given.check()
+    return psa.fmu_model(path, free=free or None, values=values)
 
 
 def _made(file: Path, name: str) -> psa.Model:

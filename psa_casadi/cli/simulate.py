@@ -1,5 +1,6 @@
 """`psa simulate`: what a model does with its inputs."""
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +22,7 @@ def simulate(
     input_: Path,
     output: Path,
     model: Path | None = None,
+    fmu: Path | None = None,
     stack: StackName = None,
     value: list[str] | None = None,
     start: list[str] | None = None,
@@ -41,6 +43,7 @@ def simulate(
         input_: Record with time and voltage, and load_force if any; with the inputs of a model of
             your own by their names.
         output: CSV to write.
+        fmu: FMU of any tool, in the place of --model.
         value: Parameter in place of the model's, NAME=VALUE in SI units; repeat for several.
         start: Start of a state, NAME=VALUE in SI units; repeat for several.
         hold: What the inputs do between samples.
@@ -55,10 +58,18 @@ def simulate(
     from psa_casadi.files import atomic_path
     from psa_casadi.report.plots.figures import DPI, columns_figure, picture_format
 
-    given.outputs({"--output": output, "--figure": figure}, [model, input_])
-    chosen, record = _read(given, model, stack, input_, begin, reading)
+    given.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
+    if fmu is None and model is not None and model.suffix.lower() == ".fmu":
+        model, fmu = None, model
+    own = partial(own_model, given, model, Fitting())
+    if fmu is not None:
+        numbers = given.numbers("--value", value)
+        own = partial(given.attempt, partial(psa.fmu_model, fmu, free={}, values=numbers))
+        given.refuse({"--model": model})
+    chosen, record = _read(given, own, model, stack, input_, begin, reading)
     turns = given.turns(begin.history)
-    values, starts = given.numbers("--value", value), given.numbers("--start", start)
+    values = {} if fmu else given.numbers("--value", value)
+    starts = given.numbers("--start", start)
     if chosen is not None:
         chosen = given.attempt(partial(_begun, chosen, values, starts))
     chosen, record = given.ready(chosen), given.ready(record)
@@ -88,6 +99,7 @@ def simulate(
 
 def _read(
     given: Given,
+    own_or_none: "Callable[[], psa.Model | None]",
     model: Path | None,
     stack: str | None,
     input_: Path,
@@ -97,7 +109,7 @@ def _read(
     """Return the model and the record of its inputs, `Signals` where it is no stack's."""
     from psa_casadi.identification.experiments import in_units
 
-    chosen = own_model(given, model, Fitting())
+    chosen = own_or_none()
     if chosen is not None:
         own, problems = chosen, Problems()
         voltage = begin.start_voltage is not None

@@ -93,7 +93,7 @@ def diagnose_ode(
     shifted = known_zeros(model, zeros)
 
     def made(length: int | None) -> tuple[Experiment, ...]:
-        parts = cut(given, length), cut(held, length)
+        parts = cut(model, given, length), cut(model, held, length)
         return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
 
     known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]

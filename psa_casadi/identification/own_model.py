@@ -60,7 +60,7 @@ def identify_ode(
     *_, (best, runs, outcomes, said) = ways(
         model, given,
         lambda length: experiments_of(
-            model, cut(given, length), judged=False, zeros=shifted, known_start=known_start
+            model, cut(model, given, length), judged=False, zeros=shifted, known_start=known_start
         ),
         free_of(model, free), undecided=undecided(records, hold), starts=starts, progress=progress,
     )  # fmt: skip

@@ -6,6 +6,10 @@ Each part begins with a state of its own, which is estimated with the parameters
 advances in parameter identification techniques for ODE, 1983). Short parts are fitted from several
 starts; then two become one, with the state that the first began with, as long as the model follows
 them. Where it follows the whole records so, they are whole again, from a better start.
+
+An FMU that is run as a whole begins in one state only: of it, records are fitted from their
+beginning on, a part first, and then twice as much. Where the declared values lead to a fit that
+follows the records, no others are tried, as each run is dear.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,8 +35,8 @@ from psa_casadi.units import FloatArray
 #: A model follows an output where it misses less than this share of its standard deviation; one
 #: that forgets its start is not lost where it comes so near; beyond the last it shows nothing.
 _FOLLOWED, NEAR, _LOST = 0.05, 0.5, 0.7
-#: Samples of a part at least, and parts at most.
-_FEWEST, _MOST = 16, 128
+#: Samples of a part at least, and parts at most; of what begins once, the first over the whole.
+_FEWEST, _MOST, _LEAST = 16, 128, 32
 #: Lengths of short parts that are tried, over the shortest.
 _SHORT = (4, 2, 1)
 #: A model forgets where its outputs depend on the first states less than this at the end, over how
@@ -66,23 +70,23 @@ def ways(
     nor parts can be simulated.
     """
     runs, lost, usable = made(None), None, False
+    from_several = 1 if begins_once(model) else starts
     try:
         best, whole, outcomes = search_starts(
-            sized(model, runs), runs, free, starts=starts, progress=progress
+            sized(model, runs), runs, free, starts=from_several, progress=progress
         )
     except SimulationError as error:
         lost = error
     else:
-        whole_only = model.structure.played is not None  # it begins in one state
-        done = best.interrupted or whole_only or settled(best, whole)
+        done = best.interrupted or settled(best, whole)
         usable = done or (follows(best, whole, _LOST) and not _grows(best, whole))
         if usable:
             yield _as_read(best, whole, outcomes, undecided)
         if done:
             return
-    if model.structure.played is not None and lost:
-        raise lost
     progress("fitting parts of the records")
+    if begins_once(model) and lost is None and follows(best, whole, NEAR):
+        starts = 1
     found = _in_parts(model, given, made, free, undecided, starts, progress)
     if found is not None and (lost or len(found[1]) > len(whole) or _nearer(found[0], best)):
         yield found
@@ -140,7 +144,7 @@ def _in_parts(
         best, parts, lambda n: read_like(made(n), hold, said), length, max(s.n for s in given)
     )
     if reached is not None:
-        if forgets(best, parts):
+        if begins_once(model) or forgets(best, parts):
             return None
         lasts = reached * float(np.median([s.sample_time for s in given]))
         said = (*said, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
@@ -152,7 +156,8 @@ def _shortest(
     progress: Progress,
 ) -> tuple[tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]], int] | None:  # fmt: skip
     """Return the search in short parts, shorter ones where a model does not follow, and samples."""
-    finest = max(_FEWEST, -(-sum(s.n for s in given) // _MOST))
+    most = _LEAST if begins_once(model) else _MOST
+    finest = max(_FEWEST, -(-sum(s.n for s in given) // most))
     for length in (k * finest for k in _SHORT):
         if 2 * length > max(s.n for s in given):
             continue
@@ -188,10 +193,20 @@ def _longest(
     return best, parts, reached
 
 
-def cut(given: Sequence[Signals], length: int | None) -> list[Signals]:
-    """Return records in parts of so many samples, the last one of up to half of them more."""
+def begins_once(model: Model) -> bool:
+    """Whether a model can begin in one state only, as an FMU that is run as a whole."""
+    return model.structure.played is not None
+
+
+def cut(model: Model, given: Sequence[Signals], length: int | None) -> list[Signals]:
+    """Return records in parts of so many samples, the last one of up to half of them more.
+
+    Only the first part of each for a model that begins once.
+    """
     if length is None:
         return list(given)
+    if begins_once(model):
+        return [s.slice(0, min(length, s.n)) for s in given]
     found = []
     for s in given:
         begins = [a for a in range(0, s.n, length) if not a or a <= s.n - length // 2]

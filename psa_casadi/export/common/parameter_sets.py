@@ -58,13 +58,15 @@ def parameter_rows(model: Model, values: Mapping[str, float] | None = None) -> l
 
 
 def set_text(name: str, rows: Sequence[Row]) -> str:
-    """Return a parameter set (SSV), with the definitions of its units."""
+    """Return a parameter set (SSV), with the definitions of its units; a row may have none, ""."""
     return xml_text(
         "parameters.xml",
         name=name,
         tool=generation_tool(),
-        rows=[(title, meaning, number(value), unit) for title, meaning, value, unit in rows],
-        units={unit: base_unit(parse_unit(unit)) for unit in sorted({unit for *_, unit in rows})},
+        rows=[
+            (title, meaning, number(value), unit or None) for title, meaning, value, unit in rows
+        ],
+        units={u: base_unit(parse_unit(u)) for u in sorted({unit for *_, unit in rows if unit})},
     )
 
 

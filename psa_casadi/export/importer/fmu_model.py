@@ -29,7 +29,7 @@ from psa_casadi.units import parse_unit
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 
 #: What `free` may be: names, or names with bounds or whole declarations.
-Free = Sequence[str] | Mapping[str, tuple[float, float] | Parameter]
+Free = Sequence[str] | Mapping[str, tuple[float, float] | Parameter | None]
 #: A range whose ends differ by this factor is searched on a logarithmic scale.
 _DECADE = 10.0
 _REALS = ("Real", "Float64")
@@ -149,9 +149,14 @@ def _free(
     bounded = {n for n in own if math.isfinite(math.hypot(*limits[n]))}
     if free is None:
         if not bounded:
+            every = {n: _start(fmu, n) for n in fmu.elements if n in own}
+            listed = ", ".join(f"{n} ({v:g})" for n, v in every.items()) or "none"
+            name, v = next(iter(every.items()), ("k", 1.0))
+            low, high = sorted((0.1 * v, 10.0 * v)) if v else (-1.0, 1.0)
             problems.add(
-                f"No parameter of {fmu.path.name} has a least and a greatest value; name those to"
-                f" identify with bounds, free={{name: (low, high)}}; it has {quoted(sorted(own))}."
+                f"{fmu.path.name} declares no bounds for its parameters: {listed}. Say which to"
+                f" identify within which bounds: free={{'{name}': ({low:g}, {high:g})}}, on the"
+                f" command line --free {name}={low:g}:{high:g}."
             )
         return {n: limits[n] for n in fmu.elements if n in bounded}
     given = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
@@ -160,11 +165,12 @@ def _free(
         if name not in own:
             problems.add(
                 f"`free` has '{name}', which is no real parameter of {fmu.path.name}; it has"
-                f" {quoted(sorted(own))}."
+                f" {quoted(sorted(own)) or 'none'}."
             )
         elif bounds is None and name not in bounded:
             problems.add(
-                f"'{name}' has no bounds in {fmu.path.name}; give {{'{name}': (low, high)}}."
+                f"'{name}' has no bounds in {fmu.path.name}; give {{'{name}': (low, high)}}, on the"
+                f" command line --free {name}=LOW:HIGH."
             )
         else:
             found[name] = limits[name] if bounds is None else bounds
@@ -283,10 +289,10 @@ def fmu_model(
     s, own = read.selected, [p.name for p in read.parameters]
     played = Played(
         str(file.resolve()), digest, chosen, s.inputs, s.outputs,
-        tuple(zip(own, s.parameters, strict=True)), s.fixed,
+        tuple(zip(own, s.parameters, strict=True)), s.fixed, fmu.has_events(),
     )  # fmt: skip
     used = FmuUsed(file.name, digest, s.parameters, dict(s.fixed), _NAMES[chosen])
-    foreign = Foreign(f"fmu_{digest[:16]}", _no_function, used)
+    foreign = Foreign(f"fmu_{digest[:16]}", _no_function, used, str(file.resolve()))
     equations = PlayedEquations(tuple(o.name for o in read.outputs))
     return compose([_component(fmu, read, equations, foreign, name, played)], name=_own(fmu, name))
 

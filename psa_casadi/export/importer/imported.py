@@ -122,7 +122,7 @@ class Imported:
         """What a component declares of it."""
         s, file = self.selected, Path(self.fmu.path)
         used = FmuUsed(file.name, self.digest, s.parameters, dict(s.fixed))
-        return Foreign(self.name, self._addresses, used)
+        return Foreign(self.name, self._addresses, used, str(file))
 
     def _addresses(self) -> tuple[int, int]:  # a method, as it is pickled
         names = (self.name, f"fwd1_{self.name}")

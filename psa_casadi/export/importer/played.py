@@ -28,6 +28,7 @@ from psa_casadi.interruption import raise_if_stopped
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.model.ports import Opened, ported
 from psa_casadi.processes import Processes
+from psa_casadi.simulation.exact.split import closure, dependence
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.start import begun
 from psa_casadi.simulation.stepper import SimulationError, Steps, run
@@ -48,7 +49,9 @@ _PLAYED, _GIVEN = "played_", "given_"
 class Played:
     """An FMU that is run as a whole: its file, and its variables in the order of the model's.
 
-    `parameters` are by the model's names; `fixed` are values of further ones.
+    `parameters` are by the model's names; `fixed` are values of further ones. Outputs of one that
+    `jumps` at events may be discontinuous: its slopes are the lesser of a difference to either
+    side, as one across a jump is none.
     """
 
     file: str
@@ -58,6 +61,7 @@ class Played:
     outputs: tuple[str, ...]
     parameters: tuple[tuple[str, str], ...]
     fixed: tuple[tuple[str, float], ...]
+    jumps: bool = False
 
     def outputs_of(
         self, wanted: Sequence[tuple[Mapping[str, float], FloatArray]], t: FloatArray, hold: str
@@ -117,23 +121,36 @@ class Played:
             for k, q in enumerate(unknowns)
             if q in dict(self.parameters) or np.any(before.sensitivity[:, :, k])
         ]
-        steps = [_step(inner, unknowns[k], own) for k in moved]
+        changes = [
+            (k, side * _step(inner, unknowns[k], own))
+            for side in ((1, -1) if self.jumps else (1,))
+            for k in moved
+        ]
         wanted = [(own, applied)]
-        for k, h in zip(moved, steps, strict=True):
+        for k, h in changes:
             q, by = unknowns[k], before.sensitivity[:, :, k]
             new = {**own, q: own[q] + h} if isinstance(q, str) else own
             wanted.append((new, applied + h * by))
         plain, *others = self.outputs_of(wanted, t, hold if as_given else "linear")
         found = around(plain, asked, unknowns)
         rows = [names.index(n) for n in asked]
+        slopes: dict[int, FloatArray] = {}
+        for (k, h), other in zip(changes, others, strict=True):
+            new_one = (around(other, asked, ()).y[:, rows] - found.y[:, rows]) / h
+            slopes[k] = _lesser(slopes.get(k, new_one), new_one)
         sensitivity = found.sensitivity.copy()
-        for k, h, other in zip(moved, steps, others, strict=True):
-            changed = around(other, asked, ()).y[:, rows]
-            sensitivity[:, :, k] += (changed - found.y[:, rows]) / h
+        for k, slope in slopes.items():
+            sensitivity[:, :, k] += slope
         every = [names.index(n) for n in model.output_names]
         return replace(
             found, y=found.y[:, every], sensitivity=sensitivity.reshape(len(t), len(rows), count)
         )
+
+
+def _lesser(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return what is nearer to 0, and 0 where the signs differ."""
+    nearer = np.where(np.abs(one) < np.abs(other), one, other)
+    return np.where(one * other > 0, nearer, 0.0)
 
 
 def _step(model: Model, unknown: str | int, values: Mapping[str, float]) -> float:
@@ -203,15 +220,14 @@ def _inner(component: Component) -> Component:
 @in_turn
 def _loops(structure: Structure) -> bool:
     """Whether what is given to an FMU depends on what is played of it, states in between or not."""
-    played = [i for i in structure.inputs if i.name.startswith(_PLAYED)]
-    reached = ca.vertcat(*(structure.symbols[i.name] for i in played))
-    for _ in structure.states:
-        new = [
-            q
-            for q, rate in zip(ca.vertsplit(structure.x), ca.vertsplit(structure.xdot), strict=True)
-            if ca.depends_on(rate, reached)
-        ]
-        reached = ca.vertcat(reached, *new)
+    reach = closure(dependence(structure.xdot, structure.x))
+    played = ca.vertcat(
+        ca.SX(0, 1),
+        *(structure.symbols[i.name] for i in structure.inputs if i.name.startswith(_PLAYED)),
+    )
+    hit = [k for k, rate in enumerate(ca.vertsplit(structure.xdot)) if ca.depends_on(rate, played)]
+    behind = [k for k in range(structure.x.numel()) if any(k == j or reach[k, j] for j in hit)]
+    reached = ca.vertcat(played, structure.x[behind])
     rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
     return bool(rows and reached.numel() and ca.depends_on(structure.y[rows], reached))
 

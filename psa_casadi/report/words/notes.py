@@ -370,6 +370,10 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
         f" by {nats:.0f}), which the fit uses. Smooth them in your own simulation as well."
     ),
     # the fit
+    "starts_in_binary": lambda names: (
+        f"The binary of the FMU starts {', '.join(names)} at its own values: an importer must set"
+        " the start values of the description (fmpy: apply_default_start_values=True)."
+    ),
     "in_parts": lambda parts, lasts: (
         f"The records are fitted in {parts} parts of {quantity(*lasts)}, each with a state of its"
         " own to begin with. What the model misses at the beginning of a whole record grows or"
