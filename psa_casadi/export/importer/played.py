@@ -77,7 +77,7 @@ class Played:
             )
             for values, u in wanted
         ]  # fmt: skip
-        return _RUNS.of(runs)
+        return RUNS.of(runs)
 
     def run(
         self, model: Model, t: FloatArray, u: FloatArray, x0: FloatArray, *, rtol: float,
@@ -272,6 +272,10 @@ class _Runs:
             atexit.register(self.end)
         return self._processes.submit(play, wanted)
 
+    def forget(self) -> None:
+        """Forget the runs that were."""
+        self._kept.clear()
+
     def end(self) -> None:
         """End the processes."""
         if self._processes is not None:
@@ -298,4 +302,4 @@ def _key(of: Run) -> str:
     return content.hexdigest()
 
 
-_RUNS = _Runs()
+RUNS = _Runs()

@@ -1,0 +1,59 @@
+"""FMUs of other tools, made here: PythonFMU (FMI 2) and PythonFMU3 (FMI 3), co-simulation only."""
+
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from pythonfmu.builder import FmuBuilder as Builder2
+from pythonfmu3.builder import FmuBuilder as Builder3
+from scipy.integrate import solve_ivp
+
+from psa_casadi.units import FloatArray
+
+_FOLDER = tempfile.TemporaryDirectory()
+_SUPPLIERS = Path(__file__).with_name("suppliers")
+TIMES = np.linspace(0.0, 100.0, 501)
+INFLOW = 0.02 * (1.0 + np.sin(TIMES / 8.0) + 0.8 * np.sin(TIMES / 3.0))
+
+
+@cache
+def supplied(name: str) -> Path:
+    """Return the FMU of a file of suppliers/: `tank` (FMI 2) or `ball` (FMI 3)."""
+    build = (Builder2 if name == "tank" else Builder3).build_FMU
+    made: Path = build(_SUPPLIERS / f"{name}.py", dest=_FOLDER.name)
+    return made
+
+
+def level(area: float, outlet: float, flow: FloatArray = INFLOW) -> FloatArray:
+    """Return the level of the supplier's tank with an open valve, by SciPy."""
+
+    def rate(t: float, h: FloatArray) -> FloatArray:
+        given = float(np.interp(t, TIMES, flow))
+        return (given - outlet * np.sqrt(np.maximum(0.0, 19.62 * h))) / area
+
+    found = solve_ivp(rate, (0.0, 100.0), [0.2], t_eval=TIMES, rtol=1e-9, max_step=0.2)
+    return np.asarray(found.y[0])
+
+
+def lagged(y: FloatArray, time: float) -> FloatArray:
+    """Return what a sensor with a lag shows of an output at `TIMES`."""
+
+    def rate(t: float, z: FloatArray) -> FloatArray:
+        return (float(np.interp(t, TIMES, y)) - z) / time
+
+    found = solve_ivp(rate, (0.0, 100.0), y[:1], t_eval=TIMES, rtol=1e-8, max_step=0.2)
+    return np.asarray(found.y[0])
+
+
+def bounces(g: float, e: float, times: FloatArray) -> FloatArray:
+    """Return the height of a ball dropped from 1 m, from the sum of its flights."""
+    begins, lasts = 0.0, np.sqrt(2.0 / g)
+    first = np.where(times < lasts, 1.0 - 0.5 * g * times**2, 0.0)
+    begins, speed = lasts, e * np.sqrt(2.0 * g)
+    found = first
+    while speed > 1e-3:
+        at, lasts = times - begins, 2.0 * speed / g
+        found = np.where((at >= 0) & (at < lasts), speed * at - 0.5 * g * at**2, found)
+        begins, speed = begins + lasts, e * speed
+    return np.asarray(found)

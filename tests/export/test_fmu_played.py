@@ -1,0 +1,212 @@
+"""FMUs that are run as a whole: co-simulation only, events, arrays; effects around them."""
+
+import zipfile
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import casadi as ca
+import fmpy
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.diagnosis.generic.attached import extended
+from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.fmu_model import FmuInterface
+from psa_casadi.export.importer.play import communication_points
+from psa_casadi.export.importer.played import RUNS
+from psa_casadi.simulation.sizes import Sizes
+from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.stepper import SimulationError
+from psa_casadi.units import FloatArray
+from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, supplied
+from tests.export.test_fmu_model import pendulum
+
+T = np.linspace(0.0, 20.0, 401)
+U = np.column_stack([np.sin(T) + 0.4 * np.sin(3.1 * T)])
+ALL = Sizes({"u": 1.4, "y": 1.0, "x": 1.0}, {"x": 2.0}, 0.05, 20.0)
+AREA = {"area": (0.05, 4.0)}
+
+
+def _own() -> psa.Model:
+    x, u, k = (ca.SX.sym(n) for n in ("x", "u", "k"))
+    k_ = psa.Parameter("k", 1.3, "1/s", (0.1, 30.0), "rate", log=True)
+    return psa.ode_model(
+        {"x": x, "u": u, "p": k, "ode": k * (u - x), "y": x}, name="own", parameters=[k_],
+        outputs=["y"],
+    )  # fmt: skip
+
+
+def _record(area: float, outlet: float, shown: FloatArray | None = None) -> dict[str, FloatArray]:
+    """Return what is measured of a tank; nothing of its equations is the FMU's."""
+    y = level(area, outlet) if shown is None else shown
+    noise = 1e-3 * np.random.default_rng(5).standard_normal(len(TIMES))
+    return {"time": TIMES, "inflow": INFLOW, "level": y + noise}
+
+
+def test_effects_around_a_whole_fmu_are_those_of_the_equations(tmp_path: Path) -> None:
+    names = ("lag_of_u", "bend_of_u", "lag_of_y", "gain_of_y", "delay_of_y")
+    values = {
+        "k": 1.7, "lag_of_u_time": 0.3, "bend_of_u_size": 0.2, "lag_of_y_time": 0.4,
+        "gain_of_y_size": 0.1, "delay_of_y_time": 0.2,
+    }  # fmt: skip
+    own = _own()
+    whole = psa.fmu_model(
+        psa.export_fmu(own, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
+    )
+    table = {e.name: e for e in effects_of(whole, ALL)}
+    found = []
+    for base in (own, whole):
+        model = extended(base, [table[n] for n in names]).with_values(values)
+        free = ["k", *(n for n in values if n != "k")]
+        start = begun(model, T, U, {})
+        s0 = start.by_parameter[:, [model.parameter_names.index(n) for n in free]]
+        steps = psa.run(model, T, U, start.x, rtol=1e-8, unknowns=free, s0=s0, outputs=["y"])
+        found.append((steps.y[:, 0], steps.sensitivity[:, 0]))
+    (y, slopes), (y_whole, slopes_whole) = found
+    assert np.max(np.abs(y_whole - y)) < 1e-3 * np.ptp(y)
+    for n, one, other in zip(free, slopes.T, slopes_whole.T, strict=True):
+        assert np.max(np.abs(one - other)) < 0.01 * np.max(np.abs(one)), n
+
+
+def test_a_run_is_nearer_to_the_truth_than_an_importer_s() -> None:
+    model = psa.fmu_model(supplied("tank"), free=AREA, values={"valve": 1.0})
+    y = psa.run(model, TIMES, INFLOW[:, None], np.zeros(0)).y[:, 0]
+    rows = list(zip(TIMES, INFLOW, strict=True))
+    peer = fmpy.simulate_fmu(
+        str(supplied("tank")), stop_time=100.0, output_interval=0.2, start_values={"valve": True},
+        input=np.array(rows, dtype=[("time", float), ("inflow", float)]), output=["level"],
+        validate=False,
+    )["level"]  # fmt: skip
+    truth = level(0.5, 0.01)
+    errors = [np.max(np.abs(shown - truth)) for shown in (y, peer)]
+    assert errors[0] < 1e-4 * np.ptp(truth)
+    assert errors[1] > 30 * errors[0]  # it holds the input at its value before the step
+
+
+def test_a_supplier_s_parameters_are_identified_in_few_runs() -> None:
+    RUNS.forget()
+    before = RUNS.count
+    model = psa.fmu_model(
+        supplied("tank"), free={**AREA, "outlet": (1e-3, 0.1)}, values={"valve": 1.0}
+    )
+    found = psa.identify(model, _record(0.7, 0.012))
+    for name, true in (("area", 0.7), ("outlet", 0.012)):
+        assert abs(found.model.values[name] - true) < 4 * found.errors[name]
+    assert RUNS.count - before < 80
+
+
+def test_a_ball_is_followed_from_its_first_bounce_on() -> None:
+    times = np.linspace(0.0, 3.0, 301)
+    h = bounces(9.0, 0.8, times) + 2e-3 * np.random.default_rng(1).standard_normal(301)
+    model = psa.fmu_model(supplied("ball"), free={"g": (5.0, 20.0), "e": (0.4, 0.95)})
+    found = psa.identify(model, {"time": times, "h": h})
+    assert found.rms["h"] == pytest.approx(2e-3, rel=0.15)
+    for name, true in (("g", 9.0), ("e", 0.8)):
+        assert abs(found.model.values[name] - true) < 4 * found.errors[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", ["lag", "gain", "nothing"])
+def test_what_hides_around_a_supplier_s_fmu_is_named(hidden: str) -> None:
+    flow = INFLOW * (0.88 if hidden == "gain" else 1.0)
+    shown = level(0.5, 0.012, flow)
+    record = _record(0.5, 0.012, lagged(shown, 3.0) if hidden == "lag" else shown)
+    model = psa.fmu_model(supplied("tank"), free={"outlet": (1e-3, 0.1)}, values={"valve": 1.0})
+    d = psa.diagnose(model, record)
+    expected = {"lag": ["lag_of_level"], "gain": ["gain_of_inflow"], "nothing": []}[hidden]
+    assert [c.effect for c in d.causes] == expected
+    assert d.verdict == ("cause_named" if expected else "adequate")
+
+
+def test_events_of_model_exchange_are_those_of_its_solver(tmp_path: Path) -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    k = ca.SX.sym("k")
+    ode = {"x": x, "u": u, "p": k, "ode": ca.if_else(u > 0.3, k, -0.2 * k), "zero": u - 0.3, "y": x}
+    k_ = psa.Parameter("k", 1.0, "1/s", (0.1, 9.0), "rate")
+    own = psa.ode_model(ode, name="switched", parameters=[k_], outputs=["y"])
+    path = psa.export_fmu(own, tmp_path / "switched.fmu", fmi=3)
+    # a step of co-simulation has one value of the input, and so begins or ends at the event
+    ways: list[tuple[FmuInterface, float]] = [("model exchange", 1e-4), ("co-simulation", 0.02)]
+    for interface, most in ways:
+        there = psa.fmu_model(path, free=["k"], interface=interface)
+        assert not there.state_names
+        found = psa.run(there, T, U, np.zeros(0), unknowns=["k"], outputs=["y"])
+        exact = psa.run(own, T, U, np.zeros(1), rtol=1e-9, unknowns=["k"], outputs=["y"])
+        assert found.y == pytest.approx(exact.y, abs=most)
+        assert found.sensitivity == pytest.approx(exact.sensitivity, abs=most)
+
+
+def test_an_fmu_of_which_one_instance_lives_is_run_as_a_whole() -> None:
+    with pytest.raises(psa.InputError, match=r"has no co-simulation, only 'model exchange'"):
+        psa.fmu_model(pendulum(once="true"), interface="co-simulation")
+    model = psa.fmu_model(pendulum(once="true"), free={"length": (0.1, 5.0)})
+    torque = np.zeros((50, 1))
+    y = psa.run(model, T[:50], torque, np.zeros(0)).y
+    smooth = psa.fmu_model(pendulum(), free={"length": (0.1, 5.0)})
+    assert y == pytest.approx(psa.run(smooth, T[:50], torque, np.array([0.1, 0.0])).y, abs=5e-5)
+
+
+def test_communication_points_are_what_the_fmu_takes(tmp_path: Path) -> None:
+    path = psa.export_fmu(_own(), tmp_path / "own.fmu")
+    uneven = np.array([0.0, 0.1, 0.25, 0.3])
+    with Fmu(path) as fmu:
+        co = fmu.description.coSimulation
+        fmu.description.defaultExperiment.stepSize = "0.05"
+        points = communication_points(fmu, uneven)
+        assert points == pytest.approx([0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3])
+        assert set(uneven) <= set(points)
+        co.canHandleVariableCommunicationStepSize = False
+        assert np.ptp(np.diff(communication_points(fmu, uneven))) < 1e-12
+        co.fixedInternalStepSize = "0.04"
+        points = communication_points(fmu, uneven)
+        assert points[-1] >= 0.3
+        assert np.diff(points) == pytest.approx(0.08)
+
+
+def test_a_model_says_what_it_lacks() -> None:
+    tank = supplied("tank")
+    with pytest.raises(psa.InputError, match=r"area \(0\.5\), outlet \(0\.01\)\. .*area=0\.05:5\."):
+        psa.fmu_model(tank)
+    model = psa.fmu_model(tank, free=AREA)
+    assert (model.input_names, model.output_names) == (("inflow", "valve"), ("level",))
+    whole = model.with_components(model.components)
+    assert whole.structure.played == model.structure.played
+    with pytest.raises(SimulationError, match=r"ended \(exit code 3\)"):
+        psa.run(
+            psa.fmu_model(tank, free={"area": (0.05, 9.0)}).with_values({"area": 6.0}), TIMES[:9],
+            np.ones((9, 2)), np.zeros(0),
+        )  # fmt: skip
+
+
+def test_the_commands_take_it_and_write_start_values(tmp_path: Path) -> None:
+    table = np.column_stack(list(_record(0.7, 0.01).values()))
+    record = tmp_path / "tank.csv"
+    np.savetxt(record, table, delimiter=",", header="time,inflow,level", comments="")
+
+    def typed(*words: object) -> str:
+        result = CliRunner().invoke(app, [str(w) for w in words])
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    of = ["--fmu", supplied("tank"), "--value", "valve=1"]
+    out = tmp_path / "out.csv"
+    typed("simulate", *of, "--value", "area=0.7", "--input", record, "-o", out)
+    shown = np.loadtxt(out, delimiter=",", skiprows=1)[:, 2]
+    assert shown == pytest.approx(level(0.7, 0.01), abs=1e-3)
+    for name in ("fit.fmu", "fit.ssv", "fit.json"):
+        said = typed("identify", *of, record, "--free", "area=0.05:4", "-o", tmp_path / name)
+        assert ("an importer must set the start values" in said) == (name == "fit.fmu")
+    with zipfile.ZipFile(tmp_path / "fit.fmu") as archive:
+        root = ET.fromstring(archive.read("modelDescription.xml"))
+    starts = {v.get("name"): v[0].get("start") for v in root.iterfind("ModelVariables/*")}
+    value = psa.load_model(tmp_path / "fit.json", fmu=supplied("tank")).values["area"]
+    assert float(str(starts["area"])) == pytest.approx(value)
+    assert value == pytest.approx(0.7, rel=0.01)
+    rows = ET.parse(tmp_path / "fit.ssv").getroot().findall(".//{*}Parameter")
+    assert [(r.get("name"), r[0].get("unit")) for r in rows] == [("area", None)]
+    bad = CliRunner().invoke(app, ["identify", "--free", "area=1:2", str(record)])
+    assert "add --fmu FILE.fmu" in bad.output
