@@ -250,19 +250,20 @@ def fmu_model(
     derivatives where it has them, else central differences; those by p are central differences of
     instances initialised with other values. The states start where the FMU starts.
 
-    Any other one is run as a whole, in processes of its own: by co-simulation, or by model exchange
-    with its events (fmpy's CVode) where it has no other interface. Its inputs and outputs are the
-    ports; derivatives are differences of runs, side by side, 0.1 % of a parameter apart. It begins
-    in its start values at the beginning of each record. Between communication points, which are the
-    samples or closer, an input is a straight line where the FMU takes input derivatives, else its
-    mean over the step. Numbers of every type are inputs and outputs, elements of arrays too.
+    Any other one is run as a whole, in processes of its own: by model exchange with its events
+    (fmpy's CVode), or by co-simulation where it has no other interface. Its inputs and outputs are
+    the ports; derivatives are differences of runs, side by side, 0.1 % of a parameter apart. It
+    begins in its start values at the beginning of each record. Between communication points, which
+    are the samples or closer, an input is a straight line where the FMU takes input derivatives,
+    else its mean over the step. Numbers of every type are inputs and outputs, elements of arrays
+    too.
 
     `free` says which parameters are identified: {name: (low, high)}, {name: Parameter}, or names
     whose least and greatest values the FMU declares; by default all parameters that have both. Of
     one run as a whole, start values of its variables can be named, too. A range of a decade or more
     above 0 is searched on a logarithmic scale. `values` are numbers of parameters in the place of
     the FMU's, and of inputs that no record has, which stay there. `interface` is "model exchange"
-    or "co-simulation", by default the first one if it has no events, else the second.
+    or "co-simulation", by default the first one if it has that.
 
     Inputs, outputs and their names are those of the FMU, its units are kept where they are SI
     units, else they are "1"; nothing is converted. A name that is no identifier is written with
@@ -299,12 +300,11 @@ def fmu_model(
 
 def _interface(fmu: Fmu, wanted: FmuInterface | None) -> int:
     """Return how an FMU is run as a whole. Raises InputError."""
-    there = [_NAMES[k] for k in fmu.interfaces()]
+    there = [_NAMES[k] for k in sorted(fmu.interfaces())]  # model exchange first
     if wanted is not None and wanted not in there:
         raise InputError(f"{fmu.path.name} has no {wanted}, only {quoted(there)}; choose that.")
     chosen = CO_SIMULATION if (wanted or there[0]) == _NAMES[CO_SIMULATION] else MODEL_EXCHANGE
-    if chosen == CO_SIMULATION:
-        fmu.loaded(chosen)  # raises where there is no binary
+    fmu.loaded(chosen)  # raises where there is no binary
     return chosen
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import fmpy
 import numpy as np
@@ -121,17 +122,50 @@ def _integrated(fmu: Fmu, run: Run) -> FloatArray:
     t, u = run.t, run.u
     if run.hold == "zero":  # a jump is two rows of one time
         t, u = np.repeat(t, 2)[1:], np.repeat(u, 2, axis=0)[:-1]
-    kinds = {"Boolean": bool, "Integer": np.int64}
-    fields = [(n, kinds.get(fmu.elements[n].type, float)) for n in run.inputs]
-    table = np.zeros(len(t), dtype=[("time", float), *fields])
-    for name, column in zip(("time", *run.inputs), (t, *u.T), strict=True):
-        table[name] = column
     found = fmpy.simulate_fmu(
         str(fmu.directory), validate=False, model_description=fmu.description,
         fmi_type="ModelExchange", start_time=float(t[0]), stop_time=float(t[-1]),
         output_interval=float(np.min(np.diff(run.t))), relative_tolerance=_TOLERANCE,
-        record_events=False, start_values=dict(run.values), output=list(run.outputs),
-        input=table if run.inputs else None,
+        record_events=False, start_values=_whole(fmu, run.values),
+        output=list({fmu.elements[n].variable for n in run.outputs}),
+        input=_table(fmu, run, t, u) if run.inputs else None,
     )  # fmt: skip
-    columns = [np.interp(run.t, found["time"], found[n].astype(float)) for n in run.outputs]
-    return np.array(columns).T
+    shown = []
+    for e in (fmu.elements[n] for n in run.outputs):
+        column = found[e.variable].reshape(len(found), e.count)[:, e.place]
+        shown.append(np.interp(run.t, found["time"], column.astype(float)))
+    return np.array(shown).T
+
+
+def _whole(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float | list[float]]:
+    """Return values of whole variables: elements of arrays that are not given keep their starts."""
+    found: dict[str, float | list[float]] = {}
+    for name, value in values.items():
+        e = fmu.elements[name]
+        whole = found.setdefault(e.variable, list(e.starts) if e.variable != name else value)
+        if isinstance(whole, list):
+            whole[e.place] = value
+    return found
+
+
+def _table(fmu: Fmu, run: Run, t: FloatArray, u: FloatArray) -> Any:
+    """Return the inputs as fmpy takes them: a column for each variable, arrays whole."""
+    constant = {n: v for n, v in run.values.items() if fmu.elements[n].variable != n}
+    given = dict(zip(run.inputs, u.T, strict=True))
+    elements = {e.variable: e for e in (fmu.elements[n] for n in run.inputs)}
+    kinds = {"Boolean": bool, "Integer": np.int64}
+    fields = [
+        (name, kinds.get(e.type, float), *([(e.count,)] if e.count > 1 else []))
+        for name, e in elements.items()
+    ]
+    table = np.zeros(len(t), dtype=[("time", float), *fields])
+    table["time"] = t
+    for name, e in elements.items():
+        table[name] = e.starts if e.count > 1 else e.starts[0]
+    for name, column in {**constant, **given}.items():
+        e = fmu.elements[name]
+        if e.variable in elements and e.count > 1:
+            table[e.variable][:, e.place] = column
+        elif e.variable in elements:
+            table[e.variable] = column
+    return table
