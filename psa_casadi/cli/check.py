@@ -23,6 +23,7 @@ def check(
     record: list[Path] | None = None,
     columns: str | None = None,
     portable: bool = False,
+    foreign: bool = False,
     json: Path | None = None,
     junit: Path | None = None,
     timeout: Annotated[float, typer.Option(min=0.1, max=1e6)] = 600.0,
@@ -32,6 +33,7 @@ def check(
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
 
     It is compared with the model that --model or --stack names, else with the one that it carries.
+    One that another tool made is checked by the standard: a row fails where a clause is violated.
 
     This RUNS THE CODE of the FMU, as every simulation with it does. A process
     of its own, with limits of time and memory, keeps its faults from the table.
@@ -42,6 +44,7 @@ def check(
         fmu: FMU to check.
         evidence: Play the run that the FMU carries as evidence, and compare it.
         record: Record that the model comes from (may be repeated): is its error as stated?
+        foreign: Check it by the standard alone, as one that another tool made.
         portable: Its binary for Linux must load on old systems too: GNU libc 2.17.
         json: JSON file of all checks to write.
         timeout: Seconds that the whole check may take.
@@ -60,14 +63,14 @@ def check(
     given.outputs({"--json": json, "--junit": junit}, [fmu, model])
     if not fmu.is_file():
         what = "is a directory" if fmu.is_dir() else "there is no such file"
-        given.add(f"{fmu}: {what}; name an FMU that `psa export fmu` wrote.")
+        given.add(f"{fmu}: {what}; name an FMU.")
     chosen = given.model_or_stack(model, stack, any_model=True, needed=False)
     records = given.records(record, Reading(columns=columns)) if record else ()
     given.check()
     with working("checking", given.quiet):
         report = psa.check_fmu(
             fmu, chosen, effects=given.own, timeout=timeout, memory=memory << 20,
-            evidence=evidence, records=records, portable=portable,
+            evidence=evidence, records=records, portable=portable, foreign=foreign or None,
         )  # fmt: skip
     show_table(check_table(report), given.quiet)
     show(f"\n{check_sentence(report)}", given.quiet)

@@ -75,7 +75,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="the code is for POSI
 
 #: The check during which each moment comes.
 DURING = {
-    "load": "binary loads", "make": "co-simulation instantiates", "step": "life cycle",
+    "load": "binary loads", "make": "instances", "step": "life cycle",
     "leave": "process ends",
 }  # fmt: skip
 DEEDS = {
@@ -127,7 +127,7 @@ def test_every_way_to_end_is_told_apart(
     assert (row.name, row.passed) == (DURING[moment], False)
     assert DEEDS[deed] in row.remark
     assert "units defined" in before, "rows that were finished before are kept"
-    assert ("co-simulation instantiates" in before) == (moment == "step")
+    assert ("instances" in before) == (moment == "step")
 
 
 def test_the_command_fails_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,7 +150,7 @@ def test_a_bad_end_after_all_checks(
 ) -> None:
     row, before = _ended(tmp_path, 2, f"leave:{deed}", monkeypatch)
     assert row.name == "process ends"
-    assert "directional derivatives" in before
+    assert "memory" in before
     assert "before the checks were done" not in row.remark
 
 

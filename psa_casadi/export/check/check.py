@@ -15,6 +15,7 @@ from psa_casadi.export.check import binaries, description
 from psa_casadi.export.check.agreement import fixed_truth, stated_step, truth_of
 from psa_casadi.export.check.apart import OVERTIME, rows_apart
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
+from psa_casadi.export.check.foreign import described
 from psa_casadi.export.check.measured import Task
 from psa_casadi.export.check.rows import (
     LEFT_OUT,
@@ -46,13 +47,14 @@ class CheckReport:
     """All checks of one FMU; `compared` says whether there was a model to compare with.
 
     `left_out` names the checks that this kind of FMU has nothing for, or that need lief where that
-    is not installed.
+    is not installed. A `foreign` FMU was checked by the standard alone.
     """
 
     path: Path
     rows: tuple[CheckRow, ...]
     compared: bool
     left_out: tuple[str, ...] = ()
+    foreign: bool = False
 
     @property
     def passed(self) -> bool:
@@ -75,6 +77,7 @@ def check_fmu(
     evidence: bool = False,
     records: Sequence[Record] = (),
     portable: bool = False,
+    foreign: bool | None = None,
 ) -> CheckReport:
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
@@ -95,6 +98,10 @@ def check_fmu(
     Its binary for this machine must load on systems like this one, with `portable` on old ones.
     Without lief (`pip install lief`) the binaries are not inspected.
 
+    A `foreign` one, by default every one that another tool made and for which no model is given, is
+    checked by the standard alone: a row fails where a clause is violated, and notes what else a
+    buyer should know. See docs/fmu.md.
+
     Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
     checks that mean nothing there.
 
@@ -107,13 +114,7 @@ def check_fmu(
             "What a binary needs of its system is not seen without lief; run `pip install lief`,"
             " or leave --portable out."
         )
-    try:
-        with path.open("rb") as file:
-            head = file.read(2)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({why_not_read(error)}); name an FMU.") from error
-    if head != b"PK":
-        raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
+    _demand_zip(path)
     rows = [
         CheckRow(name, float(len(problems)), 0.0, not problems, plain("; ".join(problems)))
         for name, problems in archive_problems(path).items()
@@ -123,6 +124,11 @@ def check_fmu(
     chosen: list[Model] = [model] if model else []
     end = time.monotonic() + timeout
     with requests_to_end_answered(), Archive(path) as archive:
+        if _is_foreign(archive, foreign, model):
+            rows += [c.row() for c in described(archive, description.invalid)]
+            task = Task(path, archive.directory, None, timeout, memory, foreign=True)
+            rows += rows_apart(task, end)
+            return CheckReport(path, tuple(rows), compared=False, foreign=True)
         stated = stated_step(archive.directory)
         if stated is not None and (evidence or records):
             raise InputError(
@@ -149,6 +155,22 @@ def check_fmu(
     last = "start of a run" if stated else "equations"
     done = any(row.name == last for row in rows)
     return CheckReport(path, tuple(rows), done, left_out)
+
+
+def _demand_zip(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            head = file.read(2)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({why_not_read(error)}); name an FMU.") from error
+    if head != b"PK":
+        raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
+
+
+def _is_foreign(archive: Archive, wanted: bool | None, model: Model | None) -> bool:
+    if wanted is not None:
+        return wanted
+    return model is None and not str(archive.description.generationTool).startswith("psa_casadi")
 
 
 def _described(

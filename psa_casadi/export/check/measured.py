@@ -13,6 +13,7 @@ from psa_casadi.export.check import structure
 from psa_casadi.export.check.agreement import Run, Truth
 from psa_casadi.export.check.binaries import binary_checks
 from psa_casadi.export.check.calls import CALLS
+from psa_casadi.export.check.foreign import foreign_checks
 from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, Check, CheckRow, stopped
 from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.fmu.sources import fixed_step_of
@@ -109,7 +110,7 @@ class Task:
 
     `truth` is what to compare with, `playbacks` are runs to repeat. All checks may take `timeout`
     [s], the foreign code `memory` [bytes] beside Python's own; that is limited on Linux only.
-    `key` marks what its process tells.
+    `key` marks what its process tells. A `foreign` FMU is checked by the standard alone.
     """
 
     path: Path
@@ -119,6 +120,7 @@ class Task:
     memory: int
     portable: bool = False
     playbacks: tuple[Playback, ...] = ()
+    foreign: bool = False
     key: str = field(default_factory=lambda: secrets.token_hex(16))
 
 
@@ -127,6 +129,10 @@ def checks_of(task: Task) -> Iterator[Check]:
 
     Without a model there is no truth, and nothing is compared with it.
     """
+    if task.foreign:
+        with Archive(task.path, task.unpacked) as archive:
+            yield from foreign_checks(partial(Fmu, task.path, task.unpacked), archive)
+        return
     with Archive(task.path, task.unpacked) as archive:
         yield from binary_checks(archive, portable=task.portable)
     loaded: list[Fmu] = []

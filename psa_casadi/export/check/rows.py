@@ -26,13 +26,19 @@ _LONGEST = 4000
 
 @dataclass(frozen=True)
 class CheckRow:
-    """One check: what was found, how much is allowed, and what is wrong or was compared."""
+    """One check: what was found, how much is allowed, and what is wrong or was compared.
+
+    `clause` is that of the standard, of a foreign FMU's; `noted` says that it passed, and that the
+    remark is something to know.
+    """
 
     name: str
     figure: float
     limit: float
     passed: bool
     remark: str
+    clause: str = ""
+    noted: bool = False
 
 
 @dataclass(frozen=True)

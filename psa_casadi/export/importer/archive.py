@@ -71,7 +71,8 @@ def _wrong_names(entries: list[zipfile.ZipInfo]) -> Iterator[str]:
             yield f"{shown} is a link or a device"
         if entry.flag_bits & 0x1:
             yield f"{shown} is encrypted"
-    for place, count in Counter(e.filename.removesuffix("/").casefold() for e in entries).items():
+    same = {(e.filename.removesuffix("/"), e.CRC, e.file_size) for e in entries}  # a repeat is none
+    for place, count in Counter(name.casefold() for name, *_ in same).items():
         if count > 1:
             yield f"{place[:80]!a} stands for {count} entries on some file systems"
 
@@ -168,8 +169,8 @@ class Archive:
         interface = self.description.coSimulation or self.description.modelExchange
         if said[:2] not in ("2.", "3.") or interface is None:
             raise InputError(
-                f"{self.path}: is of FMI {said} or has no interface that is known; export it again"
-                " with --fmi 2 or --fmi 3."
+                f"{self.path}: is of FMI {said}, or has neither model exchange nor co-simulation;"
+                " export it again for one of these, of FMI 2.0 or FMI 3.0."
             )
         self.version = int(said[0])
         self.identifier = str(interface.modelIdentifier)

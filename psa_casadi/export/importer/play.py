@@ -1,7 +1,8 @@
 """One run of an FMU over a record, in a process that may end with it.
 
-Co-simulation is stepped here, as no importer known sets an input to its mean over a step: held at
-its value at the beginning it is late by half a step. Model exchange with events is fmpy's.
+Co-simulation is stepped with inputs at their mean over a step: held at the value of its beginning,
+as importers do, they are late by half a step. Model exchange has its events, and inputs as they are
+at every time at which the solver, fmpy's CVode, asks for rates.
 """
 
 import math
@@ -11,15 +12,23 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import fmpy
 import numpy as np
+from fmpy.sundials import CVodeSolver
 
-from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError, Instance
+from psa_casadi.export.importer.fmu import (
+    CO_SIMULATION,
+    MODEL_EXCHANGE,
+    Fmu,
+    FmuError,
+    Instance,
+)
 from psa_casadi.export.importer.imported import opened
 from psa_casadi.units import FloatArray
 
 #: Relative tolerance of a run by model exchange; CVode's.
 _TOLERANCE = 1e-7
+#: Steps of the solver between two samples, and updates of discrete states at an event, at most.
+_MOST_STEPS, _UPDATES = 10_000, 100
 #: Intervals that differ by this share are the same.
 _SAME = 1e-6
 
@@ -117,55 +126,79 @@ def _inputs(run: Run, times: FloatArray) -> FloatArray:
     return np.array(columns).reshape(run.u.shape[1], len(times)).T
 
 
+class _Solver(CVodeSolver):  # type: ignore[misc]
+    """fmpy's CVode, with the inputs of the time at which it asks for rates."""
+
+    def f(self, t: float, y: Any, ydot: Any, data: Any) -> int:
+        """Set the inputs, then compute the rates: fmpy's has those of the step's beginning."""
+        self.input.apply(t)
+        return int(super().f(t, y, ydot, data))
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    """The inputs of a run, set in an instance at a time; held ones only at events."""
+
+    instance: Instance
+    run: Run
+
+    def apply(self, t: float, *, event: bool = False) -> None:
+        """Set the inputs of a time."""
+        if self.run.inputs and (event or self.run.hold != "zero"):
+            values = _inputs(self.run, np.array([t]))[0].tolist()
+            self.instance.set(dict(zip(self.run.inputs, values, strict=True)))
+
+
 def _integrated(fmu: Fmu, run: Run) -> FloatArray:
-    """Integrate model exchange over a run, with its events."""
-    t, u = run.t, run.u
-    if run.hold == "zero":  # a jump is two rows of one time
-        t, u = np.repeat(t, 2)[1:], np.repeat(u, 2, axis=0)[:-1]
-    found = fmpy.simulate_fmu(
-        str(fmu.directory), validate=False, model_description=fmu.description,
-        fmi_type="ModelExchange", start_time=float(t[0]), stop_time=float(t[-1]),
-        output_interval=float(np.min(np.diff(run.t))), relative_tolerance=_TOLERANCE,
-        record_events=False, start_values=_whole(fmu, run.values),
-        output=list({fmu.elements[n].variable for n in run.outputs}),
-        input=_table(fmu, run, t, u) if run.inputs else None,
-    )  # fmt: skip
-    shown = []
-    for e in (fmu.elements[n] for n in run.outputs):
-        column = found[e.variable].reshape(len(found), e.count)[:, e.place]
-        shown.append(np.interp(run.t, found["time"], column.astype(float)))
-    return np.array(shown).T
+    """Integrate a new instance of model exchange over a run, with its events. Raises FmuError."""
+    t = run.t.tolist()
+    with fmu.open(MODEL_EXCHANGE) as instance:
+        begins = dict(zip(run.inputs, run.u[0].tolist(), strict=True))
+        instance.setup(start_time=t[0], values={**run.values, **begins})
+        event, fmi = _event(instance), instance.fmi
+        two, told = fmu.version == 2, fmu.description.modelExchange
+        finished = getattr(told, "completedIntegratorStepNotNeeded", None)
+        needed = bool(told.needsCompletedIntegratorStep) and not finished
+        inputs = _Inputs(instance, run)
+        solver = _Solver(
+            nx=sum(fmu.elements[n].variable in set(fmu.states()) for n in fmu.elements),
+            nz=fmu.indicator_count(), get_x=fmi.getContinuousStates, set_x=fmi.setContinuousStates,
+            get_dx=fmi.getDerivatives if two else fmi.getContinuousStateDerivatives,
+            get_z=fmi.getEventIndicators, get_nominals=fmi.getNominalsOfContinuousStates,
+            set_time=fmi.setTime, input=inputs, startTime=t[0], maxStep=(t[-1] - t[0]) / 50.0,
+            relativeTolerance=_TOLERANCE, maxNumSteps=_MOST_STEPS,
+        )  # fmt: skip
+        rows = [instance.get(run.outputs)]
+        now, same = t[0], 1e-12 * (t[-1] - t[0])
+        for target in t[1:]:
+            while now < target - same:
+                stop = min(target, event)
+                happened, _, now = solver.step(now, stop)
+                fmi.setTime(now)
+                inputs.apply(now)
+                asked = [bool(q) for q in fmi.completedIntegratorStep()] if needed else [False] * 2
+                if asked[1]:
+                    raise FmuError(f"the FMU ends the simulation at {now:g} s")
+                jumps = run.hold == "zero" and now >= target - same
+                if happened or asked[0] or jumps or now >= event - same:
+                    if jumps:
+                        rows.append(instance.get(run.outputs))
+                    instance.require("EnterEventMode")
+                    inputs.apply(now, event=True)
+                    event = _event(instance)
+                    solver.reset(now)
+            if len(rows) < 1 + t.index(target):
+                rows.append(instance.get(run.outputs))
+        return np.array(rows)
 
 
-def _whole(fmu: Fmu, values: Mapping[str, float]) -> dict[str, float | list[float]]:
-    """Return values of whole variables: elements of arrays that are not given keep their starts."""
-    found: dict[str, float | list[float]] = {}
-    for name, value in values.items():
-        e = fmu.elements[name]
-        whole = found.setdefault(e.variable, list(e.starts) if e.variable != name else value)
-        if isinstance(whole, list):
-            whole[e.place] = value
-    return found
-
-
-def _table(fmu: Fmu, run: Run, t: FloatArray, u: FloatArray) -> Any:
-    """Return the inputs as fmpy takes them: a column for each variable, arrays whole."""
-    constant = {n: v for n, v in run.values.items() if fmu.elements[n].variable != n}
-    given = dict(zip(run.inputs, u.T, strict=True))
-    elements = {e.variable: e for e in (fmu.elements[n] for n in run.inputs)}
-    kinds = {"Boolean": bool, "Integer": np.int64}
-    fields = [
-        (name, kinds.get(e.type, float), *([(e.count,)] if e.count > 1 else []))
-        for name, e in elements.items()
-    ]
-    table = np.zeros(len(t), dtype=[("time", float), *fields])
-    table["time"] = t
-    for name, e in elements.items():
-        table[name] = e.starts if e.count > 1 else e.starts[0]
-    for name, column in {**constant, **given}.items():
-        e = fmu.elements[name]
-        if e.variable in elements and e.count > 1:
-            table[e.variable][:, e.place] = column
-        elif e.variable in elements:
-            table[e.variable] = column
-    return table
+def _event(instance: Instance) -> float:
+    """Update in event mode and leave it; return the time of the next time event, else infinity."""
+    for _ in range(_UPDATES):
+        again, end, *_ = instance.update_discrete_states()
+        if end:
+            raise FmuError("the FMU ends the simulation at an event")
+        if not again:
+            instance.require("EnterContinuousTimeMode")
+            return math.inf if instance.next_event_time is None else instance.next_event_time
+    raise FmuError("the FMU updates its discrete states without end")

@@ -115,7 +115,7 @@ class Played:
         silent = np.zeros((len(t), len(self.outputs)))
         before = around(silent, given, unknowns)
         applied = before.y[:, [names.index(n) for n in given]]
-        as_given = bool(np.array_equal(applied, u))
+        kept = hold if not _filtered(inner.structure) else "linear"
         moved = [
             k
             for k, q in enumerate(unknowns)
@@ -131,7 +131,7 @@ class Played:
             q, by = unknowns[k], before.sensitivity[:, :, k]
             new = {**own, q: own[q] + h} if isinstance(q, str) else own
             wanted.append((new, applied + h * by))
-        plain, *others = self.outputs_of(wanted, t, hold if as_given else "linear")
+        plain, *others = self.outputs_of(wanted, t, kept)
         found = around(plain, asked, unknowns)
         rows = [names.index(n) for n in asked]
         slopes: dict[int, FloatArray] = {}
@@ -230,6 +230,14 @@ def _loops(structure: Structure) -> bool:
     reached = ca.vertcat(played, structure.x[behind])
     rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
     return bool(rows and reached.numel() and ca.depends_on(structure.y[rows], reached))
+
+
+@cache
+@in_turn
+def _filtered(structure: Structure) -> bool:
+    """Whether what is given to an FMU has a memory, so that held inputs are not held there."""
+    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
+    return bool(rows and structure.x.numel() and ca.depends_on(structure.y[rows], structure.x))
 
 
 class _Runs:

@@ -41,13 +41,18 @@ CHECK_FORMAT: Literal["psa_casadi.check/1"] = "psa_casadi.check/1"
 
 @dataclass(frozen=True)
 class CheckedRow:
-    """One check: the figure found (null: the check broke down), the largest allowed, a remark."""
+    """One check: the figure found (null: the check broke down), the largest allowed, a remark.
+
+    Of a foreign FMU also the clause of the standard, and whether the remark is to be noted.
+    """
 
     name: str
     found: float | None
     allowed: float
     passed: bool
     remark: str
+    clause: str = ""
+    noted: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,8 @@ class CheckFile:
 def check_file(report: CheckReport) -> dict[str, Any]:
     """Return what `--json` writes of the checks of an FMU."""
     rows = tuple(
-        CheckedRow(r.name, _finite(r.figure), r.limit, r.passed, r.remark) for r in report.rows
+        CheckedRow(r.name, _finite(r.figure), r.limit, r.passed, r.remark, r.clause, r.noted)
+        for r in report.rows
     )
     head = (CHECK_FORMAT, __version__, str(report.path))
     return asdict(CheckFile(*head, report.passed, report.compared, rows, report.left_out))

@@ -20,12 +20,17 @@ class Case:
 
 def check_cases(report: CheckReport) -> list[Case]:
     """Return every check of an FMU as a test."""
-    rows = zip(check_table(report).rows, report.rows, strict=True)
-    return [
-        Case(name, text, "" if row.passed else text)
-        for (name, found, allowed, _, remark), row in rows
-        if (text := f"found {found}, allowed {allowed}{f': {remark}' if remark else ''}")
+    table = check_table(report)
+    found = [dict(zip(table.head, row, strict=True)) for row in table.rows]
+    texts = [
+        f"found {row['found']}, allowed {row['allowed']}" if "found" in row else row["clause"]
+        for row in found
     ]
+    cases = []
+    for row, text, r in zip(found, texts, report.rows, strict=True):
+        said = ": ".join(filter(None, (text, row["remark"])))
+        cases.append(Case(row["check"], said, "" if r.passed else said))
+    return cases
 
 
 def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float) -> str:

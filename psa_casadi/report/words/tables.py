@@ -316,8 +316,12 @@ def check_table(report: "CheckReport") -> Table:
         # where none is allowed it counts problems
         counted = r.limit == 0 and r.figure >= 0
         found = str(int(r.figure)) if counted else number(r.figure)
-        rows.append((r.name, found, number(r.limit), "pass" if r.passed else "FAIL", r.remark))
-    return _table(("check", "found", "allowed", "result", "remark"), rows)
+        result = "note" if r.noted else "pass" if r.passed else "FAIL"
+        rows.append((r.name, found, number(r.limit), result, r.remark, r.clause))
+    head = ("check", "found", "allowed", "result", "remark", "clause")
+    if report.foreign:
+        return _table((*head[:1], *head[3:]), [(row[0], *row[3:]) for row in rows])
+    return _table(head[:-1], [row[:-1] for row in rows])
 
 
 def timings_table(stages: Sequence[Stage]) -> Table:

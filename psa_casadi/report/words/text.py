@@ -193,6 +193,8 @@ def effect_page(
 def check_sentence(report: "CheckReport") -> str:
     """Say how the check of an FMU ended."""
     against = "" if report.compared else " There was no model to compare it with."
+    if report.foreign:
+        against = " It was checked by the standard; a note is no violation."
     unseen = [name for name in report.left_out if name in OF_BINARIES]
     if fixed := [name for name in report.left_out if name not in OF_BINARIES]:
         against += f" Left out, as its step is fixed: {listing(fixed)}."
