@@ -70,7 +70,8 @@ def ways(
     nor parts can be simulated.
     """
     runs, lost, usable = made(None), None, False
-    from_several = 1 if begins_once(model) else starts
+    dear = begins_once(model)
+    from_several = 1 if dear else starts
     try:
         best, whole, outcomes = search_starts(
             sized(model, runs), runs, free, starts=from_several, progress=progress
@@ -81,11 +82,12 @@ def ways(
         done = best.interrupted or settled(best, whole)
         usable = done or (follows(best, whole, _LOST) and not _grows(best, whole))
         if usable:
-            yield _as_read(best, whole, outcomes, undecided)
+            # what a model lacks may look like a delay of half a sample; the search decides again
+            yield _as_read(best, whole, outcomes, undecided and (follows(best, whole) or not dear))
         if done:
             return
     progress("fitting parts of the records")
-    if begins_once(model) and lost is None and follows(best, whole, NEAR):
+    if dear and lost is None and follows(best, whole, NEAR):
         starts = 1
     found = _in_parts(model, given, made, free, undecided, starts, progress)
     if found is not None and (lost or len(found[1]) > len(whole) or _nearer(found[0], best)):

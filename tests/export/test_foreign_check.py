@@ -1,0 +1,103 @@
+"""`psa check` of FMUs of other tools: each fault of a small one is found, and nothing else."""
+
+import json
+import tempfile
+import zipfile
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import fmpy
+import pytest
+from typer.testing import CliRunner
+
+import psa_casadi as psa
+from psa_casadi.cli.app import app
+from psa_casadi.simulation.compiler import compiler_command, run_compiler
+from tests.export.supplied import supplied
+from tests.tiers import slow_but
+
+_SOURCES = Path(__file__).with_name("faulty")
+_FOLDER = tempfile.TemporaryDirectory()
+#: The row that finds each fault, and what it says.
+FAULTS = {
+    1: ("start values", "'k' starts at 2.5, its description says 2"),
+    2: ("values are taken", "'k' was set to 2.02 and is 2"),
+    3: ("life cycle", "after a reset it gives other results"),
+    4: ("several instances", "two instances disturb each other in step 1"),
+    5: ("memory", "bytes left by each of 1000 cycles"),
+    6: ("state saved", "a state that is restored replays"),
+    7: ("derivatives", "that of 'der(x)' is"),
+    8: ("dependencies", "'y' depends on 'u', which is not told"),
+    9: ("step sizes", "fmi2DoStep returned status 3"),
+    10: ("description valid", "InitialUnknowns"),
+    11: ("instances", "the FMU gives no instance"),
+    12: ("inputs at events", "'u' was set to 0.1 at an event and is 0"),
+}
+#: What else a fault does.
+_ALSO = {3: set(), 4: {"life cycle"}, 6: set(), 9: {"step sizes"}}
+
+
+@cache
+def faulty(number: int) -> Path:
+    """Return the FMU with a fault, 0 for none."""
+    folder = Path(_FOLDER.name) / str(number)
+    folder.mkdir()
+    library = folder / f"filter{fmpy.sharedLibraryExtension}"
+    (folder / "filter.c").write_bytes((_SOURCES / "filter.c").read_bytes())
+    command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{files('fmpy') / 'c-code'}"]
+    run_compiler([*command, f"-DFAULT={number}", "filter.c", "-o", str(library)], folder)
+    said = (_SOURCES / "modelDescription.xml").read_text("utf-8")
+    initial = "" if number == 10 else '<Unknown index="4"/>'
+    with zipfile.ZipFile(folder / "filter.fmu", "w") as archive:
+        text = said.format(known="1" if number == 8 else "1 3", initial=initial)
+        archive.writestr("modelDescription.xml", text)
+        archive.write(library, f"binaries/{fmpy.platform}/{library.name}")
+    return folder / "filter.fmu"
+
+
+def test_an_fmu_without_a_fault_passes() -> None:
+    report = psa.check_fmu(faulty(0))
+    assert report.foreign
+    assert [(r.name, r.remark) for r in report.failures] == []
+    assert {r.clause.partition(",")[0] for r in report.rows if r.clause} == {"FMI 2.0"}
+    notes = {r.name for r in report.rows if r.noted}
+    assert {"units defined", "speed", "step sizes"} <= notes <= {
+        "units defined", "speed", "step sizes", "memory", "same bits again",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("number", slow_but([1, 8], FAULTS))
+def test_each_fault_is_found_by_its_row(number: int) -> None:
+    rows = {r.name: r for r in psa.check_fmu(faulty(number)).failures}
+    name, said = FAULTS[number]
+    assert said in rows[name].remark
+    if number != 11:  # without an instance nothing else can be seen
+        assert set(rows) <= {name} | _ALSO.get(number, set())
+
+
+def test_the_command_writes_the_clauses(tmp_path: Path) -> None:
+    json_file, junit = tmp_path / "check.json", tmp_path / "check.xml"
+    words = ["check", str(faulty(8)), "--json", str(json_file), "--junit", str(junit)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 1
+    assert "FMI 2.0, 2.2.8" in result.output
+    assert "did not pass: dependencies. It was checked by the standard" in result.output
+    rows = {r["name"]: r for r in json.loads(json_file.read_text("utf-8"))["rows"]}
+    assert (rows["dependencies"]["clause"], rows["speed"]["noted"]) == ("FMI 2.0, 2.2.8", True)
+    cases = ET.parse(junit).getroot().iter("testcase")
+    assert [c.get("name") for c in cases if c.find("failure") is not None] == ["dependencies"]
+
+
+def test_what_a_tool_s_fmus_lack_is_told() -> None:
+    tank = {r.name for r in psa.check_fmu(supplied("tank")).failures}
+    assert tank <= {"description valid", "memory"}  # PythonFMU 0.7: no initial unknowns, a leak
+    assert psa.check_fmu(supplied("ball")).passed
+
+
+def test_one_of_ours_is_checked_so_where_it_is_asked(tmp_path: Path) -> None:
+    path = psa.export_fmu(psa.stack_model("P-885.51"), tmp_path / "stack.fmu", fmi=3)
+    report = psa.check_fmu(path, foreign=True)
+    assert [(r.name, r.remark) for r in report.failures] == []
+    assert not psa.check_fmu(path).foreign
