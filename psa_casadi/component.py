@@ -29,7 +29,16 @@ _TABLES = (
 
 #: What effects do, whatever their place.
 Kind = Literal[
-    "", "curve", "hysteresis", "relaxation", "resonance", "lag", "damping", "time", "changing gain"
+    "",
+    "curve",
+    "hysteresis",
+    "relaxation",
+    "resonance",
+    "lag",
+    "damping",
+    "time",
+    "changing gain",
+    "gain",
 ]
 
 #: Probe value that stands for "the frequencies where the residual's spectrum peaks", in Hz.

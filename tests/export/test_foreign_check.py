@@ -36,7 +36,7 @@ FAULTS = {
     12: ("inputs at events", "'u' was set to 0.1 at an event and is 0"),
 }
 #: What else a fault does.
-_ALSO = {3: set(), 4: {"life cycle"}, 6: set(), 9: {"step sizes"}}
+_ALSO = {4: {"life cycle", "state saved"}}
 
 
 @cache

@@ -30,7 +30,7 @@ _DOES: dict[str, Kind] = {
     "lag": "lag", "delay": "lag", "bend": "curve", "saturation": "curve", "dead_zone": "curve",
     "zero": "time", "drift": "time", "constant": "time", "loss": "damping", "friction": "damping",
     "drag": "damping", "curve": "curve", "stop": "curve", "hysteresis": "hysteresis",
-    "change": "changing gain", "gain": "curve", "backlash": "hysteresis",
+    "change": "changing gain", "gain": "gain", "backlash": "hysteresis",
 }  # fmt: skip
 #: Returns a parameter or a state of an effect by its short name.
 Own = Callable[[str], Expression]

@@ -23,7 +23,8 @@ from psa_casadi.units import FloatArray
 _MOST_OWN = 100
 #: Steps of a run, cycles of making and freeing an instance, and how long these may take [s].
 _STEPS, _CYCLES, _PATIENCE = 5, 1000, 20.0
-#: Cycles before memory is looked at, and bytes that a cycle may leave: an importer in Python leaves some 300.
+#: Cycles before memory is looked at, and bytes that a cycle may leave: an importer in Python leaves
+#: some 300.
 _WARM, _LEFT = 100, 1024.0
 #: Relative step of a difference, and how far a derivative may be from it.
 _DIFFERENCE, _SLOPE = 1e-5, 1e-3

@@ -162,6 +162,7 @@ _TOLD = 0.005
 #: What effects of a kind do, and the places of a rig.
 _DOES = {
     "curve": "a bent static curve",
+    "gain": "another gain",
     "hysteresis": "a dependence on past reversals",
     "relaxation": "a relaxation",
     "resonance": "a resonance",
