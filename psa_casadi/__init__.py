@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from psa_casadi import datasets, design, online, system
     from psa_casadi.component import Component, Equations, Symbols
     from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
+    from psa_casadi.design.linear import Linear, linearize, margins, observer
     from psa_casadi.design.mechanism.mechanism import (
         design_mechanism,
         mechanism_model,
@@ -123,6 +124,7 @@ _HOMES = {
     "model.table": "table",
     "export.importer.model_with_fmu": "load_model",
     "model.model_file": "save_model",
+    "design.linear": "Linear linearize margins observer",
     "design.mechanism.mechanism": "design_mechanism mechanism_model port_model",
     "online": "HysteresisObserver FeedForward stack_values part_for OnlineIdentification"
     " AdaptiveFeedForward identifier_for",
@@ -172,6 +174,7 @@ __all__ = [
     "write_population", "HysteresisObserver", "FeedForward", "stack_values",
     "OnlineIdentification", "AdaptiveFeedForward", "identifier_for", "part_for",
     "design_mechanism", "mechanism_model", "port_model", "export_fmu", "CodeExport", "export_c",
+    "Linear", "linearize", "margins", "observer",
     "export_modelica", "export_ssp", "CheckReport", "check_fmu", "InputError", "MachineError",
     "PsaError", "datasets", "design", "online", "system", "__version__",
 ]  # fmt: skip

@@ -29,17 +29,9 @@ _TABLES = (
 
 #: What effects do, whatever their place.
 Kind = Literal[
-    "",
-    "curve",
-    "hysteresis",
-    "relaxation",
-    "resonance",
-    "lag",
-    "damping",
-    "time",
+    "", "curve", "gain", "hysteresis", "relaxation", "resonance", "lag", "damping", "time",
     "changing gain",
-    "gain",
-]
+]  # fmt: skip
 
 #: Probe value that stands for "the frequencies where the residual's spectrum peaks", in Hz.
 SPECTRAL_PEAKS = "spectral_peaks"

@@ -23,6 +23,7 @@ from psa_casadi.cli.examples import examples
 from psa_casadi.cli.export import c, fmu, modelica, ssp
 from psa_casadi.cli.failures import guarded, prepare
 from psa_casadi.cli.identify import identify
+from psa_casadi.cli.linearize import linearize
 from psa_casadi.cli.options import command
 from psa_casadi.cli.sample import sample
 from psa_casadi.cli.simulate import simulate
@@ -75,7 +76,7 @@ def _add(group: typer.Typer, *functions: Callable[..., None]) -> None:
 
 
 _add(app, demo, identify, sample, simulate, diagnose, batch, compare, effects, stacks)
-_add(app, check, web, examples, datasets)
+_add(app, check, linearize, web, examples, datasets)
 _add(export, fmu, modelica, c, ssp)
 _add(design, experiment, mechanism, input_)
 app.add_typer(export, name="export")

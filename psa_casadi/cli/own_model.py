@@ -50,14 +50,20 @@ class Fitting:
         return every
 
 
-def own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | None:
+def own_model(
+    given: Given, path: Path | None, fitting: Fitting, *, fitted: bool = True
+) -> psa.Model | None:
     """Return the model that a path names where it is no stack's; None for a stack's or none.
+
+    Unless it is to be `fitted`, no parameter of an FMU is free.
 
     A model that cannot be made ends the command.
     """
     if fitting.fmu is not None and path is not None:
         given.add("--fmu and --model are both given; leave one of them out.")
-    found = None if (place := fitting.fmu or path) is None else _model(given, place, fitting)
+    found = (
+        None if (place := fitting.fmu or path) is None else _model(given, place, fitting, fitted)
+    )
     if found is None or not found.structure.foreign:
         bounds = [text for text in fitting.free or () if "=" in text]
         for text in [*bounds, *(fitting.value or ())]:
@@ -69,14 +75,14 @@ def own_model(given: Given, path: Path | None, fitting: Fitting) -> psa.Model | 
     return found
 
 
-def _model(given: Given, path: Path, fitting: Fitting) -> psa.Model | None:
+def _model(given: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     from psa_casadi.simulation.start import is_stack
 
     match = _PYTHON.fullmatch(str(path))
     if match is not None:
         return _made(Path(match["file"]), match["name"] or "")
     if path.suffix.lower() == ".fmu" or fitting.fmu:
-        return _imported(given, path, fitting)
+        return _imported(given, path, fitting, fitted)
     try:
         model = psa.load_model(path, given.own)
     except InputError:  # which is told where a stack's file is read
@@ -84,7 +90,7 @@ def _model(given: Given, path: Path, fitting: Fitting) -> psa.Model | None:
     return None if is_stack(model) else model
 
 
-def _imported(given: Given, path: Path, fitting: Fitting) -> psa.Model | None:
+def _imported(given: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
     free: dict[str, tuple[float, float] | None] = {}
     for text in fitting.free or ():
@@ -96,7 +102,7 @@ def _imported(given: Given, path: Path, fitting: Fitting) -> psa.Model | None:
             given.add(f"--free is '{text}'; give NAME=LOW:HIGH, such as --free mass=0.1:10.")
     values = given.numbers("--value", fitting.value)
     given.check()
-    return psa.fmu_model(path, free=free or None, values=values)
+    return psa.fmu_model(path, free=(free or None) if fitted else {}, values=values)
 
 
 def _made(file: Path, name: str) -> psa.Model:

@@ -59,16 +59,12 @@ def simulate(
     from psa_casadi.report.plots.figures import DPI, columns_figure, picture_format
 
     given.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
-    if fmu is None and model is not None and model.suffix.lower() == ".fmu":
-        model, fmu = None, model
-    own = partial(own_model, given, model, Fitting())
-    if fmu is not None:
-        numbers = given.numbers("--value", value)
-        own = partial(given.attempt, partial(psa.fmu_model, fmu, free={}, values=numbers))
-        given.refuse({"--model": model})
+    imported = fmu is not None or (model is not None and model.suffix.lower() == ".fmu")
+    chosen_by = Fitting(fmu=fmu, value=value if imported else None)
+    own = partial(own_model, given, model, chosen_by, fitted=False)
     chosen, record = _read(given, own, model, stack, input_, begin, reading)
     turns = given.turns(begin.history)
-    values = {} if fmu else given.numbers("--value", value)
+    values = {} if imported else given.numbers("--value", value)
     starts = given.numbers("--start", start)
     if chosen is not None:
         chosen = given.attempt(partial(_begun, chosen, values, starts))

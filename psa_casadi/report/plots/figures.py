@@ -12,6 +12,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
 from psa_casadi.component import Component
+from psa_casadi.design.linear import Linear
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.errors import InputError
@@ -38,6 +39,7 @@ from psa_casadi.report.words.series import (
 from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
 from psa_casadi.units import FloatArray, convert
+from psa_casadi.variables import nominal_value
 
 Compared = Diagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals
@@ -168,6 +170,47 @@ def columns_figure(record: Signals, first: Sequence[str] = ()) -> Figure:
     for name, axes in zip(names, np.ravel(figure.subplots(len(names), 1)), strict=True):
         _curve(axes, record.time, record.columns[name], name, record.units.get(name, ""))
     return figure
+
+
+#: Lines that lie on each other are seen; and what an output is over its usual size that is none.
+_LINES, _NOTHING = ("-", "--", "-.", ":"), 1e-9
+
+
+def bode_figure(of: Linear) -> Figure:
+    """Return gain and phase of every output over every input of a linearised model.
+
+    A column for each input; frequencies from a decade below the slowest pole to one above the
+    fastest.
+    """
+    sizes = np.abs(of.poles)[np.abs(of.poles) > 0] / (2 * np.pi)
+    low, high = (float(f(sizes)) if sizes.size else 1.0 for f in (np.min, np.max))
+    hertz = np.geomspace(0.1 * low, 10.0 * high, 1500)
+    found = of.response(2 * np.pi * hertz)
+    figure = sheet((4.5 * max(2, len(of.inputs)), 7.0), DPI)
+    rows = figure.subplots(2, len(of.inputs), sharex=True, squeeze=False)
+    for k, i in enumerate(of.inputs):
+        for j, o in enumerate(of.outputs):
+            of_one = found[:, j, k]
+            size, usual = (nominal_value(v.nominal, {}) for v in (i, o))
+            if np.max(np.abs(of_one)) * size > _NOTHING * usual:  # else it is rounding
+                style_of = {"color": f"C{j}", "linestyle": _LINES[j % len(_LINES)]}
+                label = f"{o.name} [{o.unit}]"
+                rows[0, k].loglog(hertz, np.abs(of_one), label=label, **style_of)
+                rows[1, k].semilogx(hertz, np.rad2deg(np.unwrap(np.angle(of_one))), **style_of)
+        rows[0, k].set_title(f"over {i.name} [{i.unit}]", loc="left")
+        rows[0, k].legend(frameon=False, fontsize="small", loc="best")
+        rows[1, k].set_xlabel("frequency [Hz]")
+    for axes in rows.flat:
+        axes.grid(visible=True, which="major", alpha=0.4)
+    rows[0, 0].set_ylabel("gain")
+    rows[1, 0].set_ylabel("phase [degrees]")
+    return figure
+
+
+def save_bode(of: Linear, path: str | os.PathLike[str]) -> None:
+    """Write the Bode picture of a linearised model, PNG, SVG or PDF as the name ends."""
+    with atomic_path(path) as temporary:
+        bode_figure(of).savefig(temporary, format=picture_format(path), dpi=DPI)
 
 
 def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:

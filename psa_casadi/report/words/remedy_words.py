@@ -95,7 +95,7 @@ DO: Mapping[str, str] = {
     "saturation": "Stay below the level, or use a device there that reaches further",
     "dead_zone": "Jump over the zone when the sign changes, or make up the play or the threshold",
     "gain": "Calibrate that signal, check its unit, or keep the gain in the model",
-    "backlash": "Preload what plays, approach from the same side, or keep the backlash in the model",
+    "backlash": "Preload what plays, approach from one side, or keep the backlash in the model",
     "zero": "Take the zero before every run",
     "drift": "Let the sensor warm up, and take its zero before and after every run",
     "constant": "Look for a weight, a leak or the offset of an input, and put it into the equation",

@@ -1,0 +1,100 @@
+"""`psa linearize`: a model as matrices at an operating point, its Bode picture, loop, observer."""
+
+from pathlib import Path
+
+import psa_casadi as psa
+from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.options import StackName
+from psa_casadi.cli.own_model import Fitting, own_model
+from psa_casadi.cli.screen import show, tell_written
+
+
+def linearize(
+    *,
+    model: Path | None = None,
+    fmu: Path | None = None,
+    stack: StackName = None,
+    at: list[str] | None = None,
+    state: list[str] | None = None,
+    output: Path | None = None,
+    figure: Path | None = None,
+    controller: str | None = None,
+    from_: str | None = None,
+    to: str | None = None,
+    observer: Path | None = None,
+    noise: list[str] | None = None,
+    step: float = 1e-4,
+    given: Given,
+) -> None:
+    """Linearise a model at rest: A, B, C, D, poles, Bode picture, margins, Kalman filter.
+
+    A stack, a model of your own (FILE.py:FUNCTION or its file), or an FMU of model exchange.
+
+    Options:
+        model: MODEL.json, or a model of your own.
+        fmu: FMU of any tool, in the place of --model.
+        at: Input at the operating point, NAME=VALUE in SI units; repeat for several.
+        state: State there, NAME=VALUE in SI units, where it is not at rest; repeat for several.
+        output: NAME.mat or NAME.json to write: matrices, point, names.
+        figure: Bode picture to write, PNG, SVG or PDF as its name ends.
+        controller: Transfer function that acts on the setpoint less the output, as "2 50 / 1 0" for
+            (2 s + 50)/s; the loop's margins are told. Needs python-control.
+        from_: Input of the loop, where there are several.
+        to: Output of the loop, where there are several.
+        observer: NAME.fmu to write, or a folder for C: a Kalman filter of the model.
+        noise: Standard deviation of the samples of an input or a measured output, NAME=VALUE in SI
+            units, for the observer; repeat for several.
+        step: Time between these samples [s], and the step of the observer's C.
+
+    Example:
+        psa linearize --stack P-885.51 --at voltage=60 -o stack.mat --figure bode.png
+    """
+    from psa_casadi.report.plots.figures import save_bode
+
+    given.outputs({"--output": output, "--figure": figure, "--observer": observer}, [model, fmu])
+    chosen = own_model(given, model, Fitting(fmu=fmu), fitted=False)
+    if chosen is None:
+        chosen = given.model_or_stack(model, stack, any_model=True)
+    inputs, states = given.numbers("--at", at), given.numbers("--state", state)
+    sizes, loop = given.numbers("--noise", noise), _parsed(given, controller)
+    given.check()
+    found = psa.linearize(given.ready(chosen), inputs, states=states)
+    show(repr(found), given.quiet)
+    if loop is not None:
+        told = psa.margins(found, loop, input=from_, output=to)
+        ends = "stable" if told["stable"] else "NOT STABLE"
+        show(
+            f"loop: gain margin {told['gain_margin']:.4g} at {told['gain_margin_at']:.4g} Hz, phase"
+            f" margin {told['phase_margin']:.4g} degrees at {told['phase_margin_at']:.4g} Hz, delay"
+            f" margin {told['delay_margin']:.4g} s; the closed loop is {ends}",
+            given.quiet,
+        )
+    if output is not None:
+        found.save(output)
+    if figure is not None:
+        save_bode(found, figure)
+    if observer is not None:
+        made = psa.observer(
+            found, input_noise={n: v for n, v in sizes.items() if n in found.input_names},
+            output_noise={n: v for n, v in sizes.items() if n not in found.input_names}, step=step,
+        )  # fmt: skip
+        if observer.suffix.lower() == ".fmu":
+            psa.export_fmu(made, observer)
+        else:
+            psa.export_c(made, observer, step=step)
+    tell_written(output, figure, observer, quiet=given.quiet)
+
+
+def _parsed(given: Given, controller: str | None) -> tuple[list[float], list[float]] | None:
+    """Return numerator and denominator of a controller's text; None without one."""
+    if controller is None:
+        return None
+    parts = controller.split("/")
+    try:
+        top, bottom = ([float(q) for q in part.split()] for part in parts)
+        if top and any(bottom):
+            return top, bottom
+    except ValueError:
+        pass
+    given.add(f"--controller is '{controller}'; give coefficients, as \"2 50 / 1 0\".")
+    return None
