@@ -108,7 +108,8 @@ def search_starts(
         progress(f"fit from {name}")
         return fit(
             model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
-            evaluations=_QUICK if starts > 1 else 3 * _QUICK, tolerance=1e-4,
+            evaluations=_QUICK if starts > 1 else 3 * _QUICK,
+            tolerance=1e-4 if starts > 1 else 1e-6,
         )  # fmt: skip
 
     found = sorted(fits_from(begins, quick), key=lambda pair: pair[1].cost)
@@ -120,7 +121,7 @@ def search_starts(
     cut = any(f.interrupted for _, f in found)
     ended = [
         refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)
-        for _, f in found[: 0 if cut else _FOLLOWED]
+        for _, f in found[: 0 if cut or starts == 1 else _FOLLOWED]
     ]
     fits = dict(found) | {name: f for (name, _), f in zip(found, ended, strict=False)}
     best = min(fits.values(), key=lambda f: f.cost)

@@ -248,11 +248,6 @@ class Archive:
             return len(self.description.eventIndicators)
         return int(self.description.numberOfEventIndicators or 0)
 
-    def has_events(self) -> bool:
-        """Return whether the description announces events."""
-        co = self.description.coSimulation
-        return self.indicator_count() > 0 or bool(getattr(co, "hasEventMode", False))
-
     def binaries(self) -> Iterator[Path]:
         """Yield the paths of the libraries for all platforms, sorted."""
         for path in sorted((self.directory / "binaries").rglob("*")):

@@ -290,7 +290,7 @@ def fmu_model(
     s, own = read.selected, [p.name for p in read.parameters]
     played = Played(
         str(file.resolve()), digest, chosen, s.inputs, s.outputs,
-        tuple(zip(own, s.parameters, strict=True)), s.fixed, fmu.has_events(),
+        tuple(zip(own, s.parameters, strict=True)), s.fixed,
     )  # fmt: skip
     used = FmuUsed(file.name, digest, s.parameters, dict(s.fixed), _NAMES[chosen])
     foreign = Foreign(f"fmu_{digest[:16]}", _no_function, used, str(file.resolve()))

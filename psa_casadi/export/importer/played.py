@@ -39,6 +39,10 @@ from psa_casadi.variables import Input, Output
 #: Step of a difference over the usual size of a parameter: far above what a solver with a tolerance
 #: of 1e-6 errs by, and small enough for a slope that is right to a thousandth.
 _STEP = 1e-3
+#: A slope jumps at a sample where it is so many times those beside, and this share of the largest:
+#: an output that is discontinuous at an event has another value there. Then the lesser of the
+#: differences to either side is its slope.
+_SPIKE, _SPIKE_SHARE = 5.0, 0.05
 #: Runs that are kept, and how long [s] until it is looked whether the work is to end.
 _KEPT, _LOOK = 512, 0.1
 #: What a model has in the place of an FMU: outputs that are played to it, inputs that it gives.
@@ -49,9 +53,7 @@ _PLAYED, _GIVEN = "played_", "given_"
 class Played:
     """An FMU that is run as a whole: its file, and its variables in the order of the model's.
 
-    `parameters` are by the model's names; `fixed` are values of further ones. Outputs of one that
-    `jumps` at events may be discontinuous: its slopes are the lesser of a difference to either
-    side, as one across a jump is none.
+    `parameters` are by the model's names; `fixed` are values of further ones.
     """
 
     file: str
@@ -61,7 +63,6 @@ class Played:
     outputs: tuple[str, ...]
     parameters: tuple[tuple[str, str], ...]
     fixed: tuple[tuple[str, float], ...]
-    jumps: bool = False
 
     def outputs_of(
         self, wanted: Sequence[tuple[Mapping[str, float], FloatArray]], t: FloatArray, hold: str
@@ -121,30 +122,41 @@ class Played:
             for k, q in enumerate(unknowns)
             if q in dict(self.parameters) or np.any(before.sensitivity[:, :, k])
         ]
-        changes = [
-            (k, side * _step(inner, unknowns[k], own))
-            for side in ((1, -1) if self.jumps else (1,))
-            for k in moved
-        ]
-        wanted = [(own, applied)]
-        for k, h in changes:
-            q, by = unknowns[k], before.sensitivity[:, :, k]
+        steps = {k: _step(inner, unknowns[k], own) for k in moved}
+
+        def changed(k: int, side: int) -> tuple[Mapping[str, float], FloatArray]:
+            """Return values and inputs with a step of an unknown to one side."""
+            q, h = unknowns[k], side * steps[k]
             new = {**own, q: own[q] + h} if isinstance(q, str) else own
-            wanted.append((new, applied + h * by))
-        plain, *others = self.outputs_of(wanted, t, kept)
+            return new, applied + h * before.sensitivity[:, :, k]
+
+        plain, *others = self.outputs_of([(own, applied), *(changed(k, 1) for k in moved)], t, kept)
         found = around(plain, asked, unknowns)
         rows = [names.index(n) for n in asked]
-        slopes: dict[int, FloatArray] = {}
-        for (k, h), other in zip(changes, others, strict=True):
-            new_one = (around(other, asked, ()).y[:, rows] - found.y[:, rows]) / h
-            slopes[k] = _lesser(slopes.get(k, new_one), new_one)
+
+        def slope(k: int, side: int, y: FloatArray) -> FloatArray:
+            return (around(y, asked, ()).y[:, rows] - found.y[:, rows]) / (side * steps[k])
+
+        slopes = {k: slope(k, 1, y) for k, y in zip(moved, others, strict=True)}
+        jumping = [k for k in moved if _jumps(slopes[k])]
+        back = self.outputs_of([changed(k, -1) for k in jumping], t, kept)
+        for k, y in zip(jumping, back, strict=True):
+            slopes[k] = _lesser(slopes[k], slope(k, -1, y))
         sensitivity = found.sensitivity.copy()
-        for k, slope in slopes.items():
-            sensitivity[:, :, k] += slope
+        for k in moved:
+            sensitivity[:, :, k] += slopes[k]
         every = [names.index(n) for n in model.output_names]
         return replace(
             found, y=found.y[:, every], sensitivity=sensitivity.reshape(len(t), len(rows), count)
         )
+
+
+def _jumps(slope: FloatArray) -> bool:
+    """Whether a difference (n, m) leads across jumps: samples that stand far above those beside."""
+    size = np.abs(slope)
+    beside = np.maximum(size[:-2], size[2:])
+    least = _SPIKE_SHARE * np.max(size, axis=0, initial=0.0)
+    return bool(np.any((size[1:-1] > _SPIKE * beside) & (size[1:-1] > least)))
 
 
 def _lesser(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -241,10 +253,13 @@ def _filtered(structure: Structure) -> bool:
 
 
 class _Runs:
-    """Runs of FMUs in processes; those that were are kept, and `count` is how many there were."""
+    """Runs of FMUs in processes; those that were are kept.
+
+    `count` is how many there were, `samples` how many samples they had.
+    """
 
     def __init__(self) -> None:
-        self.count = 0
+        self.count = self.samples = 0
         self._kept: OrderedDict[str, FloatArray | str] = OrderedDict()
         self._processes: Processes | None = None
         self._lock = threading.Lock()
@@ -274,7 +289,7 @@ class _Runs:
         return [r for r in results if not isinstance(r, str)]
 
     def _submitted(self, wanted: Run) -> "Future[Any]":
-        self.count += 1
+        self.count, self.samples = self.count + 1, self.samples + len(wanted.t)
         if self._processes is None:
             self._processes = Processes(threads())
             atexit.register(self.end)

@@ -150,8 +150,9 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
         if not quick:
             hidden.append(_diagnosed(case, path, progress))
     note = (
-        "Off: distance from the truth in standard errors. Runs: simulations of the FMU, where it is"
-        " run as a whole. Cost: half the sum of squares over the noise, ours over the peer's."
+        "Off: distance from the truth in standard errors. Runs: simulations of whole records"
+        " by the FMU, where it is run as a whole. Cost: half the sum of squares over the noise,"
+        " ours over the peer's."
     )
     tables = [TitledTable("Parameters of FMUs, beside SciPy's least_squares", found, note)]
     return Outcome([*tables, TitledTable("What hides around them", hidden)] if hidden else tables)
@@ -198,9 +199,9 @@ def _model(case: Case, path: Path, free: Mapping[str, tuple[float, float]]) -> p
 def _identified(case: Case, path: Path) -> Row:
     model, record = _model(case, path, case.free), record_of(case)
     RUNS.forget()
-    runs, begin = RUNS.count, perf_counter()
+    samples, begin = RUNS.samples, perf_counter()
     found = psa.identify(model, record, known_start=True)
-    took, runs = perf_counter() - begin, RUNS.count - runs
+    took, runs = perf_counter() - begin, (RUNS.samples - samples) / _SAMPLES
     names = [_plain(n) for n in case.true]
     off = max(
         abs(found.model.values[n] - v) / found.errors[n]
@@ -210,7 +211,7 @@ def _identified(case: Case, path: Path) -> Row:
     peer, calls = _peer(model, case, record)
     return {
         "fmu": case.name, "kind": case.kind, "off": f"{off:.1f}",
-        "runs": runs if model.structure.played else "-", "runs of the peer": calls,
+        "runs": f"{runs:.0f}" if model.structure.played else "-", "runs of the peer": calls,
         "cost": f"{ours / peer:.5f}", "s": f"{took:.1f}",
     }  # fmt: skip
 
