@@ -40,9 +40,9 @@ _ALSO = {4: {"life cycle", "state saved"}}
 
 
 @cache
-def faulty(number: int) -> Path:
-    """Return the FMU with a fault, 0 for none."""
-    folder = Path(_FOLDER.name) / str(number)
+def faulty(number: int, lines: str = "false") -> Path:
+    """Return the FMU with a fault, 0 for none, that takes `lines` as inputs or does not say so."""
+    folder = Path(_FOLDER.name) / f"{number}{lines}"
     folder.mkdir()
     library = folder / f"filter{fmpy.sharedLibraryExtension}"
     (folder / "filter.c").write_bytes((_SOURCES / "filter.c").read_bytes())
@@ -51,7 +51,7 @@ def faulty(number: int) -> Path:
     said = (_SOURCES / "modelDescription.xml").read_text("utf-8")
     initial = "" if number == 10 else '<Unknown index="4"/>'
     with zipfile.ZipFile(folder / "filter.fmu", "w") as archive:
-        text = said.format(known="1" if number == 8 else "1 3", initial=initial)
+        text = said.format(known="1" if number == 8 else "1 3", initial=initial, lines=lines)
         archive.writestr("modelDescription.xml", text)
         archive.write(library, f"binaries/{fmpy.platform}/{library.name}")
     return folder / "filter.fmu"

@@ -1,14 +1,30 @@
-/* x' = k (u - x), y = x + u: an FMU of FMI 2.0 that has one FAULT by its number, or none with 0. */
+/* x' = k (u - x), y = x + u: an FMU of FMI 2.0 that has one FAULT by its number, or none with 0.
+   What is called it appends to the file that FMU_CALLS names in the environment, if there is one. */
+#include <stdarg.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "fmi2Functions.h"
 
 enum { X, DER, U, Y, K, COUNT };
+static const char *const NAMES[COUNT] = {"x", "der(x)", "u", "y", "k"};
 typedef struct {
     double v[COUNT];
     int event;
 } body;
+
+static void say(const char *format, ...) {
+    const char *place = getenv("FMU_CALLS");
+    FILE *file = place ? fopen(place, "a") : NULL;
+    if (file) {
+        va_list words;
+        va_start(words, format);
+        vfprintf(file, format, words);
+        va_end(words);
+        fclose(file);
+    }
+}
 
 static double shared;
 static void *volatile lost;
@@ -44,13 +60,25 @@ fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean a, size_t n, const f
 }
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean a, fmi2Real b, fmi2Real d,
                                fmi2Boolean e, fmi2Real f) {
-    (void)c, (void)a, (void)b, (void)d, (void)e, (void)f;
+    (void)c, (void)a, (void)b, (void)e;
+    say("SetupExperiment from %g, stop %s\n", d, e ? "defined" : "not defined");
+    (void)f;
     return fmi2OK;
 }
-fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return c ? fmi2OK : fmi2Error; }
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return c ? fmi2OK : fmi2Error; }
-fmi2Status fmi2Terminate(fmi2Component c) { return c ? fmi2OK : fmi2Error; }
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
+    say("EnterInitializationMode\n");
+    return c ? fmi2OK : fmi2Error;
+}
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
+    say("ExitInitializationMode\n");
+    return c ? fmi2OK : fmi2Error;
+}
+fmi2Status fmi2Terminate(fmi2Component c) {
+    say("Terminate\n");
+    return c ? fmi2OK : fmi2Error;
+}
 fmi2Status fmi2Reset(fmi2Component c) {
+    say("Reset\n");
     if (FAULT != 3) {
         start(c);
     }
@@ -60,6 +88,7 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference r[], size_t n,
                        const fmi2Real v[]) {
     body *b = c;
     for (size_t k = 0; k < n; k++) {
+        say("Set %s = %.6g\n", NAMES[r[k]], v[k]);
         if (!(FAULT == 2 && r[k] == K) && !(FAULT == 12 && b->event && r[k] == U)) {
             b->v[r[k]] = v[k];
         }
@@ -71,6 +100,7 @@ fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference r[], size_t n, 
     rates(b);
     for (size_t k = 0; k < n; k++) {
         v[k] = b->v[r[k]];
+        say("Get %s\n", NAMES[r[k]]);
     }
     return fmi2OK;
 }
@@ -155,7 +185,8 @@ fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean a, fmi2Boole
     return fmi2OK;
 }
 fmi2Status fmi2SetTime(fmi2Component c, fmi2Real t) {
-    (void)c, (void)t;
+    (void)c;
+    say("SetTime %.6g\n", t);
     return fmi2OK;
 }
 fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t n) {
@@ -164,6 +195,7 @@ fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t n
 }
 fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real d[], size_t n) {
     (void)n, rates(c);
+    say("GetDerivatives with u = %.6g\n", ((body *)c)->v[U]);
     d[0] = ((body *)c)->v[DER];
     return fmi2OK;
 }
@@ -181,7 +213,8 @@ fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x[], size
 }
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real now, fmi2Real h, fmi2Boolean a) {
     body *b = c;
-    (void)now, (void)a;
+    (void)a;
+    say("DoStep from %.6g by %.6g\n", now, h);
     if (FAULT == 9 && (h < 0.0099 || h > 0.0101)) {
         return fmi2Error;
     }
@@ -196,8 +229,11 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real now, fmi2Real h, fmi2Boolean a) 
 fmi2Status fmi2CancelStep(fmi2Component c) { return c ? fmi2OK : fmi2Error; }
 fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference r[], size_t n,
                                        const fmi2Integer o[], const fmi2Real v[]) {
-    (void)c, (void)r, (void)n, (void)o, (void)v;
-    return fmi2Error;
+    (void)c, (void)o;
+    for (size_t k = 0; k < n; k++) {
+        say("Set derivative of %s = %.6g\n", NAMES[r[k]], v[k]);
+    }
+    return fmi2OK;
 }
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference r[], size_t n,
                                         const fmi2Integer o[], fmi2Real v[]) {
