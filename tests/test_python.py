@@ -244,6 +244,11 @@ def symbol_names(c: psa.Component) -> list[str]:
     return [f"{n} = {ca.SX(e)}" for part in (made.der, made.add, made.out) for n, e in part.items()]
 
 
+def _lag() -> psa.Model:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    return psa.ode_model({"x": x, "u": u, "ode": u - x}, name="lag")
+
+
 #: By public class: an example, and what it answers.
 EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     "Model": (stack, driven),
@@ -300,6 +305,7 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     "Job": (lambda: psa.Job("a", ("a.csv",), "b", date(2026, 1, 2)), lambda j: [j]),
     "Options": (psa.Options, lambda o: [o]),
     "BatchRun": (lambda: psa.BatchRun(Path("x"), (), (), 1, 2.0, ()), lambda b: [b, b.counts]),
+    "Linear": (lambda: psa.linearize(_lag()), lambda v: [repr(v), v.a, v.to_json()]),
     "CodeExport": (
         lambda: psa.CodeExport(Path("a.h"), Path("a.c"), 2, ()), lambda c: [c],
     ),

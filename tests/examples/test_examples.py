@@ -182,7 +182,7 @@ def test_every_notebook_is_in_the_menu() -> None:
     menu = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
     pages = next(section["Tutorials"] for section in menu if "Tutorials" in section)
     assert sorted(pages) == [f"{FOLDER}/{path.stem}.md" for path in NOTEBOOKS]
-    assert len(pages) == 8
+    assert len(pages) == 9
 
 
 def test_a_picture_is_described_by_the_heading_above_it() -> None:
