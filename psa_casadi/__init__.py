@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from psa_casadi.effects import EFFECTS
     from psa_casadi.errors import InputError, MachineError, PsaError
     from psa_casadi.export.check.check import CheckReport, check_fmu
+    from psa_casadi.export.extended import export_extended
     from psa_casadi.export.fixed_step.export import CodeExport, export_c
     from psa_casadi.export.fmu.archive import export_fmu
     from psa_casadi.export.importer.fmu_model import fmu_model
@@ -151,6 +152,7 @@ _HOMES = {
     "export.ssp": "export_ssp",
     "export.importer.fmu_model": "fmu_model",
     "export.importer.start_values": "save_start_values",
+    "export.extended": "export_extended",
     "export.check.check": "CheckReport check_fmu",
     "errors": "InputError MachineError PsaError",
 }
@@ -163,7 +165,7 @@ __all__ = [
     "Symbols", "own_effects", "patched_model", "STACKS", "stack_model", "Model", "compose",
     "PARTS", "part_model", "compensator_for", "controller_for", "margins_of", "System", "connect",
     "nanopositioner", "ode_model", "table", "fmu_model",
-    "save_start_values", "Input", "Output", "Parameter",
+    "save_start_values", "export_extended", "Input", "Output", "Parameter",
     "Publication", "State", "load_model", "save_model", "Trajectory", "simulate", "simulate_record",
     "simulate_many", "memory_after", "settled_at", "run", "Identification",
     "identify", "sample", "Posterior", "diagnose", "Diagnosis", "StackDiagnosis",

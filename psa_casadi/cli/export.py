@@ -13,6 +13,7 @@ import typer
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Given, step_seconds
 from psa_casadi.cli.options import PartName, Published, StackName, Start, names
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, tell_written, working
 from psa_casadi.files import atomic_write, make_folder
 
@@ -257,6 +258,9 @@ def ssp(
 ) -> None:
     """Write a nanopositioner as SSP: controller, compensator, amplifier, stack, flexure, wired.
 
+    The file of an FMU's model, as `psa diagnose --fmu` writes it, becomes that FMU between FMUs of
+    the effects that were found at its inputs and outputs.
+
     Options:
         output: SSP archive to write.
         stack: Named stack in place of a model; `psa stacks` lists them.
@@ -274,6 +278,13 @@ def ssp(
         given.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     given.attempt(lambda: chosen_platforms(wanted))
+    found = own_model(given, model, Fitting())
+    if found is not None and found.structure.foreign:
+        given.refuse({"--picture": picture, "--stack": stack, "--no-compensator": no_compensator})
+        given.check()
+        psa.export_extended(found, output, platforms=wanted)
+        tell_written(output, quiet=given.quiet)
+        return
     chosen = given.model_or_stack(model, stack or (DEFAULT_STACK if model is None else None))
     chosen = given.published(chosen, published)
     system = None

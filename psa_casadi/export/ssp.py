@@ -60,12 +60,18 @@ class WiredParts:
     """A system as SSP sees it: models by the names of the parts, wires, and its own ports.
 
     A wire from or to `OUTSIDE` makes a port of the system, with the unit of the part's port.
+    `names` are other names of ports in their FMU.
     """
 
     name: str
     parts: Mapping[str, Model]
     wires: tuple[Wire, ...]
     publication: Publication = field(default_factory=Publication)
+    names: Mapping[Port, str] = field(default_factory=dict)
+
+    def called(self, port: Port) -> str:
+        """Return the name of a port in its FMU."""
+        return self.names.get(port, port.name)
 
     def unit(self, port: Port) -> str:
         """Return the unit of a port; that of the system is the unit of what it is wired to."""

@@ -90,12 +90,18 @@ class SspArchive:
         return {d.name for d in unknown.dependencies or () if d.causality == "input"}
 
 
+def _number(text: str) -> float:
+    return float({"true": "1", "false": "0"}.get(text, text))
+
+
 def _parameters(system: Any) -> dict[str, dict[str, float]]:
     """Return the parameters of each part from the sets of the parts, then those of the system."""
     found: dict[str, dict[str, float]] = {c.name: {} for c in system.elements}
     for owner in (*system.elements, system):
         for binding in owner.parameterBindings:
-            given = {p.name: float(p.value) for s in binding.parameterValues for p in s.parameters}
+            given = {
+                p.name: _number(p.value) for s in binding.parameterValues for p in s.parameters
+            }
             if owner is not system:
                 found[owner.name] |= given
                 continue

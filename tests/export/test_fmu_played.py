@@ -16,12 +16,14 @@ from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_model import FmuInterface
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.importer.play import communication_points
 from psa_casadi.export.importer.played import RUNS
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.simulation.start import begun
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
+from tests.export.ssp_master import SspArchive, couple
 from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, supplied
 from tests.export.test_fmu_model import pendulum
 
@@ -207,6 +209,34 @@ def test_the_commands_take_it_and_write_start_values(tmp_path: Path) -> None:
     assert float(str(starts["area"])) == pytest.approx(value)
     assert value == pytest.approx(0.7, rel=0.01)
     rows = ET.parse(tmp_path / "fit.ssv").getroot().findall(".//{*}Parameter")
-    assert [(r.get("name"), r[0].get("unit")) for r in rows] == [("area", None)]
+    assert [(r.get("name"), r[0].get("unit")) for r in rows] == [("area", None), ("valve", None)]
     bad = CliRunner().invoke(app, ["identify", "--free", "area=1:2", str(record)])
     assert "add --fmu FILE.fmu" in bad.output
+
+
+def test_what_was_found_around_an_fmu_stands_around_it_in_an_ssp(tmp_path: Path) -> None:
+    model = psa.fmu_model(supplied("tank"), free=AREA, values={"valve": 1.0})
+    sizes = Sizes({"inflow": 0.05, "level": 0.6}, {}, 0.2, 100.0)
+    table = {e.name: e for e in effects_of(model, sizes)}
+    found = extended(model, [table["gain_of_inflow"], table["lag_of_level"]])
+    values = {"area": 0.7, "gain_of_inflow_size": -0.12, "lag_of_level_time": 3.0}
+    path = psa.export_extended(found.with_values(values), tmp_path / "tank.ssp", step=0.05)
+    fine = np.linspace(0.0, 100.0, 2001)
+    flow = np.interp(fine, TIMES, INFLOW)[:, None]
+    with SspArchive(path) as archive:
+        assert archive.parameters["original"] == {"area": 0.7, "valve": 1.0}
+        shown = couple(
+            archive, fine, Signals(("inflow",), fine, flow), ["level"], rates=False
+        )[:, 0]  # fmt: skip
+    truth = lagged(level(0.7, 0.01, 0.88 * INFLOW), 3.0)
+    assert np.interp(TIMES, fine, shown) == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
+    with zipfile.ZipFile(path) as inside:
+        assert inside.read("resources/original.fmu") == supplied("tank").read_bytes()
+        root = ET.fromstring(inside.read("resources/original.ssv"))
+    kinds = {p.get("name"): p[0].tag.rpartition("}")[2] for p in root.iterfind(".//{*}Parameter")}
+    assert kinds == {"area": "Real", "valve": "Boolean"}
+    with pytest.raises(psa.InputError, match="is of no FMU"):
+        psa.export_extended(_own(), tmp_path / "none.ssp")
+    smooth = psa.fmu_model(pendulum(), free={"length": (0.1, 5.0)})
+    with pytest.raises(psa.InputError, match="has no co-simulation, which an SSP needs"):
+        psa.export_extended(smooth, tmp_path / "none.ssp")

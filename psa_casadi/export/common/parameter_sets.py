@@ -57,15 +57,26 @@ def parameter_rows(model: Model, values: Mapping[str, float] | None = None) -> l
     return rows
 
 
-def set_text(name: str, rows: Sequence[Row]) -> str:
-    """Return a parameter set (SSV), with the definitions of its units; a row may have none, ""."""
+def set_text(name: str, rows: Sequence[Row], kinds: Mapping[str, str] | None = None) -> str:
+    """Return a parameter set (SSV), with the definitions of its units; a row may have none, "".
+
+    `kinds` are the types of parameters of an FMU that are no real numbers.
+    """
+    words = {"Boolean": ("false", "true")}
+
+    def typed(title: str, value: float) -> tuple[str, str]:
+        """Return the element of SSV, and the value as it has it."""
+        kind = (kinds or {}).get(title)
+        if kind is None:
+            return "Real", number(value)
+        element = kind if kind in words else "Integer"
+        return element, words[kind][round(value)] if kind in words else str(round(value))
+
     return xml_text(
         "parameters.xml",
         name=name,
         tool=generation_tool(),
-        rows=[
-            (title, meaning, number(value), unit or None) for title, meaning, value, unit in rows
-        ],
+        rows=[(n, meaning, *typed(n, value), unit or None) for n, meaning, value, unit in rows],
         units={u: base_unit(parse_unit(u)) for u in sorted({unit for *_, unit in rows if unit})},
     )
 

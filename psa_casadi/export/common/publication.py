@@ -69,6 +69,6 @@ def refuse_foreign(structure: Structure, what: str) -> None:
         (own, *_) = (c for c in structure.components if c.foreign)
         raise InputError(
             f"The model has an FMU in it ('{own.name}': {own.source}), which is a binary without"
-            f" equations to write as {what}; add the effects to the model in the tool that made the"
-            " FMU. Here it can be simulated, identified and diagnosed."
+            f" equations to write as {what}. Effects at its inputs and outputs can stand around it"
+            " in an SSP: psa.export_extended, or psa export ssp --model MODEL.json."
         )

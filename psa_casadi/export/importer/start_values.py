@@ -36,10 +36,7 @@ def save_start_values(model: Model, path: str | os.PathLike[str]) -> tuple[Note,
     component = own[0]
     values = fmu_values(model, component)
     if target.suffix.lower() == ".ssv":
-        known = dict(zip((p.name for p in component.parameters), values, strict=True))
-        rows = parameter_rows(model)
-        told = [(known[n], m, v, "" if u == "1" else u) for n, m, v, u in rows if n in known]
-        atomic_write(target, set_text(component.name, told))
+        atomic_write(target, start_set(model, component))
         return ()
     if target.suffix.lower() != ".fmu":
         raise InputError(f"{target}: start values are written to NAME.fmu or NAME.ssv; name it so.")
@@ -47,6 +44,22 @@ def save_start_values(model: Model, path: str | os.PathLike[str]) -> tuple[Note,
     with atomic_path(target) as temporary:
         _copy(place, temporary, values)
     return _kept_by(target, values)
+
+
+def start_set(model: Model, component: Component) -> str:
+    """Return the parameters of an FMU as a parameter set (SSV), in the names that it has.
+
+    And what else was set in it.
+    """
+    own = (p.name for p in component.parameters)
+    known = dict(zip(own, fmu_values(model, component), strict=True))
+    rows = parameter_rows(model)
+    told = [(known[n], m, v, "" if u == "1" else u) for n, m, v, u in rows if n in known]
+    fixed = component.foreign.fmu.values if component.foreign else {}
+    told += [(n, "as it was set", v, "") for n, v in fixed.items()]
+    with Archive(Path(component.foreign.place if component.foreign else "")) as archive:
+        kinds = {n: archive.elements[n].type for n, *_ in told if not archive.elements[n].real}
+    return set_text(component.name, told, kinds)
 
 
 def fmu_values(model: Model, component: Component) -> dict[str, float]:

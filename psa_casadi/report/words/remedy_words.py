@@ -258,6 +258,11 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
     if not (stack or model_file or added(d)):
         return (), ()  # what there is of one's own is its equations
     file = model_file or _FILES[added(d)]
+    if d.model.structure.foreign:
+        around = d.causes and all(c.belongs_to in ("drive", "sensor") for c in d.causes)
+        ssp = shlex.quote(str(PurePath(file).with_suffix(".ssp")))
+        command = f"psa export ssp --model {shlex.quote(file)} -o {ssp}"
+        return ((command,) if around and model_file else ()), ()
     fmu = shlex.quote(str(PurePath(file).with_suffix(".fmu")))
     model = f"--model {shlex.quote(file)}"
     commands = [f"psa export fmu {model} -o {fmu}"]
