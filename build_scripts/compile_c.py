@@ -73,6 +73,36 @@ def write(directory: Path, texts: Mapping[str, str], copied: Iterable[str] = ())
     return directory
 
 
+#: What psa_casadi.export.nested writes of two parts with one wire.
+_NESTED = """
+#define NESTED_PARTS 2
+#define NESTED_WIRES 1
+#define NESTED_SHOWN 1
+#define NESTED_STARTS 1
+#define NESTED_TOKEN "{token}"
+#define NESTED_PLATFORM "linux64"
+#define NESTED_SUFFIX ".so"
+static const struct {
+    const char *folder, *identifier, *token;
+    int lines;
+} NESTED[] = {{"a", "a", "a", 1}, {"b", "b", "b", 0}};
+static const struct {
+    fmi2ValueReference output, input;
+    int from, to;
+} WIRES[] = {{1u, 2u, 0, 1}, {0u, 0u, -1, -1}};
+static const struct {
+    fmi2ValueReference variable;
+    int part;
+} SHOWN[] = {{1u, 1}};
+static const struct {
+    fmi2ValueReference variable;
+    int part;
+    char kind;
+    double value;
+} STARTS[] = {{1u, 1, 'R', 1.0}, {0u, 0, 0, 0.0}};
+"""
+
+
 def write_all(sources: Path) -> list[Work]:
     """Write every source into folders of its own; return what is to be compiled.
 
@@ -89,6 +119,7 @@ def write_all(sources: Path) -> list[Work]:
     sizes = "".join(f"#define PSA_N{k} {n}\n" for k, n in zip("XUPY", (2, 1, 3, 1), strict=True))
     config = {"imported_config.h": f"#define PSA_IMPORTED_NAME fmu_f\n{sizes}"}
     write(sources / "imported", config, ("imported.c", "imported.h"))
+    write(sources / "nested", {"nested_config.h": _NESTED}, ("nested.c",))
     work = [
         Work(tuple(sorted(folder.glob("*.c"))), (folder, headers))
         for folder in sorted(sources.iterdir())

@@ -122,6 +122,8 @@ def fmu(
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive.
 
+    The file of an FMU's model becomes an FMU of FMI 2.0 that holds the original and the effects.
+
     Options:
         output: FMU to write.
         fmi: Version of the standard.
@@ -157,6 +159,10 @@ def fmu(
     chosen = given.model_or_stack(model, stack, part=part, any_model=True)
     chosen = given.ready(given.published(given.started(chosen, start), published))
     targets = given.ready(targets)
+    if chosen.structure.foreign:
+        psa.export_extended(chosen, output)
+        tell_written(output, quiet=given.quiet)
+        return
     with working("compiling", given.quiet) as progress:
         progress(", ".join(t.name for t in targets))
         psa.export_fmu(

@@ -16,7 +16,8 @@ from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
-from psa_casadi.export.importer.start_values import fmu_values, start_set
+from psa_casadi.export.importer.start_values import fmu_starts, fmu_values, start_set
+from psa_casadi.export.nested import nested
 from psa_casadi.export.ssp import (
     OUTSIDE,
     PICTURE_ENTRY,
@@ -57,11 +58,15 @@ def export_extended(
     step: float | None = None,
     platforms: Sequence[str] = ("host",),
 ) -> Path:
-    """Write the model of an FMU with effects at its inputs and outputs as an SSP; return its path.
+    """Write the model of an FMU with effects at its inputs and outputs, and return its path.
 
-    The archive (SSP 1.0) has the FMU as it is, its parameters as a set, and an FMU of FMI 2.0 with
-    the effects of inputs, and one with those of outputs. A master steps the parts: what one shows
-    acts on the next one `step` [s] later, by default the FMU's step size.
+    NAME.ssp is an archive (SSP 1.0) of the FMU as it is, its parameters as a set, and FMUs of FMI
+    2.0 with the effects of inputs and of outputs. A master steps the parts: what one shows acts on
+    the next one `step` [s] later, by default the FMU's step size.
+
+    NAME.fmu is one FMU of FMI 2.0 for co-simulation, for this machine's platform, with the others
+    in its resources. It steps them in turn, each with a line of what the one before shows: nothing
+    is late. The FMU in it must be of FMI 2.0.
 
     Raises InputError for a model that is of no FMU, one without co-simulation, and for effects in
     rates, which are inside; and as `export_fmu`.
@@ -69,34 +74,50 @@ def export_extended(
     own = [c for c in model.components if c.foreign]
     if not own or own[0].foreign is None:
         raise InputError(f"The model '{model.name}' is of no FMU; write it with psa.export_fmu.")
-    component, foreign = own[0], own[0].foreign
-    place = Path(foreign.place)
+    component, file = own[0], own[0].foreign.fmu.file
+    target, place = Path(path), Path(own[0].foreign.place)
+    single = target.suffix.lower() == ".fmu"
     with Archive(place) as archive:
         if archive.description.coSimulation is None:
-            raise InputError(f"{foreign.fmu.file} has no co-simulation, which an SSP needs.")
+            raise InputError(f"{file} has no co-simulation, which can stand between effects.")
+        if single and archive.version != 2:
+            raise InputError(f"{file} is of FMI 3.0, which no FMU holds here; write NAME.ssp.")
+    wiring = _wired(model, component, _by_place(model, component))
+    with temporary_folder() as folder:
+        fmus = {_ORIGINAL: place}
+        for name, part in wiring.parts.items():
+            if name != _ORIGINAL:
+                fmus[name] = export_fmu(
+                    part, folder / f"{name}.fmu", name=name, include_sensor=True,
+                    platforms=platforms,
+                )  # fmt: skip
+        if single:
+            entries = nested(wiring, fmus, fmu_starts(model, component))
+        else:
+            entries = _system(model, component, wiring, step)
+            entries |= {f"resources/{n}.fmu": f.read_bytes() for n, f in fmus.items()}
+    with atomic_path(target) as temporary:
+        write_archive(temporary, entries)
+    return target
+
+
+def _system(
+    model: Model, component: Component, wiring: WiredParts, step: float | None
+) -> dict[str, bytes]:
+    """Return the description of an SSP, its parameter sets and picture."""
+    with Archive(Path(component.foreign.place if component.foreign else "")) as archive:
         size = step or archive.step_size
-        end = float(getattr(archive.description.defaultExperiment, "stopTime", None) or 1000 * size)
-    groups = _by_place(model, component)
-    wiring = _wired(model, component, groups)
+        stop = getattr(archive.description.defaultExperiment, "stopTime", None)
     layout = layout_of(wiring)
     others = {name: part for name, part in wiring.parts.items() if name != _ORIGINAL}
     entries, bindings = parameter_files(others, model.name)
-    if fmu_values(model, component):
+    if fmu_starts(model, component):
         entries[_PARAMETERS] = start_set(model, component).encode("utf-8")
         bindings = (*bindings, Binding(_ORIGINAL, _PARAMETERS))
-    text = structure_description(wiring, layout, bindings, end, size)
+    text = structure_description(wiring, layout, bindings, float(stop or 1000 * size), size)
     entries["SystemStructure.ssd"] = text.encode("utf-8")
     entries[PICTURE_ENTRY] = wiring_picture(wiring, layout, "svg")
-    entries[f"resources/{_ORIGINAL}.fmu"] = place.read_bytes()
-    with temporary_folder() as folder:
-        for name, part in others.items():
-            fmu = export_fmu(
-                part, folder / f"{name}.fmu", name=name, include_sensor=True, platforms=platforms
-            )
-            entries[f"resources/{name}.fmu"] = fmu.read_bytes()
-    with atomic_path(path) as temporary:
-        write_archive(temporary, entries)
-    return Path(path)
+    return entries
 
 
 def _by_place(model: Model, component: Component) -> dict[str, list[Component]]:

@@ -214,13 +214,18 @@ def test_the_commands_take_it_and_write_start_values(tmp_path: Path) -> None:
     assert "add --fmu FILE.fmu" in bad.output
 
 
-def test_what_was_found_around_an_fmu_stands_around_it_in_an_ssp(tmp_path: Path) -> None:
+def _with_effects() -> psa.Model:
     model = psa.fmu_model(supplied("tank"), free=AREA, values={"valve": 1.0})
     sizes = Sizes({"inflow": 0.05, "level": 0.6}, {}, 0.2, 100.0)
     table = {e.name: e for e in effects_of(model, sizes)}
     found = extended(model, [table["gain_of_inflow"], table["lag_of_level"]])
     values = {"area": 0.7, "gain_of_inflow_size": -0.12, "lag_of_level_time": 3.0}
-    path = psa.export_extended(found.with_values(values), tmp_path / "tank.ssp", step=0.05)
+    return found.with_values(values)
+
+
+def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
+    found = _with_effects()
+    path = psa.export_extended(found, tmp_path / "tank.ssp", step=0.05)
     fine = np.linspace(0.0, 100.0, 2001)
     flow = np.interp(fine, TIMES, INFLOW)[:, None]
     with SspArchive(path) as archive:
@@ -235,8 +240,26 @@ def test_what_was_found_around_an_fmu_stands_around_it_in_an_ssp(tmp_path: Path)
         root = ET.fromstring(inside.read("resources/original.ssv"))
     kinds = {p.get("name"): p[0].tag.rpartition("}")[2] for p in root.iterfind(".//{*}Parameter")}
     assert kinds == {"area": "Real", "valve": "Boolean"}
+    one = psa.export_extended(found, tmp_path / "tank.fmu")
+    given = np.array([*zip(fine, flow[:, 0], strict=True)], [("time", float), ("inflow", float)])
+    played = fmpy.simulate_fmu(
+        str(one), stop_time=100.0, output_interval=0.05, input=given, output=["level"]
+    )
+    shown = np.interp(TIMES, played["time"], played["level"])
+    assert shown == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
+    ball = psa.fmu_model(supplied("ball"), free={"g": (5.0, 20.0)})
+    with pytest.raises(psa.InputError, match=r"is of FMI 3\.0, which no FMU holds here"):
+        psa.export_extended(ball, tmp_path / "ball.fmu")
     with pytest.raises(psa.InputError, match="is of no FMU"):
         psa.export_extended(_own(), tmp_path / "none.ssp")
     smooth = psa.fmu_model(pendulum(), free={"length": (0.1, 5.0)})
-    with pytest.raises(psa.InputError, match="has no co-simulation, which an SSP needs"):
+    with pytest.raises(
+        psa.InputError, match="has no co-simulation, which can stand between effects"
+    ):
         psa.export_extended(smooth, tmp_path / "none.ssp")
+
+
+@pytest.mark.slow
+def test_an_fmu_that_holds_another_one_keeps_to_the_standard(tmp_path: Path) -> None:
+    path = psa.export_extended(_with_effects(), tmp_path / "tank.fmu")
+    assert {r.name for r in psa.check_fmu(path, foreign=True).failures} <= {"memory"}  # PythonFMU's

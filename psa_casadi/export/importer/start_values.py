@@ -68,6 +68,12 @@ def fmu_values(model: Model, component: Component) -> dict[str, float]:
     return {n: model.values[p.name] for n, p in zip(names, component.parameters, strict=True)}
 
 
+def fmu_starts(model: Model, component: Component) -> dict[str, float]:
+    """Return what is set in an FMU before its initialization, by the names in it."""
+    fixed = component.foreign.fmu.values if component.foreign else {}
+    return {**fixed, **fmu_values(model, component)}
+
+
 def _copy(place: Path, target: Path, values: Mapping[str, float]) -> None:
     """Copy an FMU with other start values in its description."""
     with Archive(place) as of:

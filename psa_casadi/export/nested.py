@@ -1,0 +1,197 @@
+"""FMUs in the resources of one FMU, which steps them in turn (fmu_src/nested.c)."""
+
+import hashlib
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from fmpy.model_description import (
+    CoSimulation,
+    ModelDescription,
+    ModelVariable,
+    Unknown,
+    write_model_description,
+)
+
+from psa_casadi.export.common.markup import generation_tool
+from psa_casadi.export.fmu.platforms import compile_library, host_platform
+from psa_casadi.export.fmu.sources import FMI_HEADERS
+from psa_casadi.export.importer.archive import Archive
+from psa_casadi.export.ssp import OUTSIDE, Port, WiredParts
+from psa_casadi.files import temporary_folder
+from psa_casadi.simulation.compiler import sources_directory
+
+_IDENTIFIER = "nested"
+#: Kinds of start values in nested_config.h by the type of a variable.
+_KINDS = {"Integer": "I", "Enumeration": "I", "Boolean": "B"}
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """A variable of the FMU: which one of a part it is, what it is called, where it starts."""
+
+    name: str
+    part: str
+    variable: str
+    causality: str
+    start: float | None = None
+
+
+def nested(
+    wiring: WiredParts, fmus: Mapping[str, Path], starts: Mapping[str, float]
+) -> dict[str, bytes]:
+    """Return the entries of an FMU that holds others, in the order in which they are stepped.
+
+    `starts` are those of the part that is not ours, by the names in it. Raises MachineError where
+    it cannot be compiled.
+    """
+    archives = {name: Archive(fmus[name]) for name in wiring.parts}
+    try:
+        shown = _shown(wiring, archives, starts)
+        digest = hashlib.sha256(repr((shown, *(f.read_bytes() for f in fmus.values()))).encode())
+        token = f"{{{uuid.UUID(digest.hexdigest()[:32])}}}"
+        target = host_platform()
+        headers = files("fmpy") / "c-code"
+        texts = {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[2]}
+        texts["nested.c"] = (sources_directory() / "nested.c").read_text(encoding="utf-8")
+        texts["nested_config.h"] = _config(wiring, archives, shown, token)
+        binary = compile_library(texts, _IDENTIFIER, target)
+        entries = {f"binaries/{target.binaries(2)}/{_IDENTIFIER}{target.suffix}": binary}
+        for name, archive in archives.items():
+            for file in archive.directory.rglob("*"):
+                if file.is_file():
+                    place = file.relative_to(archive.directory).as_posix()
+                    entries[f"resources/{name}/{place}"] = file.read_bytes()
+        entries["modelDescription.xml"] = _description(wiring, archives, shown, token)
+        return entries
+    finally:
+        for archive in archives.values():
+            archive.__exit__()
+
+
+def _shown(
+    wiring: WiredParts, archives: Mapping[str, Archive], starts: Mapping[str, float]
+) -> list[_Shown]:
+    """Return the variables: what is wired outside, and the parameters of every part."""
+    found = []
+    for wire in wiring.wires:
+        if wire.start.part == OUTSIDE:
+            start = _start(archives, wire.end.part, wiring.called(wire.end))
+            found.append(
+                _Shown(wire.start.name, wire.end.part, wiring.called(wire.end), "input", start)
+            )
+        elif wire.end.part == OUTSIDE:
+            found.append(
+                _Shown(wire.end.name, wire.start.part, wiring.called(wire.start), "output")
+            )
+    for name, archive in archives.items():
+        for v in archive.description.modelVariables:
+            if v.causality == "parameter" and v.type in ("Real", *_KINDS):
+                start = starts.get(v.name, _start(archives, name, v.name))
+                own = v.name if v.name not in [f.name for f in found] else f"{name}.{v.name}"
+                found.append(_Shown(own, name, v.name, "parameter", start))
+    inputs = {n for f in found for n in [f.variable] if f.causality == "input"}
+    others = [n for n in archives["original"].names("input") if n in starts and n not in inputs]
+    found += [_Shown(n, "original", n, "input", starts[n]) for n in others]
+    return found
+
+
+def _start(archives: Mapping[str, Archive], part: str, name: str) -> float:
+    element = archives[part].elements[name]
+    return element.starts[element.place]
+
+
+def _config(
+    wiring: WiredParts, archives: Mapping[str, Archive], shown: list[_Shown], token: str
+) -> str:
+    """Return nested_config.h."""
+    order, target = list(archives), host_platform()
+
+    def reference(port: Port) -> int:
+        return archives[port.part].references[wiring.called(port)]
+
+    parts = [
+        f'{{"{n}", "{a.identifier}", "{a.token}", {int(_takes_lines(a))}}}'
+        for n, a in archives.items()
+    ]
+    inner = [w for w in wiring.wires if OUTSIDE not in (w.start.part, w.end.part)]
+    wires = [
+        f"{{{reference(w.start)}u, {reference(w.end)}u, {order.index(w.start.part)},"
+        f" {order.index(w.end.part)}}}"
+        for w in inner
+    ]
+    places = [
+        f"{{{archives[f.part].references[f.variable]}u, {order.index(f.part)}}}" for f in shown
+    ]
+    starts = [
+        f"{{{archives[f.part].references[f.variable]}u, {order.index(f.part)},"
+        f" '{_KINDS.get(archives[f.part].elements[f.variable].type, 'R')}', {f.start!r}}}"
+        for f in shown
+        if f.start is not None
+    ]
+    sizes = {"PARTS": parts, "WIRES": wires, "SHOWN": places, "STARTS": starts}
+    return "".join(
+        [
+            *(f"#define NESTED_{n} {len(q)}\n" for n, q in sizes.items()),
+            f'#define NESTED_TOKEN "{token}"\n',
+            f'#define NESTED_PLATFORM "{target.binaries(2)}"\n',
+            f'#define NESTED_SUFFIX "{target.suffix}"\n',
+            "static const struct {\n    const char *folder, *identifier, *token;\n    int lines;\n"
+            f"}} NESTED[] = {{{', '.join(parts)}}};\n",
+            "static const struct {\n    fmi2ValueReference output, input;\n    int from, to;\n"
+            f"}} WIRES[] = {{{', '.join([*wires, '{0u, 0u, -1, -1}'])}}};\n",
+            "static const struct {\n    fmi2ValueReference variable;\n    int part;\n"
+            f"}} SHOWN[] = {{{', '.join(places)}}};\n",
+            "static const struct {\n    fmi2ValueReference variable;\n    int part;\n"
+            "    char kind;\n    double value;\n"
+            f"}} STARTS[] = {{{', '.join([*starts, '{0u, 0, 0, 0.0}'])}}};\n",
+        ]
+    )
+
+
+def _takes_lines(archive: Archive) -> bool:
+    return bool(archive.description.coSimulation.canInterpolateInputs)
+
+
+def _description(
+    wiring: WiredParts, archives: Mapping[str, Archive], shown: list[_Shown], token: str
+) -> bytes:
+    """Return modelDescription.xml, as fmpy writes it."""
+    variables: list[Any] = []
+    for k, f in enumerate(shown):
+        of = archives[f.part].variables[f.variable]
+        real, start = of.type == "Real", None if f.start is None else repr(f.start)
+        if start is not None and not real:
+            start = str(bool(f.start)).lower() if of.type == "Boolean" else str(round(f.start or 0))
+        parameter = f.causality == "parameter"
+        variables.append(
+            ModelVariable(
+                name=f.name, valueReference=k, causality=f.causality,
+                type="Integer" if of.type == "Enumeration" else of.type,
+                start=start, description=of.description,
+                variability="fixed" if parameter else "continuous" if real else "discrete",
+                initial="exact" if parameter else "calculated" if f.causality == "output" else None,
+            )
+        )  # fmt: skip
+    outputs = [Unknown(variable=v) for v in variables if v.causality == "output"]
+    said = ModelDescription(
+        fmiVersion="2.0", modelName=wiring.name, instantiationToken=token,
+        description="an FMU with what was found at its inputs and outputs",
+        generationTool=generation_tool(), variableNamingConvention="flat",
+        defaultExperiment=archives["original"].description.defaultExperiment,
+        coSimulation=CoSimulation(
+            modelIdentifier=_IDENTIFIER,
+            canHandleVariableCommunicationStepSize=all(
+                a.description.coSimulation.canHandleVariableCommunicationStepSize
+                for a in archives.values()
+            ),
+            canInterpolateInputs="before" in archives or _takes_lines(archives["original"]),
+        ),
+        modelVariables=variables, outputs=outputs, initialUnknowns=outputs,
+    )  # fmt: skip
+    with temporary_folder() as folder:
+        write_model_description(said, folder / "modelDescription.xml")
+        return (folder / "modelDescription.xml").read_bytes()
