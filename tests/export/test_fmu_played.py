@@ -214,7 +214,8 @@ def test_the_commands_take_it_and_write_start_values(tmp_path: Path) -> None:
     assert "add --fmu FILE.fmu" in bad.output
 
 
-def _with_effects() -> psa.Model:
+def with_effects() -> psa.Model:
+    """Return the supplier's tank with an input gain of 0.88 and a sensor lag of 3 s."""
     model = psa.fmu_model(supplied("tank"), free=AREA, values={"valve": 1.0})
     sizes = Sizes({"inflow": 0.05, "level": 0.6}, {}, 0.2, 100.0)
     table = {e.name: e for e in effects_of(model, sizes)}
@@ -224,7 +225,7 @@ def _with_effects() -> psa.Model:
 
 
 def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
-    found = _with_effects()
+    found = with_effects()
     path = psa.export_extended(found, tmp_path / "tank.ssp", step=0.05)
     fine = np.linspace(0.0, 100.0, 2001)
     flow = np.interp(fine, TIMES, INFLOW)[:, None]
@@ -253,13 +254,11 @@ def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
     with pytest.raises(psa.InputError, match="is of no FMU"):
         psa.export_extended(_own(), tmp_path / "none.ssp")
     smooth = psa.fmu_model(pendulum(), free={"length": (0.1, 5.0)})
-    with pytest.raises(
-        psa.InputError, match="has no co-simulation, which can stand between effects"
-    ):
+    with pytest.raises(psa.InputError, match="has no co-simulation, which can stand between"):
         psa.export_extended(smooth, tmp_path / "none.ssp")
 
 
 @pytest.mark.slow
 def test_an_fmu_that_holds_another_one_keeps_to_the_standard(tmp_path: Path) -> None:
-    path = psa.export_extended(_with_effects(), tmp_path / "tank.fmu")
+    path = psa.export_extended(with_effects(), tmp_path / "tank.fmu")
     assert {r.name for r in psa.check_fmu(path, foreign=True).failures} <= {"memory"}  # PythonFMU's

@@ -14,6 +14,7 @@ from pathlib import Path
 from time import perf_counter
 
 import casadi as ca
+import fmpy
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
@@ -21,7 +22,8 @@ from scipy.optimize import least_squares
 import psa_casadi as psa
 from psa_casadi.export.importer.played import RUNS
 from psa_casadi.units import FloatArray
-from tests.export.supplied import bounces, supplied
+from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, supplied
+from tests.export.test_fmu_played import with_effects
 from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable
 
 _NOISE, _SAMPLES, _SEED = 0.01, 500, 7
@@ -155,7 +157,31 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
         " ours over the peer's."
     )
     tables = [TitledTable("Parameters of FMUs, beside SciPy's least_squares", found, note)]
-    return Outcome([*tables, TitledTable("What hides around them", hidden)] if hidden else tables)
+    if hidden:
+        tables.append(TitledTable("What hides around them", hidden))
+    if not only:
+        tables.append(TitledTable("The tank in an FMU with a gain and a lag, in fmpy", _held()))
+    return Outcome(tables)
+
+
+def _held() -> list[Row]:
+    """Return how long fmpy takes with an FMU, and with one that holds it; and how far it is off."""
+    held = psa.export_extended(with_effects(), Path(_FOLDER.name) / "held.fmu")
+    rows, points = list[Row](), np.linspace(0.0, 100.0, 2001)
+    flow = np.interp(points, TIMES, INFLOW)
+    given = np.array([*zip(points, flow, strict=True)], [("time", float), ("inflow", float)])
+    truth = lagged(level(0.7, 0.01, 0.88 * INFLOW), 3.0)
+    for name, path, starts in (("original", supplied("tank"), {"valve": True}), ("held", held, {})):
+        begin = perf_counter()
+        shown = fmpy.simulate_fmu(
+            str(path), stop_time=100.0, output_interval=0.05, input=given, output=["level"],
+            start_values=starts, validate=False,
+        )  # fmt: skip
+        took = perf_counter() - begin
+        off = np.max(np.abs(np.interp(TIMES, shown["time"], shown["level"]) - truth))
+        error = f"{off / np.ptp(truth):.2g}" if name == "held" else "-"
+        rows.append({"fmu": name, "s": f"{took:.2f}", "error over the range": error})
+    return rows
 
 
 _HEADS = ("off", "runs", "runs of the peer", "cost", "s")
