@@ -4,11 +4,13 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 from pythonfmu.builder import FmuBuilder as Builder2
 from pythonfmu3.builder import FmuBuilder as Builder3
 from scipy.integrate import solve_ivp
 
+import psa_casadi as psa
 from psa_casadi.units import FloatArray
 
 _FOLDER = tempfile.TemporaryDirectory()
@@ -57,3 +59,21 @@ def bounces(g: float, e: float, times: FloatArray) -> FloatArray:
         found = np.where((at >= 0) & (at < lasts), speed * at - 0.5 * g * at**2, found)
         begins, speed = begins + lasts, e * speed
     return np.asarray(found)
+
+
+def main() -> None:
+    """Write what docs/howto/fmu.md takes for granted: tank.fmu, run.csv and plant.fmu."""
+    Path("tank.fmu").write_bytes(supplied("tank").read_bytes())
+    shown = lagged(level(0.7, 0.01), 3.0)
+    shown += 1e-3 * np.random.default_rng(1).standard_normal(len(TIMES))
+    columns = [TIMES, INFLOW, np.ones(len(TIMES)), shown]
+    head = "time,inflow,valve,level"
+    np.savetxt("run.csv", np.column_stack(columns), delimiter=",", header=head, comments="")
+    speed, torque = ca.SX.sym("speed"), ca.SX.sym("torque")
+    rate = (torque - 0.01 * speed - 1e-5 * speed**3) / 2e-3
+    plant = {"x": speed, "u": torque, "ode": rate, "y": speed}
+    psa.export_fmu(psa.ode_model(plant, name="plant", outputs=["shown"]), "plant.fmu")
+
+
+if __name__ == "__main__":
+    main()
