@@ -92,8 +92,9 @@ def diagnose(
             from psa_casadi.diagnosis.result import DiagnosisInterrupted
             from psa_casadi.report.words.tables import timings_table
         with stage("reading"):
+            _demand_model_name(given, output)
             beside = {"--next": next_, "--events": events, "--junit": junit}
-            given.outputs({**outputs, **beside}, [*records, *held, *healthy, model])
+            given.outputs({**outputs, **beside}, [*records, *held, *healthy, model, fitting.fmu])
             if own is None:
                 run = _of_stack(
                     (records, held, healthy),
@@ -134,6 +135,11 @@ def diagnose(
         )
     subject = ", ".join(p.name for p in records)
     judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
+
+
+def _demand_model_name(given: Given, output: Path | None) -> None:
+    if output is not None and output.suffix.lower() in (".fmu", ".ssp", ".ssv"):
+        given.add(f"{output}: --output is a MODEL.json, which `psa export` takes on; name it so.")
 
 
 def _of_stack(

@@ -61,7 +61,7 @@ def identify(
 
     own = own_model(given, model, fitting)
     outputs = {"--output": output, "--json": json, "--report": report}
-    given.outputs(outputs, [*records, model])
+    given.outputs(outputs, [*records, model, fitting.fmu])
     if own is not None:
         of_stacks = {"--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis}
         given.refuse({**of_stacks, "--method": method == "paper", "--profile": profile})

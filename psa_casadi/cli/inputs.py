@@ -118,7 +118,8 @@ class Given:
                 columns=reading.columns, sample_time=reading.sample_time,
             )
         )  # fmt: skip
-        if found is None and model.structure.foreign:
+        lacks = [f"column '{n}' is missing" for n in model.input_names]
+        if model.structure.foreign and any(q in p for q in lacks for p in self._problems):
             self.add("An input of the FMU that no record has is held by --value NAME=VALUE.")
         for note in [n for s in found or () for n in s.notes if not self.quiet]:
             tell(f"Note: {note}")

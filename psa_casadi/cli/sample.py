@@ -67,7 +67,7 @@ def sample(
     files = {"--output": output, "--json": json, "--figure": figure, "--report": report}
     given.outputs(files, [model, *records])
     centres, widths = _priors(given, prior or ())
-    start = own_model(given, model, replace(fitting, free=None))
+    start = own_model(given, model, fitting if fitting.fmu else replace(fitting, free=None))
     measured: Sequence[psa.Record | psa.Signals]
     if start is not None:
         given.refuse({"--stack": stack})

@@ -157,7 +157,8 @@ def linearize(
     for kind, names in (("input", given), ("state", states or {})):
         for name in (n for n in names if n not in known[kind]):
             raise InputError(
-                f"The model '{model.name}' has no {kind} '{name}'; it has {quoted(known[kind])}."
+                f"The model '{model.name}' has no {kind} '{name}'; it has"
+                f" {quoted(known[kind]) or 'none'}."
             )
     if s.sampled:
         raise InputError(f"The model '{model.name}' has sampled states; leave that part out.")
@@ -253,7 +254,9 @@ def observer(
     """
     rows = [_one(of.output_names, n) for n in output_noise]
     if not rows or not all(v > 0 for v in output_noise.values()):
-        raise InputError("`output_noise` needs the noise of one measured output at least.")
+        raise InputError(
+            "An observer needs the noise of one measured output at least: `output_noise`, --noise."
+        )
     w = np.zeros(len(of.u))
     for name, size in input_noise.items():
         w[_one(of.input_names, name)] = size**2 * step
@@ -307,7 +310,8 @@ def _one(names: Sequence[str], name: str | None) -> int:
     if name is None and len(names) == 1:
         return 0
     if name not in names:
-        raise InputError(f"Name one of {quoted(names)}" + (f"; '{name}' is none." if name else "."))
+        which = f"'{name}' is none of" if name else "Name the input and the output; there are"
+        raise InputError(f"{which} {quoted(names)}.")
     return names.index(name)
 
 

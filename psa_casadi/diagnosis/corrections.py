@@ -20,7 +20,7 @@ Stops and plays: Visintin 1994; their squares and cubes make loops that are asym
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -306,8 +306,9 @@ class FreeFunction(Correction):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for DIAGNOSIS.json."""
-        names = ("port", "of", "evidence", "share", "unit", "variable", "equation", "parameters")
-        return {n: getattr(self, n) for n in names}
+        names = ("port", "of", "evidence", "share", "unit", "variable", "equation")
+        told = {n: asdict(e) for n, e in self.parameters.items()}
+        return {**{n: getattr(self, n) for n in names}, "parameters": told}
 
 
 def best_of(

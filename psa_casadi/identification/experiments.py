@@ -166,8 +166,8 @@ def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
             elif read.ratio != 1 or read.offset:
                 problems.add(
                     f"{where}: column '{name}' is in '{unit}', of which the model '{model.name}'"
-                    f" states no unit; declare it, as psa.{_kind(model, name)}('{name}',"
-                    f" '{si_unit(unit)}', ''), or give the column without a unit, in the model's."
+                    f" states no unit; {_declare(model, name, si_unit(unit))}"
+                    "give the column without a unit, in the model's."
                 )
         except InputError as error:
             problems.add(
@@ -176,8 +176,12 @@ def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
     return replace(s, columns=columns, units=units)
 
 
-def _kind(model: Model, name: str) -> str:
-    return "Input" if name in model.input_names else "Output"
+def _declare(model: Model, name: str, unit: str) -> str:
+    """Return how a unit is declared; that of an FMU is what its description says."""
+    kind = "Input" if name in model.input_names else "Output"
+    return (
+        "" if model.structure.foreign else f"declare it, as psa.{kind}('{name}', '{unit}', ''), or "
+    )
 
 
 def _check(model: Model, s: Signals, problems: Problems) -> None:

@@ -67,13 +67,15 @@ def fits_from(
 ) -> list[tuple[str, Fit]]:
     """Return the quick fits from named starts that can be simulated.
 
-    A keyboard interrupt ends it with those that there are, if any.
+    A keyboard interrupt ends it with those that there are, if any. Raises what the first one raised
+    where none can be simulated.
     """
-    found: list[tuple[str, Fit]] = []
+    found, first = list[tuple[str, Fit]](), None
     for name, start in starts:
         try:
             one = quick(name, start)
-        except PsaError:
+        except PsaError as error:
+            first = first or error
             continue
         except KeyboardInterrupt:
             if not found:
@@ -82,6 +84,8 @@ def fits_from(
         found.append((name, one))
         if one.interrupted:
             break
+    if first is not None and not found:
+        raise first
     return found
 
 
@@ -112,12 +116,13 @@ def search_starts(
             tolerance=1e-4 if starts > 1 else 1e-6,
         )  # fmt: skip
 
-    found = sorted(fits_from(begins, quick), key=lambda pair: pair[1].cost)
-    if not found:
+    try:
+        found = sorted(fits_from(begins, quick), key=lambda pair: pair[1].cost)
+    except PsaError as error:
         raise SimulationError(
             f"The model '{model.name}' cannot be simulated on these records from any start; check"
-            " the units of its inputs, its values and their bounds."
-        )
+            f" the units of its inputs, its values and their bounds. At its own values: {error}"
+        ) from error
     cut = any(f.interrupted for _, f in found)
     ended = [
         refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)

@@ -1,5 +1,6 @@
 """Intermediates as ports: forces between two bodies, what lags inside a model, and formulas."""
 
+import json
 import re
 from pathlib import Path
 
@@ -72,6 +73,7 @@ def test_a_law_that_no_effect_of_the_table_has_is_told_as_a_formula(tmp_path: Pa
     assert h.interval[0] < 0.02 < h.interval[1]
     assert law.held[0] < 0.8 * d.errors[0].base
     assert law.equation in " ".join(str(d).split())
+    assert json.loads(d.to_json())["correction"]["parameters"].keys() == law.parameters.keys()
     patched = psa.patched_model(d)
     for n, v in truth.items():
         assert patched.values[n] == pytest.approx(v, rel=0.02)

@@ -359,8 +359,7 @@ def _state(fmu: Fmu, found: _Found) -> None:
 def _derivatives(fmu: Fmu, found: _Found) -> None:
     """Directional derivatives of model exchange are those of differences, at two step sizes."""
     exchange = fmu.description.modelExchange
-    flags = ("providesDirectionalDerivative", "providesDirectionalDerivatives")
-    if exchange is None or not any(getattr(exchange, n, False) for n in flags):
+    if exchange is None or not exchange.providesDirectionalDerivative:
         found.notes.append("it provides none")
         return
     states = _states(fmu)

@@ -30,6 +30,7 @@ MOST_GROWTH, SMALL_BYTES = 100, 8 << 20
 LONGEST_TEXT = 64 << 20
 _TEXTS = ("modelDescription.xml", "resources/model.json")
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
+_FLAG = "providesDirectionalDerivatives"
 #: What the standard library raises on a damaged archive.
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, struct.error, EOFError, ArithmeticError, LookupError,
@@ -169,10 +170,12 @@ class Archive:
         interface = self.description.coSimulation or self.description.modelExchange
         if said[:2] not in ("2.", "3.") or interface is None:
             raise InputError(
-                f"{self.path}: is of FMI {said}, or has neither model exchange nor co-simulation;"
-                " export it again for one of these, of FMI 2.0 or FMI 3.0."
+                f"{self.path}: is of FMI {said} and has"
+                f" {'no' if interface is None else 'an'} interface for model exchange or"
+                " co-simulation; give one of FMI 2.0 or FMI 3.0 that has one of these."
             )
         self.version = int(said[0])
+        self._read_flag()
         self.identifier = str(interface.modelIdentifier)
         if not _IDENTIFIER.fullmatch(self.identifier):  # it names the file that is loaded
             raise InputError(
@@ -192,6 +195,15 @@ class Archive:
         experiment = self.description.defaultExperiment
         self.step_size = float(getattr(experiment, "stepSize", None) or 1e-3)
         self._states = [str(u.variable.derivative.name) for u in self.description.derivatives]
+
+    def _read_flag(self) -> None:
+        """Note that FMI 3.0 provides directional derivatives: fmpy reads the name of FMI 2.0."""
+        text = (self.directory / "modelDescription.xml").read_text("utf-8", errors="replace")
+        for name in ("modelExchange", "coSimulation"):
+            kind = getattr(self.description, name)
+            tag = name[0].upper() + name[1:]
+            if kind is not None and re.search(rf"<{tag}\b[^>]*?\s{_FLAG}=[\"'](?:true|1)", text):
+                kind.providesDirectionalDerivative = True
 
     def _elements(self) -> Iterator[tuple[str, Element]]:
         """Yield the numbers of all variables by name."""

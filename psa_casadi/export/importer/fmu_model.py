@@ -71,7 +71,10 @@ def read_variables(
     own = {n for n, v in rows.items() if v.causality == "parameter"} | begun
     fixed = own | {n for n, v in rows.items() if v.causality == "input"}
     for name in [n for n in values if n not in fixed]:
-        problems.add(f"`values` has '{name}', which is no parameter of {fmu.path.name}.")
+        problems.add(
+            f"`values` has '{name}', which is no parameter or input of {fmu.path.name}; it has"
+            f" {quoted(sorted(fixed)) or 'none'}."
+        )
     wanted = _free(fmu, free, own, problems)
     problems.raise_if_any()
     parameters = [
@@ -189,7 +192,9 @@ def _parameter(
         return given
     low, high = (float(b) for b in given)
     value = float(values.get(name, _start(fmu, name)))
-    if not low <= value <= high or low == high:
+    if low >= high:
+        problems.add(f"'{name}' has the bounds [{low:g}, {high:g}]; give the lower one first.")
+    elif not low <= value <= high:
         problems.add(
             f"'{name}' is {value:g} in the FMU, outside [{low:g}, {high:g}]; give wider"
             " bounds, or another value in `values`."
@@ -266,8 +271,9 @@ def fmu_model(
     or "co-simulation", by default the first one if it has that.
 
     Inputs, outputs and their names are those of the FMU, its units are kept where they are SI
-    units, else they are "1"; nothing is converted. A name that is no identifier is written with
-    underscores: `body.phi[1]` is `body_phi_1`; a state that is an output too is NAME_state.
+    units, else they are "1"; columns of records are converted to these. A name that is no
+    identifier is written with underscores: `body.phi[1]` is `body_phi_1`; a state that is an output
+    too is NAME_state.
 
     The binary runs without protection: load none that you would not run. The model is not exported,
     as it has no equations to print; MODEL.json names the FMU's file and its SHA-256. Two models of

@@ -38,7 +38,7 @@ class Run:
     """What an FMU is to do: values before its initialization, inputs u (n, nu) at times t (n,).
 
     `interface` is `CO_SIMULATION` or `MODEL_EXCHANGE`; between samples inputs are straight lines,
-    or held (`hold` "zero").
+    or held (`hold` "zero"). A step of co-simulation is divided into so many `parts`.
     """
 
     file: str
@@ -50,6 +50,7 @@ class Run:
     t: FloatArray
     u: FloatArray
     hold: str
+    parts: int = 1
 
 
 def play(run: Run) -> FloatArray | str:
@@ -63,7 +64,7 @@ def play(run: Run) -> FloatArray | str:
 
 def stepped(fmu: Fmu, run: Run) -> FloatArray:
     """Step a new instance over a run. Raises FmuError."""
-    points, names = communication_points(fmu, run.t), run.inputs
+    points, names = communication_points(fmu, run.t, run.parts), run.inputs
     rates = bool(getattr(fmu.description.coSimulation, "canInterpolateInputs", False))
     lines = run.hold != "zero"
     at = _inputs(run, points)
@@ -91,24 +92,25 @@ def _step(instance: Instance, begin: float, size: float) -> None:
         raise FmuError(f"the FMU ends the simulation at {begin + size:g} s")
 
 
-def communication_points(fmu: Fmu, t: FloatArray) -> FloatArray:
+def communication_points(fmu: Fmu, t: FloatArray, parts: int = 1) -> FloatArray:
     """Return the communication points of a run over times t (n,).
 
-    They are the times, more where the FMU's default step is shorter; multiples of its internal
-    step, or of one interval, where the FMU takes no other ones.
+    They are the times, more where the FMU's default step is shorter, and so many `parts` of each
+    step; multiples of its internal step, or of one interval, where the FMU takes no other ones.
     """
     co, gaps = fmu.description.coSimulation, np.diff(t)
     if not len(gaps):
         return t
     said = getattr(fmu.description.defaultExperiment, "stepSize", None)
     most = float(said) if said else math.inf
+    most = min(most, float(np.max(gaps))) / parts
     internal, middle = getattr(co, "fixedInternalStepSize", None), float(np.median(gaps))
     even = bool(np.ptp(gaps) <= _SAME * middle)
     if internal:
-        size = float(internal) * max(1, math.floor(middle / float(internal) * (1 + _SAME)))
+        size = float(internal) * max(1, math.floor(middle / parts / float(internal) * (1 + _SAME)))
     elif co.canHandleVariableCommunicationStepSize:
-        parts = np.ceil(gaps / most * (1 - _SAME)).astype(int).clip(1)
-        inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(t, t[1:], parts)]  # noqa: B905
+        counts = np.ceil(gaps / most * (1 - _SAME)).astype(int).clip(1)
+        inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(t, t[1:], counts)]  # noqa: B905
         return np.concatenate([*inner, t[-1:]])
     else:
         least = middle if even else float(np.min(gaps))
