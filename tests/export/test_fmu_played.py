@@ -1,5 +1,6 @@
 """FMUs that are run as a whole: co-simulation only, events, arrays; effects around them."""
 
+import re
 import zipfile
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -17,7 +18,7 @@ from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_model import FmuInterface
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.export.importer.play import communication_points
+from psa_casadi.export.importer.play import Run, communication_points, stepped
 from psa_casadi.export.importer.played import RUNS
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.simulation.start import begun
@@ -87,6 +88,28 @@ def test_a_run_is_nearer_to_the_truth_than_an_importer_s() -> None:
     errors = [np.max(np.abs(shown - truth)) for shown in (y, peer)]
     assert errors[0] < 1e-4 * np.ptp(truth)
     assert errors[1] > 30 * errors[0]  # it holds the input at its value before the step
+
+
+def test_a_step_is_divided_where_the_fmu_is_fast(tmp_path: Path) -> None:
+    x, u, k = (ca.SX.sym(n) for n in ("x", "u", "k"))
+    k_ = psa.Parameter("k", 40.0, "1/s", (1.0, 400.0), "rate", log=True)
+    ode = {"x": x, "u": u, "p": k, "ode": k * (u - x), "y": x}
+    fast = psa.ode_model(ode, name="fast", parameters=[k_], outputs=["y"])
+    path = tmp_path / "one_step.fmu"  # FMI 3: no input derivatives
+    with (
+        zipfile.ZipFile(psa.export_fmu(fast, tmp_path / "fast.fmu", fmi=3)) as old,
+        zipfile.ZipFile(path, "w") as new,
+    ):
+        for entry in old.infolist():
+            new.writestr(entry, re.sub(rb' stepSize="[^"]*"', b"", old.read(entry)))
+    exact = psa.run(fast, T[::4], U[::4], np.zeros(1), rtol=1e-9).y
+    there = psa.fmu_model(path, free=["k"], interface="co-simulation")
+    shown = psa.run(there, T[::4], U[::4], np.zeros(0)).y
+    assert np.std(shown - exact) < 1e-3 * np.std(exact)
+    given = {"k": 40.0}
+    run = Run(str(path), "", 1, ("u",), ("y",), given, T[::4], U[::4], "linear")
+    with Fmu(path) as fmu:
+        assert np.std(stepped(fmu, run) - exact) > 3e-3 * np.std(exact)
 
 
 def test_a_supplier_s_parameters_are_identified_in_few_runs() -> None:

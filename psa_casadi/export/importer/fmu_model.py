@@ -258,10 +258,11 @@ def fmu_model(
     Any other one is run as a whole, in processes of its own: by model exchange with its events
     (fmpy's CVode), or by co-simulation where it has no other interface. Its inputs and outputs are
     the ports; derivatives are differences of runs, side by side, 0.1 % of a parameter apart. It
-    begins in its start values at the beginning of each record. Between communication points, which
-    are the samples or closer, an input is a straight line where the FMU takes input derivatives,
-    else its mean over the step. Numbers of every type are inputs and outputs, elements of arrays
-    too.
+    begins in its start values at the beginning of each record. Between communication points an
+    input is a straight line where the FMU takes input derivatives, else its mean over the step;
+    these are the samples, or as many parts of them as it takes until twice as many change no output
+    by more than 0.05 % of its standard deviation. Numbers of every type are inputs and outputs,
+    elements of arrays too.
 
     `free` says which parameters are identified: {name: (low, high)}, {name: Parameter}, or names
     whose least and greatest values the FMU declares; by default all parameters that have both. Of
