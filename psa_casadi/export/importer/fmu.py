@@ -22,6 +22,8 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.units import FloatArray
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
+#: What is told of an FMU that says nothing of a call that fails.
+NO_MESSAGE = "no message"
 OK, WARNING, DISCARD, ERROR = 0, 1, 2, 3
 
 _CLASSES = {
@@ -173,7 +175,7 @@ class Instance:
         try:
             return type(self.fmi)._call(self.fmi, function, *arguments)
         except fmi1.FMICallException as error:
-            said = self.messages[-1] if self.messages else "no message"
+            said = self.messages[-1] if self.messages else NO_MESSAGE
             text = f"{function} returned status {error.status}: {said}"
             raise FmuError(text, error.status) from None
 

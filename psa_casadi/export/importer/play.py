@@ -18,6 +18,7 @@ from fmpy.sundials import CVodeSolver
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     MODEL_EXCHANGE,
+    NO_MESSAGE,
     Fmu,
     FmuError,
     Instance,
@@ -56,13 +57,23 @@ class Run:
 def play(run: Run) -> FloatArray | str:
     """Return the outputs (n, ny) at the times of a run, or why there are none."""
     try:
-        fmu = opened(Path(run.file), run.digest)
-        return stepped(fmu, run) if run.interface == CO_SIMULATION else _integrated(fmu, run)
+        return _played(run)
     except Exception as error:  # noqa: BLE001 - of an FMU and of fmpy, any
-        return str(error) or type(error).__name__
+        if NO_MESSAGE not in str(error):
+            return str(error) or type(error).__name__
+    try:  # once more: some say why only where they are asked to
+        return _played(run, loggingOn=True)
+    except Exception as error:  # noqa: BLE001
+        return str(error)
 
 
-def stepped(fmu: Fmu, run: Run) -> FloatArray:
+def _played(run: Run, **options: Any) -> FloatArray:
+    fmu = opened(Path(run.file), run.digest)
+    way = stepped if run.interface == CO_SIMULATION else _integrated
+    return way(fmu, run, **options)
+
+
+def stepped(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     """Step a new instance over a run. Raises FmuError."""
     points, names = communication_points(fmu, run.t, run.parts), run.inputs
     rates = bool(getattr(fmu.description.coSimulation, "canInterpolateInputs", False))
@@ -72,7 +83,8 @@ def stepped(fmu: Fmu, run: Run) -> FloatArray:
     during = at[:-1] if rates and lines else middle
     begins = {**run.values, **dict(zip(names, at[0].tolist(), strict=True))}
     found = np.empty((len(points), len(run.outputs)))
-    with fmu.start(CO_SIMULATION, values=begins, start_time=float(points[0])) as instance:
+    first = float(points[0])
+    with fmu.start(CO_SIMULATION, values=begins, start_time=first, **options) as instance:
         found[0] = instance.get(run.outputs)
         for k, (begin, end) in enumerate(pairwise(points.tolist())):
             instance.set(dict(zip(names, during[k].tolist(), strict=True)))
@@ -151,10 +163,10 @@ class _Inputs:
             self.instance.set(dict(zip(self.run.inputs, values, strict=True)))
 
 
-def _integrated(fmu: Fmu, run: Run) -> FloatArray:
+def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     """Integrate a new instance of model exchange over a run, with its events. Raises FmuError."""
     t = run.t.tolist()
-    with fmu.open(MODEL_EXCHANGE) as instance:
+    with fmu.open(MODEL_EXCHANGE, **options) as instance:
         begins = dict(zip(run.inputs, run.u[0].tolist(), strict=True))
         instance.setup(start_time=t[0], values={**run.values, **begins})
         event, fmi = _event(instance), instance.fmi

@@ -241,6 +241,7 @@ def accurate_minimum(
         if found is None:
             raise SimulationError(
                 "The model cannot be simulated at the start of the fit; start from other values."
+                f" {evaluate.refused}".rstrip()
             )
         minimum, theta = found, found.theta
         before = minimum, way
@@ -280,12 +281,15 @@ class Objective:
         self._reach = float(np.max(span / weights)) if span > 0.0 else np.inf
         self._used = [e.at(0)[: e.stop] for e in experiments]
         self._prior, self._share = 1.0 / unknowns.prior, 1.0 / weights
+        #: Why the last point that cannot be simulated cannot be.
+        self.refused = ""
 
     def __call__(self, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return residuals (m,) and Jacobian (m, size)."""
         try:
             parts = predict(*self._of, theta, way=self._way, further=True)
-        except PsaError:
+        except PsaError as error:
+            self.refused = str(error)
             return None
         beside = further_of(self._of[1], parts)
         used, samples = self._used, len(self._target)
