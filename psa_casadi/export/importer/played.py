@@ -47,7 +47,7 @@ _SPIKE, _SPIKE_SHARE = 5.0, 0.05
 #: A step is divided until twice as many parts change an output by less than this share of its
 #: standard deviation, a twentieth of a noise of 1 %; into so many parts at most.
 _SETTLED, _MOST_PARTS = 5e-4, 32
-#: Parts of a step by FMU, hold and times.
+#: Parts of a step by FMU and record.
 _PARTS: dict[str, int] = {}
 #: Runs that are kept, and how long [s] until it is looked whether the work is to end.
 _KEPT, _LOOK = 512, 0.1
@@ -71,13 +71,14 @@ class Played:
     fixed: tuple[tuple[str, float], ...]
 
     def outputs_of(
-        self, wanted: Sequence[tuple[Mapping[str, float], FloatArray]], t: FloatArray, hold: str
-    ) -> list[FloatArray]:
+        self, wanted: Sequence[tuple[Mapping[str, float], FloatArray]], t: FloatArray, hold: str,
+        parts: int,
+    ) -> list[FloatArray]:  # fmt: skip
         """Return the outputs (n, ny) for values of parameters and inputs (n, nu), by processes.
 
-        Raises SimulationError with what the FMU said.
+        A step of co-simulation is divided into so many `parts`. Raises SimulationError with what
+        the FMU said.
         """
-        parts = self._parts(*wanted[0], t, hold) if wanted else 1
         return RUNS.of([self._of(values, u, t, hold, parts) for values, u in wanted])
 
     def _of(
@@ -88,14 +89,14 @@ class Played:
         return Run(*own, given, t, u, hold, parts)
 
     def _parts(self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str) -> int:
-        """Return into how many parts a step of co-simulation is divided over these times.
+        """Return into how many parts a step of co-simulation is divided with these inputs.
 
-        It is decided once, at the first values: as many as it takes until twice as many change no
-        output by more than a small share of its standard deviation.
+        It is decided once for a record, at the first values: as many as it takes until twice as
+        many change no output by more than a small share of its standard deviation.
         """
         if self.interface != CO_SIMULATION:
             return 1
-        key = f"{self.digest} {hold} {hashlib.sha256(t.tobytes()).hexdigest()}"
+        key = _key(self._of(dict.fromkeys(values, 0.0), u, t, hold, 1))
         if key not in _PARTS:
             parts = 1
             (before,) = RUNS.of([self._of(values, u, t, hold, parts)])
@@ -116,7 +117,7 @@ class Played:
         """Run a model with this FMU in it; see `stepper.run`.
 
         States are those of effects. They begin as far from rest as `x0` is from the rest that
-        `begun` finds without the FMU.
+        `begun` finds without the FMU, whatever `s0` is.
         """
         own = dict(values or model.values)
         inner = inner_of(model).with_values(own)
@@ -158,7 +159,10 @@ class Played:
             new = {**own, q: own[q] + h} if isinstance(q, str) else own
             return new, applied + h * before.sensitivity[:, :, k]
 
-        plain, *others = self.outputs_of([(own, applied), *(changed(k, 1) for k in moved)], t, kept)
+        parts = self._parts(own, u, t, kept)
+        plain, *others = self.outputs_of(
+            [(own, applied), *(changed(k, 1) for k in moved)], t, kept, parts
+        )
         found = around(plain, asked, unknowns)
         rows = [names.index(n) for n in asked]
 
@@ -167,7 +171,7 @@ class Played:
 
         slopes = {k: slope(k, 1, y) for k, y in zip(moved, others, strict=True)}
         jumping = [k for k in moved if _jumps(slopes[k])]
-        back = self.outputs_of([changed(k, -1) for k in jumping], t, kept)
+        back = self.outputs_of([changed(k, -1) for k in jumping], t, kept, parts)
         for k, y in zip(jumping, back, strict=True):
             slopes[k] = _lesser(slopes[k], slope(k, -1, y))
         sensitivity = found.sensitivity.copy()
