@@ -132,22 +132,33 @@ static fmi2Status started(container *self) {
     return worst;
 }
 
-static int opened(container *self, int k, fmi2String name, fmi2String resources, fmi2Boolean visible,
-                  fmi2Boolean logging) {
+/* Make an instance of a part; `folder` and `text` have room for what is longer than the resources. */
+static int made(container *self, int k, fmi2String name, fmi2String resources, fmi2Boolean visible,
+                fmi2Boolean logging, char *folder, char *text, size_t room) {
     part *const p = &self->parts[k];
-    char folder[4096], text[8192];
     fmi2InstantiateTYPE *make;
-    if (!path_of(resources, folder, sizeof folder)) return 0;
-    snprintf(text, sizeof text, "%s/%s/binaries/" NESTED_PLATFORM "/%s" NESTED_SUFFIX, folder,
+    if (!path_of(resources, folder, room)) return 0;
+    snprintf(text, room, "%s/%s/binaries/" NESTED_PLATFORM "/%s" NESTED_SUFFIX, folder,
              NESTED[k].folder, NESTED[k].identifier);
     p->library = loaded(text);
     if (!p->library || !functions(p)) return 0;
     void *const place = found(p->library, "fmi2Instantiate");
     memcpy(&make, &place, sizeof place);
     if (!make) return 0;
-    snprintf(text, sizeof text, "%s/%s/resources", resources, NESTED[k].folder);
+    snprintf(text, room, "%s/%s/resources", resources, NESTED[k].folder);
     p->instance = make(name, fmi2CoSimulation, NESTED[k].token, text, &self->calls, visible, logging);
     return p->instance != NULL;
+}
+
+static int opened(container *self, int k, fmi2String name, fmi2String resources, fmi2Boolean visible,
+                  fmi2Boolean logging) {
+    const size_t room = strlen(resources) + strlen(NESTED[k].folder) + strlen(NESTED[k].identifier) + 64;
+    char *const folder = malloc(room), *const text = malloc(room);
+    const int ready = folder && text &&
+                      made(self, k, name, resources, visible, logging, folder, text, room);
+    free(folder);
+    free(text);
+    return ready;
 }
 
 void fmi2FreeInstance(fmi2Component c) {

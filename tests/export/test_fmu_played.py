@@ -2,6 +2,7 @@
 
 import re
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -12,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import psa_casadi as psa
+from psa_casadi.children import end_children
 from psa_casadi.cli.app import app
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
@@ -32,6 +34,13 @@ T = np.linspace(0.0, 20.0, 401)
 U = np.column_stack([np.sin(T) + 0.4 * np.sin(3.1 * T)])
 ALL = Sizes({"u": 1.4, "y": 1.0, "x": 1.0}, {"x": 2.0}, 0.05, 20.0)
 AREA = {"area": (0.05, 4.0)}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _processes() -> Iterator[None]:
+    """End the processes of FMUs: other tests count those of this one."""
+    yield
+    RUNS.end()
 
 
 def _own() -> psa.Model:
@@ -285,3 +294,13 @@ def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
 def test_an_fmu_that_holds_another_one_keeps_to_the_standard(tmp_path: Path) -> None:
     path = psa.export_extended(with_effects(), tmp_path / "tank.fmu")
     assert {r.name for r in psa.check_fmu(path, foreign=True).failures} <= {"memory"}  # PythonFMU's
+
+
+def test_a_process_that_was_ended_by_others_is_replaced() -> None:
+    model = psa.fmu_model(supplied("tank"), free=AREA, values={"valve": 1.0})
+    runs = []
+    for _ in range(2):
+        RUNS.forget()
+        runs.append(psa.run(model, TIMES[:9], INFLOW[:9, None], np.zeros(0)).y)
+        end_children()
+    assert np.array_equal(runs[0], runs[1])

@@ -305,7 +305,7 @@ class _Runs:
             found: dict[str, FloatArray | str] = {k: self._kept[k] for k in keys if k not in new}
         try:
             for key, future in new.items():
-                found[key] = _result(future)
+                found[key] = self._result(future, keys[key])
         except KeyboardInterrupt:
             self.end()
             raise
@@ -327,6 +327,18 @@ class _Runs:
             atexit.register(self.end)
         return self._processes.submit(play, wanted)
 
+    def _result(self, future: "Future[Any]", wanted: Run) -> FloatArray | str:
+        """Return what comes of a run; once more where its process was lost."""
+        for last in (False, True):
+            try:
+                return _waited(future)
+            except MachineError as error:
+                if last:
+                    return str(error)
+            with self._lock:
+                future = self._submitted(wanted)
+        return ""
+
     def forget(self) -> None:
         """Forget the runs that were."""
         self._kept.clear()
@@ -338,14 +350,14 @@ class _Runs:
             self._processes = None
 
 
-def _result(future: "Future[Any]") -> FloatArray | str:
+def _waited(future: "Future[Any]") -> FloatArray | str:
+    """Return what comes of a run, in numbers or words. Raises MachineError, KeyboardInterrupt."""
     while True:
         with suppress(TimeoutError):
-            try:
-                found: FloatArray | str = future.result(timeout=_LOOK)
-                return found if isinstance(found, str) or np.isfinite(found).all() else "not finite"
-            except MachineError as error:
-                return str(error)
+            found: FloatArray | str = future.result(timeout=_LOOK)
+            if isinstance(found, str):
+                return found
+            return found if np.isfinite(found).all() else "its outputs are not finite"
         raise_if_stopped()
 
 
