@@ -5,7 +5,8 @@ import pickle
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from pathlib import Path
 from typing import IO, Any, cast
 
 from psa_casadi.children import Child, end_with_parent, kill, started_python
@@ -56,6 +57,15 @@ class Processes:
                 f"The process that worked on this ended ({how}): killed, out of memory, or"
                 f" crashed. The next run tries it again. {said[-500:]}"
             ) from None
+
+
+def memory_of_process(kind: str) -> int:
+    """Return the memory of this process [bytes], of a kind of Linux such as VmData; else 0."""
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith(f"{kind}:"):
+                return int(line.split()[1]) * 1024
+    return 0
 
 
 def main() -> None:

@@ -24,6 +24,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.export.check.measured import Task, checks_of
 from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.files import temporary_folder
+from psa_casadi.processes import memory_of_process
 
 #: The row that is there only if the process ends badly outside of any check.
 OUTSIDE = "process ends"
@@ -154,7 +155,7 @@ def _limit(memory: int, act: Callable[[], None]) -> None:
         return
     import resource  # noqa: PLC0415 - there is none on Windows
 
-    most = _data_size() + memory
+    most = memory_of_process("VmData") + memory
     for kind, wanted in (
         (resource.RLIMIT_CORE, 0), (resource.RLIMIT_FSIZE, _MOST_PRINTED),
         (resource.RLIMIT_DATA, most),
@@ -165,21 +166,12 @@ def _limit(memory: int, act: Callable[[], None]) -> None:
             resource.setrlimit(kind, (size, size))
 
     def watch() -> None:
-        while _data_size() < most - (1.0 - _FULL) * memory:
+        while memory_of_process("VmData") < most - (1.0 - _FULL) * memory:
             time.sleep(_LOOK)
         act()
 
-    if _data_size():
+    if memory_of_process("VmData"):
         threading.Thread(target=watch, daemon=True).start()
-
-
-def _data_size() -> int:
-    """Return the memory of this process that counts [bytes], 0 where the system does not tell."""
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) * 1024
-    return 0
 
 
 if __name__ == "__main__":

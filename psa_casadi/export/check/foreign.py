@@ -7,16 +7,15 @@ those of FMI 2.0.5 and FMI 3.0.2.
 import gc
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, plain
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
+from psa_casadi.processes import memory_of_process
 from psa_casadi.units import FloatArray
 
 #: Internal steps in one step, at most.
@@ -36,7 +35,6 @@ _WORDS = {CO_SIMULATION: "co-simulation", MODEL_EXCHANGE: "model exchange"}
 _CLAUSES: dict[str, tuple[str, str]] = {
     "description valid": ("2.2", "2.4"),
     "units defined": ("2.2.2", "2.4.3"),
-    "binary for this machine": ("2.3", "2.5.1.4"),
     "binary loads": ("2.1.1", "2.2.2"),
     "instances": ("2.1.5", "2.3.1"),
     "life cycle": ("2.1.6", "2.3.1"),
@@ -227,9 +225,7 @@ def _begun(fmu: Fmu, interface: int) -> Instance:
 
 def _continue(instance: Instance) -> None:
     if instance.interface == MODEL_EXCHANGE:
-        for _ in range(100):
-            if not instance.update_discrete_states()[0]:
-                break
+        instance.update_events()
         instance.require("EnterContinuousTimeMode")
 
 
@@ -325,18 +321,14 @@ def _memory(fmu: Fmu, found: _Found) -> None:
 def _resident() -> int:
     """Return the memory of this process that counts [bytes], 0 where the system does not tell."""
     gc.collect()
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("RssAnon:"):
-                return int(line.split()[1]) * 1024
-    return 0
+    return memory_of_process("RssAnon")
 
 
 def _state(fmu: Fmu, found: _Found) -> None:
     """A state that is saved and restored replays the same, also by way of bytes."""
     for interface in fmu.interfaces():
         kind = (fmu.description.modelExchange, fmu.description.coSimulation)[interface]
-        if not any(getattr(kind, f"canGetAndSetFMU{n}", False) for n in ("state", "State")):
+        if not kind.canGetAndSetFMUstate:  # fmpy's name in FMI 3.0, too
             found.notes.append(f"{_WORDS[interface]}: it announces no way to save its state")
             continue
         with _begun(fmu, interface) as instance:

@@ -22,6 +22,8 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.units import FloatArray
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
+#: As often an FMU may ask for another update of its discrete states.
+_UPDATES = 100
 #: What is told of an FMU that says nothing of a call that fails.
 NO_MESSAGE = "no message"
 OK, WARNING, DISCARD, ERROR = 0, 1, 2, 3
@@ -263,6 +265,18 @@ class Instance:
         *flags, time = (self.fmi.newDiscreteStates if two else self.fmi.updateDiscreteStates)()
         self.next_event_time = time if flags[4] else None
         return [bool(flag) for flag in flags]
+
+    def update_events(self) -> tuple[bool, bool]:
+        """Update discrete states as often as it asks for that, to a limit, or until it ends.
+
+        Returns whether it asks for more, and whether it ends the simulation.
+        """
+        again, end = True, False
+        for _ in range(_UPDATES):
+            again, end, *_ = self.update_discrete_states()
+            if end or not again:
+                break
+        return again, end
 
     def vector(self, function: str, count: int) -> FloatArray:
         """Return a vector that a function of model exchange fills."""

@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,24 +123,22 @@ def _begun(fmu: Fmu) -> set[str]:
     }
 
 
-def _no_equations(fmu: Fmu) -> Iterator[str]:
-    """Yield why an FMU is no ordinary differential equation x' = f(t, x, u, p)."""
-    exchange, name = fmu.description.modelExchange, fmu.path.name
-    if exchange is None:
-        yield f"{name} has no model exchange"
-        return
-    if exchange.modelIdentifier != fmu.identifier:
-        yield f"{name} has one binary for each interface"
-    if exchange.canBeInstantiatedOnlyOncePerProcess:
-        yield f"{name} gives one instance for each process"
-    if fmu.indicator_count():
-        yield f"{name} has {fmu.indicator_count()} event indicators"
-    for v in fmu.description.modelVariables:
-        if v.causality == "input" and (v.type not in _REALS or v.dimensions):
-            yield f"{name}: the input '{v.name}' is no real number"
-    outputs = [v for v in fmu.description.modelVariables if v.causality == "output"]
-    if any(v.dimensions for v in outputs) or not any(v.type in _REALS for v in outputs):
-        yield f"{name} has outputs that are no real numbers"
+def _has_equations(fmu: Fmu) -> bool:
+    """Whether an FMU is an ordinary differential equation x' = f(t, x, u, p), but for its times.
+
+    By model exchange of its own binary, in several instances, without event indicators, real
+    numbers in and one at least out.
+    """
+    exchange = fmu.description.modelExchange
+    if exchange is None or exchange.modelIdentifier != fmu.identifier:
+        return False
+    if exchange.canBeInstantiatedOnlyOncePerProcess or fmu.indicator_count():
+        return False
+    every = fmu.description.modelVariables
+    inputs, outputs = ([v for v in every if v.causality == c] for c in ("input", "output"))
+    scalars = not any(v.dimensions for v in (*inputs, *outputs))
+    reals = all(v.type in _REALS for v in inputs) and any(v.type in _REALS for v in outputs)
+    return scalars and reals
 
 
 def _free(
@@ -286,13 +284,11 @@ def fmu_model(
     file = Path(path)
     digest = digest_of(file)
     fmu = opened(file.resolve(), digest)
-    if interface is None and not [*_no_equations(fmu)]:
+    chosen = None if interface is None else _interface(fmu, interface)
+    if chosen != CO_SIMULATION and _has_equations(fmu):
         with suppress(_TimeEventError):
             return _of_equations(fmu, file, digest, free, values or {}, name)
-    chosen = _interface(fmu, interface)
-    if interface == "model exchange" and not [*_no_equations(fmu)]:
-        with suppress(_TimeEventError):
-            return _of_equations(fmu, file, digest, free, values or {}, name)
+    chosen = _interface(fmu, None) if chosen is None else chosen
     read = read_variables(fmu, free, values or {}, whole=True)
     s, own = read.selected, [p.name for p in read.parameters]
     played = Played(

@@ -27,8 +27,6 @@ from psa_casadi.simulation.compiler import shared_library
 _PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))
 #: What is said of an FMU with events at times.
 TIME_EVENT = "the FMU announces an event at a time of its own"
-#: As often an FMU may ask for another update of its discrete states after initialization.
-_UPDATES = 100
 #: Functions of `psa_imported` by version: name of a field, name in the standard.
 _BOTH = {"set_time": "SetTime", "set_states": "SetContinuousStates"}
 _FUNCTIONS = {
@@ -144,12 +142,9 @@ class Imported:
         if old:
             old.require("Reset")
         instance.setup(values={**dict(self.selected.fixed), **parameters})
-        for _ in range(_UPDATES):
-            again, end, *_ = instance.update_discrete_states()
-            if end:
-                raise FmuError("the FMU ends the simulation at its start")
-            if not again:
-                break
+        _, end = instance.update_events()
+        if end:
+            raise FmuError("the FMU ends the simulation at its start")
         if instance.next_event_time is not None:
             raise FmuError(TIME_EVENT)
         instance.require("EnterContinuousTimeMode")

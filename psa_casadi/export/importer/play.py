@@ -24,12 +24,13 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.export.importer.imported import opened
+from psa_casadi.export.importer.signals import Signals
 from psa_casadi.units import FloatArray
 
 #: Relative tolerance of a run by model exchange; CVode's.
 _TOLERANCE = 1e-7
-#: Steps of the solver between two samples, and updates of discrete states at an event, at most.
-_MOST_STEPS, _UPDATES = 10_000, 100
+#: Steps of the solver between two samples, at most.
+_MOST_STEPS = 10_000
 #: Intervals that differ by this share are the same.
 _SAME = 1e-6
 
@@ -132,12 +133,10 @@ def communication_points(fmu: Fmu, t: FloatArray, parts: int = 1) -> FloatArray:
 
 
 def _inputs(run: Run, times: FloatArray) -> FloatArray:
-    """Return the inputs (m, nu) at times (m,)."""
-    if run.hold == "zero":
-        rows = np.searchsorted(run.t, times * (1 + 1e-12) + 1e-15, "right") - 1
-        return np.asarray(run.u[rows.clip(0)])
-    columns = [np.interp(times, run.t, column) for column in run.u.T]
-    return np.array(columns).reshape(run.u.shape[1], len(times)).T
+    """Return the inputs (m, nu) at times (m,); held ones after a jump, but for rounding."""
+    held = run.hold == "zero"
+    wanted = times * (1 + 1e-12) + 1e-15 if held else times
+    return Signals(run.inputs, run.t, run.u, held).at(wanted)
 
 
 class _Solver(CVodeSolver):  # type: ignore[misc]
@@ -208,11 +207,10 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
 
 def _event(instance: Instance) -> float:
     """Update in event mode and leave it; return the time of the next time event, else infinity."""
-    for _ in range(_UPDATES):
-        again, end, *_ = instance.update_discrete_states()
-        if end:
-            raise FmuError("the FMU ends the simulation at an event")
-        if not again:
-            instance.require("EnterContinuousTimeMode")
-            return math.inf if instance.next_event_time is None else instance.next_event_time
-    raise FmuError("the FMU updates its discrete states without end")
+    again, end = instance.update_events()
+    if end:
+        raise FmuError("the FMU ends the simulation at an event")
+    if again:
+        raise FmuError("the FMU updates its discrete states without end")
+    instance.require("EnterContinuousTimeMode")
+    return math.inf if instance.next_event_time is None else instance.next_event_time
