@@ -3,6 +3,7 @@
 import hashlib
 import uuid
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -48,8 +49,8 @@ def nested(
     `starts` are those of the part that is not ours, by the names in it. Raises MachineError where
     it cannot be compiled.
     """
-    archives = {name: Archive(fmus[name]) for name in wiring.parts}
-    try:
+    with ExitStack() as held:
+        archives = {n: held.enter_context(Archive(fmus[n])) for n in wiring.parts}
         shown = _shown(wiring, archives, starts)
         digest = hashlib.sha256(repr((shown, *(f.read_bytes() for f in fmus.values()))).encode())
         token = f"{{{uuid.UUID(digest.hexdigest()[:32])}}}"
@@ -67,9 +68,6 @@ def nested(
                     entries[f"resources/{name}/{place}"] = file.read_bytes()
         entries["modelDescription.xml"] = _description(wiring, archives, shown, token)
         return entries
-    finally:
-        for archive in archives.values():
-            archive.__exit__()
 
 
 def _shown(
@@ -93,7 +91,7 @@ def _shown(
                 start = starts.get(v.name, _start(archives, name, v.name))
                 own = v.name if v.name not in [f.name for f in found] else f"{name}.{v.name}"
                 found.append(_Shown(own, name, v.name, "parameter", start))
-    inputs = {n for f in found for n in [f.variable] if f.causality == "input"}
+    inputs = {f.variable for f in found if f.causality == "input"}
     others = [n for n in archives["original"].names("input") if n in starts and n not in inputs]
     found += [_Shown(n, "original", n, "input", starts[n]) for n in others]
     return found
