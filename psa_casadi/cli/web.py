@@ -3,17 +3,24 @@
 import sys
 import time
 import webbrowser
+from contextlib import suppress
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import StackName
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, tell, tell_written, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import temporary_folder
+
+if TYPE_CHECKING:
+    import psa_casadi as psa
+    from psa_casadi.workbench.subject import Subject
 
 
 def web(
@@ -25,15 +32,18 @@ def web(
     diagnose: bool = False,
     port: Annotated[int | None, typer.Option(min=1, max=65535)] = None,
     no_browser: bool = False,
+    fitting: Fitting,
     given: Given,
 ) -> None:
     """Write a page to play with a stack: any voltage, every effect, no network.
 
     It needs the compiler of the extra `compiler`; the page needs a browser alone. With --diagnose,
-    serve a page that diagnoses records until Ctrl-C; nothing leaves the machine.
+    serve a page that diagnoses records until Ctrl-C; nothing leaves the machine. The records are a
+    stack's, or of --model FILE.py:FUNCTION or --fmu.
 
     Options:
-        model: MODEL.json to play with; by default every named stack.
+        model: MODEL.json to play with; by default every named stack. With --diagnose, a model of
+            your own.
         output: HTML page to write.
         diagnose: Serve a page, to this machine only, that diagnoses records: drop files, map their
             columns, watch the search.
@@ -48,18 +58,22 @@ def web(
     if more.args:
         raise InputError(f"{more.args[0]}: is one file too many; give one model, by --model.")
     if diagnose:
-        if model is not None or stack is not None or output is not None:
+        own = own_model(given, model, fitting)
+        if (model is not None and own is None) or stack is not None or output is not None:
             raise InputError(
-                "--diagnose serves a page of its own: leave --model, --stack and -o out; a"
-                " MODEL.json to start from is dropped there."
+                "--diagnose serves a page of its own: leave --stack, -o and a stack's --model out;"
+                " a MODEL.json to start from is dropped there."
             )
-        _serve(port or 0, no_browser, given)
+        given.check()
+        _serve(port or 0, no_browser, _subject(own, model, fitting), given)
         return
     from psa_casadi.report.page.playground import write_playground
 
     path = output or Path("playground.html")
     if port is not None or no_browser:
         given.add("--port and --no-browser are of --diagnose; add that, or leave them out.")
+    if fitting != Fitting():
+        given.add("a model of your own is for --diagnose; add that.")
     given.outputs({"--output": path}, [model], page="--output")
     chosen = given.model_or_stack(model, stack, needed=False)
     given.check()
@@ -68,21 +82,40 @@ def web(
     tell_written(path, quiet=given.quiet)
 
 
-def _serve(port: int, no_browser: bool, given: Given) -> None:
+def _subject(own: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
+    """Return what the page diagnoses: a stack, or a model of one's own."""
+    from psa_casadi.workbench.subject import Subject
+
+    if own is None:
+        return Subject()
+    words = {"model": path and path.absolute(), **asdict(fitting)}
+    if fitting.fmu:
+        words["fmu"] = fitting.fmu.name
+    arguments: list[str] = []
+    for option, value in words.items():
+        values = value if isinstance(value, list) else [value] if value else []
+        begin = f"--{option.replace('_', '-')}"
+        arguments += [begin if value is True else f"{begin}={v}" for v in values]
+    units = {i.name: i.unit for i in own.structure.inputs}
+    units |= {o.name: o.unit for o in own.structure.outputs}
+    fmus = tuple(Path(f.place) for f in own.structure.foreign)
+    return Subject(own.input_names, own.output_names, units, tuple(arguments), fmus)
+
+
+def _serve(port: int, no_browser: bool, subject: "Subject", given: Given) -> None:
     """Serve the page until Ctrl-C; its files are removed then."""
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.workbench.desk import Desk
     from psa_casadi.workbench.server import served
 
-    given.check()
     modules = given.effects or []
     here = str(Path.cwd())  # children look for named modules there, and for nothing else
     sys.path[:] = [p for p in sys.path if p not in ("", here)] + ([here] if modules else [])
     with temporary_folder() as place:
         folder = place / "files"
         folder.mkdir()
-        desk = Desk(folder, list(known_effects(given.own)), modules)
-        with served(port, desk) as server:
+        desk = Desk(folder, list(known_effects(given.own)), modules, subject)
+        with suppress(KeyboardInterrupt), served(port, desk) as server:
             show(f"Open {server.address}")
             tell("Ctrl-C ends the page and removes its files.")
             sys.stdout.flush()
@@ -94,8 +127,6 @@ def _serve(port: int, no_browser: bool, given: Given) -> None:
                     encoding="utf-8",
                 )
                 webbrowser.open(way.as_uri())
-            try:
-                while True:
-                    time.sleep(3600.0)
-            except KeyboardInterrupt:
-                tell("Ended; the files of the page are removed.")
+            while True:
+                time.sleep(3600.0)
+        tell("Ended; the files of the page are removed.")

@@ -27,6 +27,12 @@ desk.length = function (metres) {
   return +(metres / unit[0]).toPrecision(3) + ' ' + unit[1];
 };
 
+// A length in the unit that reads best; any other quantity in the one that it has.
+desk.amount = function (value, unit) {
+  'use strict';
+  return unit === 'm' ? desk.length(value) : +value.toPrecision(3) + (unit && unit !== '1' ? ' ' + unit : '');
+};
+
 desk.size = function (bytes) {
   'use strict';
   return bytes < 1e6 ? Math.max(1, Math.round(bytes / 1e3)) + ' kB' : (bytes / 1e6).toFixed(1) + ' MB';

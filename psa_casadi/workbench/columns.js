@@ -108,11 +108,13 @@ desk.columns = (function () {
 
   function record(item) {
     var r = item.seen.record, more = r.others.length ? '; also ' + r.others.map(desk.words).join(', ') : '';
-    var ends = r.reached.map(function (x) { return r.unit === 'm' ? desk.length(x) : x + ' counts'; });
-    var reached = ends.length ? ', displacement ' + ends.join(' to ') : '';
+    var reached = Object.keys(r.reached).map(function (name) {
+      var own = r.reached[name];
+      return ', ' + desk.words(name) + ' ' + desk.amount(own[0], own[2]) + ' to ' + desk.amount(own[1], own[2]);
+    }).join('');
     return make('figure', {}, make('figcaption', {}, item.name),
       make('p', {className: 'note'}, r.n + ' samples in ' + +r.seconds.toPrecision(4) + ' s' + reached + more),
-      make('img', {className: 'still', src: 'data:image/png;base64,' + r.picture, alt: item.name + ': voltage over time, displacement over voltage'}));
+      make('img', {className: 'still', src: 'data:image/png;base64,' + r.picture, alt: item.name + ': ' + r.alt}));
   }
 
   return function (items, text) {

@@ -1,6 +1,7 @@
 """The files of the page and its runs; what lies there is the same for every tab."""
 
 import re
+import shutil
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from psa_casadi.records.read.file_bytes import MOST_BYTES
 from psa_casadi.workbench import run as runs
 from psa_casadi.workbench.previews import preview
 from psa_casadi.workbench.run import Run, Settings, removed
+from psa_casadi.workbench.subject import Subject
 
 #: The most files, and the most bytes of all of them together.
 MOST_FILES, MOST_TOGETHER = 32, 2 * MOST_BYTES
@@ -108,7 +110,8 @@ class Desk:
     """Files, settings and the run in a folder; any thread may ask. `close` ends what runs.
 
     What is given lies in a folder of its own, where nothing runs; runs leave theirs beside it.
-    `effects` are the names that may be left out, `modules` those of a user's own effects.
+    `effects` are the names that may be left out, `modules` those of a user's own effects, `subject`
+    is the model that the records are of: a stack's, unless another one is named.
     """
 
     def __init__(
@@ -116,12 +119,16 @@ class Desk:
         folder: Path,
         effects: Sequence[str],
         modules: Sequence[str] = (),
+        subject: Subject | None = None,
         limits: Limits | None = None,
         module: str = runs.PSA,
     ) -> None:
         self.folder, self.effects, self.limits = folder, tuple(effects), limits or Limits()
         self._records = folder / runs.RECORDS
         self._records.mkdir()
+        self.subject = subject or Subject()
+        for file in self.subject.files:
+            shutil.copy(file, folder / file.name)
         self._options = [word for name in modules for word in ("--effects", name)]
         self._module = module
         self._lock = threading.RLock()
@@ -136,6 +143,8 @@ class Desk:
 
     def add(self, name: str, stream: BufferedIOBase, size: int) -> None:
         """Take a file and look at it; raises InputError where it cannot be taken."""
+        if self.subject.arguments and name.lower().endswith(".json"):
+            raise InputError("The model is the one that the command names; give records alone.")
         with self._lock:
             self._idle()
             key, self._next = self._next, self._next + 1
@@ -217,6 +226,7 @@ class Desk:
             held = [i.path.name for i in records if i.held]
             models = [i.path.name for i in self._items.values() if i.is_model]
             words = runs.diagnosis(fitted, held, models[-1] if models else None, self._settings)
+            words += self.subject.arguments
             runs.clear(self.folder)
             self._export, self._number = None, self._number + 1
             self._run = Run(
@@ -280,7 +290,7 @@ class Desk:
             if item is None or item.is_model:
                 continue
             seen = preview(
-                self.folder, item.path, settings.columns or None, settings.seconds,
+                self.folder, item.path, settings.columns or None, settings.seconds, self.subject,
                 held=item.held,
             )  # fmt: skip
             with self._lock:

@@ -10,18 +10,22 @@ import io
 import json
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import TABLE, columns_of, parse_columns
-from psa_casadi.records.read.reading import read_records
+from psa_casadi.records.read.reading import read_records, read_signals
 from psa_casadi.records.record import Record
+from psa_casadi.records.signals import Signals
+from psa_casadi.workbench.subject import Subject
 
 #: Time [s] that a file may take.
 _LIMIT_S = 120.0
@@ -29,16 +33,25 @@ _MODULE = "psa_casadi.workbench.previews"
 
 
 def preview(
-    folder: Path, path: Path, columns: str | None, sample_time: float | None, *, held: bool
+    folder: Path,
+    path: Path,
+    columns: str | None,
+    sample_time: float | None,
+    subject: Subject,
+    *,
+    held: bool,
 ) -> dict[str, Any]:
     """Return the head of a file, the problems that it is read with, and the record in a picture.
 
     `folder` is where the process runs that reads it: none that holds files of others. `columns` is
-    the text of --columns, `sample_time` [s] that of --sample-time; a file that is `held` out needs
-    no voltage that changes.
+    the text of --columns, `sample_time` [s] that of --sample-time; a stack's file that is `held`
+    out needs no voltage that changes. `subject` is the model whose record it is.
     """
     file = path.relative_to(folder).as_posix()
-    asked = {"file": file, "columns": columns, "sample_time": sample_time, "held": held}
+    asked = {
+        "file": file, "columns": columns, "sample_time": sample_time, "held": held,
+        "inputs": subject.inputs, "outputs": subject.outputs,
+    }  # fmt: skip
     try:
         with started_python(_MODULE, json.dumps(asked), directory=folder) as child:
             done = heard(child, limit=_LIMIT_S)
@@ -55,17 +68,31 @@ def preview(
 
 
 def looked_at(
-    file: str, columns: str | None, sample_time: float | None, *, held: bool
+    file: str,
+    columns: str | None,
+    sample_time: float | None,
+    *,
+    held: bool,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what `preview` returns of a file in this folder, read in this process."""
-    head, problems, record = None, [], None
+    head, problems, told = None, [], None
+    names = (*inputs, *outputs)
     try:
-        wanted = parse_columns(columns) if columns else {}
+        wanted = parse_columns(columns, names) if columns else {}
         chosen = columns_of(wanted, Path(file).name).get(TABLE)
-        head = head_of(file, table=chosen.array if chosen else "")
-        record, *_ = read_records(
-            [file], columns=wanted, sample_time=sample_time, need_excitation=not held
-        )
+        head = head_of(file, table=chosen.array if chosen else "", names=names)
+        if names:
+            signals, *_ = read_signals(
+                file, inputs=inputs, outputs=outputs, columns=wanted, sample_time=sample_time
+            )
+            told = _told_of_signals(signals, inputs)
+        else:
+            record, *_ = read_records(
+                [file], columns=wanted, sample_time=sample_time, need_excitation=not held
+            )
+            told = _told(record)
     except InputError as error:
         problems = list(error.problems)
     found = _problem(*problems)
@@ -73,8 +100,7 @@ def looked_at(
         guess = {name: [f.index, f.unit] for name, f in head.guess.items()}
         found["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
         found["head"]["guess"] = guess
-    if record is not None:
-        found["record"] = _told(record)
+    found["record"] = told
     return found
 
 
@@ -84,24 +110,61 @@ def _problem(*sentences: str) -> dict[str, Any]:
 
 def _told(record: Record) -> dict[str, Any]:
     """Return how long a record is, what it reaches, and its picture."""
-    x = record.displacement
-    reached = [] if x is None else [float(np.nanmin(x)), float(np.nanmax(x))]
     others = ("load_force", "current", "temperature", "monitor_voltage", "charge",
               "displacement_2", "strain")  # fmt: skip
     return {
-        "n": record.n,
-        "seconds": float(record.time[-1] - record.time[0]),
-        "unit": record.displacement_unit,
-        "reached": reached,
+        **_extent(record, {"displacement": record.displacement_unit}),
         "others": [name for name in others if getattr(record, name) is not None],
-        "picture": _picture(record),
+        "picture": _loop(record),
+        "alt": "voltage over time, displacement over voltage",
     }
 
 
-def _picture(record: Record) -> str:
-    """Return a small PNG: the voltage over time, and where there is one the loop."""
+def _told_of_signals(signals: Signals, inputs: Sequence[str]) -> dict[str, Any]:
+    """Return what `_told` returns, of a record on any model."""
+    measured = {n: signals.units.get(n, "") for n in signals.columns if n not in inputs}
+    return {
+        **_extent(signals, measured),
+        "others": [],
+        "picture": _over_time(signals, inputs),
+        "alt": "inputs over time, outputs over time",
+    }
+
+
+def _extent(record: Signals, units: Mapping[str, str]) -> dict[str, Any]:
+    """Return how long a record is, and the lowest and highest value of columns in these units."""
+    columns = {n: x for n in units if (x := record.column(n)) is not None and np.isfinite(x).any()}
+    reached = {n: [float(np.nanmin(x)), float(np.nanmax(x)), units[n]] for n, x in columns.items()}
+    return {"n": record.n, "seconds": record.duration, "reached": reached}
+
+
+def _axes() -> tuple[Figure, Axes, Axes]:
+    """Return a small figure with two axes side by side."""
     figure = Figure(figsize=(8.4, 2.5), dpi=100, layout="constrained")
-    over_time, loop = figure.subplots(1, 2)
+    left, right = figure.subplots(1, 2)
+    for axes in (left, right):
+        axes.grid(color="#e4e7ea")
+    return figure, left, right
+
+
+def _over_time(signals: Signals, inputs: Sequence[str]) -> str:
+    """Return a small PNG: the inputs over time, the outputs over time."""
+    figure, left, right = _axes()
+    for name, values in signals.columns.items():
+        unit = signals.units.get(name, "")
+        label = f"{name} [{unit}]" if unit else name
+        axes = left if name in inputs else right
+        axes.plot(signals.time, values, linewidth=0.9, label=label)
+    for axes in (left, right):
+        axes.set(xlabel="time [s]")
+        if axes.lines:
+            axes.legend(fontsize="small")
+    return _png(figure)
+
+
+def _loop(record: Record) -> str:
+    """Return a small PNG: the voltage over time, and where there is one the loop."""
+    figure, over_time, loop = _axes()
     over_time.plot(record.time, record.voltage, color="#0072b2", linewidth=0.9)
     over_time.set(xlabel="time [s]", ylabel="voltage [V]")
     if record.displacement is None:
@@ -111,8 +174,10 @@ def _picture(record: Record) -> str:
         x = scale * record.displacement
         loop.plot(record.voltage, x, color="#3a3a3a", linewidth=0.7)
         loop.set(xlabel="voltage [V]", ylabel=f"displacement [{unit}]")
-    for axes in (over_time, loop):
-        axes.grid(color="#e4e7ea")
+    return _png(figure)
+
+
+def _png(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return base64.b64encode(buffer.getvalue()).decode("ascii")
@@ -124,7 +189,7 @@ def main() -> None:
     asked = json.loads(sys.argv[1])
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # libraries may say something
-        found = looked_at(asked["file"], asked["columns"], asked["sample_time"], held=asked["held"])
+        found = looked_at(**asked)
     json.dump(found, out, allow_nan=False)
 
 

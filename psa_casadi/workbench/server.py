@@ -18,11 +18,10 @@ from urllib.parse import parse_qs, unquote, urlsplit
 from markupsafe import Markup
 
 from psa_casadi.errors import InputError, MachineError
-from psa_casadi.records.record import COLUMNS
 from psa_casadi.report.page.document import environment, script_hash, source
-from psa_casadi.units import units_of
 from psa_casadi.version import __version__
 from psa_casadi.workbench.desk import BusyError, Desk
+from psa_casadi.workbench.subject import Subject
 
 #: The name of the machine for itself, as addresses have it.
 HOST = "127.0.0.1"
@@ -75,15 +74,16 @@ _ALWAYS = {
 }
 
 
-def page(effects: Sequence[str]) -> str:
+def page(effects: Sequence[str], subject: Subject) -> str:
     """Return the page; `effects` are those that a person may leave out of the search."""
-    told = {
-        "effects": list(effects),
-        "columns": {n: [u for q in c.quantities for u in units_of(q)] for n, c in COLUMNS.items()},
-    }
+    outputs = [subject.units[name] for name in subject.outputs]
+    unit = "m" if not outputs else outputs[0] if len(outputs) == 1 else ""
+    told = {"effects": list(effects), "columns": subject.columns, "unit": unit}
     template = environment().from_string(_PAGE.joinpath("workbench.html").read_text("utf-8"))
     asked = Markup(json.dumps(told).replace("<", "\\u003c"))
-    return template.render(style=_STYLE, script=_SCRIPT, version=__version__, told=asked)
+    return template.render(
+        style=_STYLE, script=_SCRIPT, version=__version__, told=asked, stack=not outputs
+    )
 
 
 class Server(ThreadingHTTPServer):
@@ -209,7 +209,8 @@ class _Handler(BaseHTTPRequestHandler):
             return
         self._look_at_cookie("Open the address that the command `psa web --diagnose` has printed.")
         if parts.path == "/":
-            self._answer(page(server.desk.effects).encode(), _HTML, _PAGE_POLICY)
+            content = page(server.desk.effects, server.desk.subject)
+            self._answer(content.encode(), _HTML, _PAGE_POLICY)
         elif parts.path == "/state":
             known = (_whole(asked, name) for name in ("version", "run", "seen"))
             self._answer(json.dumps(server.desk.state(*known)).encode(), _JSON)

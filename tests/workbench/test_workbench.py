@@ -21,6 +21,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
+from psa_casadi.workbench.subject import Subject
 from tests.contract.test_commands import asked
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
@@ -63,16 +64,18 @@ class Tab:
         found: dict[str, Any] = json.loads(self.ask("GET", "/state")[2])
         return found
 
-    def wait(self, there: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+    def wait(
+        self, there: Callable[[dict[str, Any]], object], limit_s: float = 60.0
+    ) -> dict[str, Any]:
         begun = time.monotonic()
-        while time.monotonic() < begun + 60.0:
+        while time.monotonic() < begun + limit_s:
             if there(state := self.state()):
                 return state
             time.sleep(0.02)
         raise AssertionError(state)
 
-    def until(self, status: str) -> dict[str, Any]:
-        return self.wait(lambda state: state["run"]["status"] == status)
+    def until(self, status: str, limit_s: float = 60.0) -> dict[str, Any]:
+        return self.wait(lambda state: state["run"]["status"] == status, limit_s)
 
     def searched(self) -> dict[str, Any]:
         found: dict[str, Any] = self.wait(lambda state: state["run"]["events"])["run"]
@@ -121,7 +124,8 @@ def test_a_file_is_read_and_its_columns_are_mapped(tab: Tab) -> None:
     assert tab.post("/settings", {"columns": "displacement=pos:10um"}) == 200
     seen = tab.state()["items"][0]["seen"]
     assert seen["problems"] == []
-    assert seen["record"]["reached"] == pytest.approx([0.0, 49 * 10e-6])
+    low, high, unit = seen["record"]["reached"]["displacement"]
+    assert (low, high, unit) == (0.0, pytest.approx(49 * 10e-6), "m")
     assert base64.b64decode(seen["record"]["picture"]).startswith(b"\x89PNG")
     assert seen["record"]["seconds"] == pytest.approx(0.099)
     assert tab.post("/settings", {"columns": "displacement=pas:um"}) == 200
@@ -329,6 +333,6 @@ def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
         for modules in ([], ["gratings"]):
             monkeypatch.setattr(sys, "path", [first, *sys.path])
             with pytest.raises(InputError, match="no server"):
-                web._serve(0, True, Given(effects=modules))
+                web._serve(0, True, Subject(), Given(effects=modules))
             here = [k for k, p in enumerate(there[-1], 1) if p in ("", str(tmp_path))]
             assert here == ([len(there[-1])] if modules else [])

@@ -46,13 +46,12 @@ class Head:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of a file: with a `request` its numbers in the folder `out`, else its head."""
+    """What is asked of a file: its numbers in the folder `out`, or `count` rows of its head."""
 
     path: str
-    request: Request | None = None
+    request: Request
     out: str = ""
     count: int = 0
-    table: str = ""
     memory: int = 0
 
 
@@ -64,13 +63,13 @@ class Answer:
     head: Head | None = None
 
 
-def head_of_tables(path: str, tables: Sequence[Table], count: int, table: str) -> Head:
+def head_of_tables(path: str, tables: Sequence[Table], count: int, request: Request) -> Head:
     """Return the head of one of the tables of a file, of the first where none is named."""
     if not tables:
         raise InputError(f"{path}: holds no header and no data; export the record again.")
     parts = parts_of_file(tables)
-    one = parts.get(table, tables[0])
-    choice = Request().chosen(one, Problems())
+    one = parts.get(request.table, tables[0])
+    choice = request.chosen(one, Problems())
     guess = dict(choice.fields)
     labels = list(one.labels)
     for name, source in choice.sources.items() if not one.headless else ():
@@ -113,16 +112,19 @@ def read(path: str, request: Request) -> Outcome:
         return outcome
 
 
-def head_of(path: str | Path, count: int = 8, table: str = "") -> Head:
+def head_of(path: str | Path, count: int = 8, table: str = "", names: tuple[str, ...] = ()) -> Head:
     """Return the head of a file with its first `count` rows; its numbers are not checked.
+
+    `names` are the inputs and outputs of the model that the file is a record of; none for a stack.
 
     Raises:
         InputError, MachineError: as `read`.
     """
     place = str(path)
+    request = Request(table=table, names=names, needed=names or Request.needed)
     if not ending_of(place):
-        return head_of_tables(place, text_of(place)[0], count, table)
-    told = answered_apart(Asked(place, count=count, table=table))
+        return head_of_tables(place, text_of(place)[0], count, request)
+    told = answered_apart(Asked(place, request, count=count))
     if told.head is None:
         raise InputError(told.outcome.problems)
     return told.head
@@ -198,8 +200,8 @@ def answered(asked: Asked) -> Answer:
     path = asked.path
     try:
         tables = READERS[ending_of(path)][0](path)
-        if asked.request is None:
-            return Answer(Outcome(), head_of_tables(path, tables, asked.count, asked.table))
+        if asked.count:
+            return Answer(Outcome(), head_of_tables(path, tables, asked.count, asked.request))
         outcome = samples_of(path, tables, asked.request)
     except InputError as error:
         return _refused(*error.problems)
