@@ -225,8 +225,7 @@ def _begun(fmu: Fmu, interface: int) -> Instance:
 
 def _continue(instance: Instance) -> None:
     if instance.interface == MODEL_EXCHANGE:
-        instance.update_events()
-        instance.require("EnterContinuousTimeMode")
+        instance.leave_event_mode()
 
 
 def _instances(fmu: Fmu, found: _Found) -> None:

@@ -266,17 +266,21 @@ class Instance:
         self.next_event_time = time if flags[4] else None
         return [bool(flag) for flag in flags]
 
-    def update_events(self) -> tuple[bool, bool]:
-        """Update discrete states as often as it asks for that, to a limit, or until it ends.
+    def leave_event_mode(self) -> float:
+        """Update in event mode and leave it; return the time of the next time event, else infinity.
 
-        Returns whether it asks for more, and whether it ends the simulation.
+        Raises FmuError where the updates have no end, or end the simulation.
         """
-        again, end = True, False
         for _ in range(_UPDATES):
             again, end, *_ = self.update_discrete_states()
-            if end or not again:
+            if end:
+                raise FmuError("the FMU ends the simulation at an event")
+            if not again:
                 break
-        return again, end
+        else:
+            raise FmuError("the FMU updates its discrete states without end")
+        self.require("EnterContinuousTimeMode")
+        return np.inf if self.next_event_time is None else self.next_event_time
 
     def vector(self, function: str, count: int) -> FloatArray:
         """Return a vector that a function of model exchange fills."""

@@ -10,6 +10,7 @@ only, a central difference of instances that were initialised with other values.
 import atexit
 import ctypes
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from ctypes import c_double, c_int, c_uint, c_void_p
 from dataclasses import dataclass, field
@@ -142,12 +143,8 @@ class Imported:
         if old:
             old.require("Reset")
         instance.setup(values={**dict(self.selected.fixed), **parameters})
-        _, end = instance.update_events()
-        if end:
-            raise FmuError("the FMU ends the simulation at its start")
-        if instance.next_event_time is not None:
+        if instance.leave_event_mode() < math.inf:
             raise FmuError(TIME_EVENT)
-        instance.require("EnterContinuousTimeMode")
         return instance
 
     def _prepared(self, slot: int, place: int, p: "ctypes._Pointer[c_double]") -> int | None:

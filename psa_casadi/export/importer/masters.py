@@ -72,7 +72,7 @@ def integrate(
     with fmu.open(MODEL_EXCHANGE) as instance:
         instance.setup(start_time=start, values=values)
         instance.set(dict(zip(inputs.names, inputs.at(start)[0], strict=True)))
-        event = _updated(instance)
+        event = instance.leave_event_mode()
         states = fmu.states()
         x = instance.get(states)
         atol = 1e-2 * tolerance * np.array([fmu.nominals[s] for s in states])
@@ -101,19 +101,11 @@ def integrate(
             instance.set(dict(zip(inputs.names, after, strict=True)))
             if now == event:
                 instance.require("EnterEventMode")
-                event = _updated(instance)
+                event = instance.leave_event_mode()
             if len(rows) < len(times) and times[len(rows)] <= now + same:
                 rows.append(instance.get(outputs))
             knots = [k for k in knots if k > now + same]
         return np.array(rows)
-
-
-def _updated(instance: Instance) -> float:
-    """Update in event mode and leave it; return the time of the next time event, else infinity."""
-    while instance.update_discrete_states()[0]:
-        pass
-    instance.require("EnterContinuousTimeMode")
-    return np.inf if instance.next_event_time is None else instance.next_event_time
 
 
 def _solved(

@@ -168,7 +168,7 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     with fmu.open(MODEL_EXCHANGE, **options) as instance:
         begins = dict(zip(run.inputs, run.u[0].tolist(), strict=True))
         instance.setup(start_time=t[0], values={**run.values, **begins})
-        event, fmi = _event(instance), instance.fmi
+        event, fmi = instance.leave_event_mode(), instance.fmi
         two, told = fmu.version == 2, fmu.description.modelExchange
         finished = getattr(told, "completedIntegratorStepNotNeeded", None)
         needed = bool(told.needsCompletedIntegratorStep) and not finished
@@ -198,19 +198,8 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
                         rows.append(instance.get(run.outputs))
                     instance.require("EnterEventMode")
                     inputs.apply(now, event=True)
-                    event = _event(instance)
+                    event = instance.leave_event_mode()
                     solver.reset(now)
             if len(rows) < 1 + t.index(target):
                 rows.append(instance.get(run.outputs))
         return np.array(rows)
-
-
-def _event(instance: Instance) -> float:
-    """Update in event mode and leave it; return the time of the next time event, else infinity."""
-    again, end = instance.update_events()
-    if end:
-        raise FmuError("the FMU ends the simulation at an event")
-    if again:
-        raise FmuError("the FMU updates its discrete states without end")
-    instance.require("EnterContinuousTimeMode")
-    return math.inf if instance.next_event_time is None else instance.next_event_time
