@@ -322,7 +322,7 @@ def _identification(found: Identification) -> str:
     """Return the parameters with their standard errors, and what is left of the outputs."""
     model = found.model
     rows = [
-        f"  {n} = {model.values[n]:.6g} +- {e:.2g} {model.parameter(n).unit}"
+        with_unit(f"  {n} = {model.values[n]:.6g} +- {e:.2g}", model.parameter(n).unit)
         for n, e in found.errors.items()
     ]
     left = [f"  {n}: {v:.3g} rms left, noise {found.noise[n]:.3g}" for n, v in found.rms.items()]
