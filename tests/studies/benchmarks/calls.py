@@ -1,7 +1,7 @@
 """Which value an FMU sees, and when: the calls that importers make, as the FMU itself logs them.
 
 The FMU is tests/export/faulty without a fault, its input the line u = t. fmpy and this project are
-always there; libcosim where `pip install libcosimpy` has been run.
+always there; libcosim where `pip install libcosimpy` has been run, PyFMI where it is installed.
 """
 
 import os
@@ -135,6 +135,13 @@ def _libcosim(path: Path) -> None:
         execution.step()
 
 
+def _pyfmi(path: Path) -> None:
+    model = import_module("pyfmi.fmi").FMUModelCS2(str(path))
+    times = np.linspace(0.0, _END, 4)
+    options = {**model.simulate_options(), "ncp": 3, "result_handling": "memory"}
+    model.simulate(0.0, _END, input=("u", np.column_stack([times, times])), options=options)
+
+
 _IMPORTERS: dict[str, Callable[[Path], None]] = {
     "fmpy, co-simulation": lambda p: _fmpy(p, fmi_type="CoSimulation"),
     "fmpy, set_input_derivatives=True": lambda p: _fmpy(
@@ -142,6 +149,7 @@ _IMPORTERS: dict[str, Callable[[Path], None]] = {
     ),
     "fmpy, model exchange": lambda p: _fmpy(p, fmi_type="ModelExchange"),
     "libcosim, an override before each step": _libcosim,
+    "PyFMI, co-simulation": _pyfmi,
     "psa identify, co-simulation": lambda p: _ours(p, CO_SIMULATION),
     "psa identify, co-simulation, input derivatives": lambda p: _ours(p, CO_SIMULATION),
     "psa identify, model exchange as a whole": lambda p: _ours(p, MODEL_EXCHANGE),
